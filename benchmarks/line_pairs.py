@@ -26,10 +26,10 @@ from vggtgeo.models.roles import Features, LineFeatures
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
-from vggtgeo.slam.tracking.description import Description
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, track
 
 GAPS, FEW = (1, 3, 5), 100

@@ -17,11 +17,11 @@ from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
 
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.known_map import MAP, save_map
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
-from vggtgeo.slam.sparse_map.known_map import MAP, save_map
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 

@@ -10,10 +10,10 @@ from test_keyframe_depth import SIZE, keyframe
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.carried_poses import carried_poses
 from vggtgeo.slam.tracking.tracker import FramePose, Tracker
 
 KEYFRAMES = (0, 4, 8)

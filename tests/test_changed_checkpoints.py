@@ -18,7 +18,7 @@ from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.run_folder import taken
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.tracking.tracker import FramePose
-from vggtgeo.slam.window.window_recorder import WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecorder
 
 FACTS = {"identity": {"seed": "0"}, "frames": 1, "last": 0, "digest": "0"}
 

@@ -20,15 +20,15 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.checkpoints import Checkpoints
-from vggtgeo.slam.camera import first_pass
+from vggtgeo.slam import first_pass
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.estimate import Estimate
-from vggtgeo.slam.window.pending_window import settled
-from vggtgeo.slam.window.sliding_window import _camera_sigma
+from vggtgeo.slam.window_steps import camera_prior
 
 GUESS = Camera.guess(320, 240)
 LENS = Camera((280.0, 280.0, 158.0, 121.0), 320, 240, (-0.1, 0.01, 0.0, 0.0), known=False)
@@ -76,7 +76,7 @@ def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
     wide = replace(slam, camera=replace(slam.camera, sigma=np.full(4, 100.0), self_calibrated=False))
     for count, held in ((2, True), (3, False)):
         slam = replace(wide, map=replace(wide.map, keyframes=wide.keyframes[:count]))
-        assert bool(_camera_sigma(slam, SETTINGS)[0] < 1.0) == held
+        assert bool(camera_prior(slam, SETTINGS).sigma[0] < 1.0) == held
         numbers = frozenset(range(count))
         pairs = tuple(pair for pair in wide.map.pairs if numbers.issuperset(pair.key))
         frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)

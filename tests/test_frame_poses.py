@@ -12,14 +12,15 @@ from vggtgeo.models.roles import GeometryResult, PoseGuess
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
-from vggtgeo.slam.camera.rolling_shutter import frame_motions, image_shift
+from vggtgeo.slam.camera.rolling_shutter import image_shift
+from vggtgeo.slam.global_map.carried_poses import carried_poses
+from vggtgeo.slam.global_map.frame_motions import frame_motions
+from vggtgeo.slam.global_map.frame_poses import LEAST_POINTS, frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.carried_poses import carried_poses
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.following import MOST_KEPT, Located
-from vggtgeo.slam.tracking.frame_poses import LEAST_POINTS, frame_poses
 from vggtgeo.slam.tracking.tracker import FramePose, SeenPoints, Tracker
 
 POINTS = 60

@@ -10,13 +10,14 @@ from recorded_run import RecordedRun, recorded_run
 from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.global_map.frame_poses import frame_poses
+from vggtgeo.slam.perception.rgbd_view import RgbdView
+from vggtgeo.slam.settings.groups import RefinementSettings
+from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.units import scaled_keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
 from vggtgeo.slam.tracking.frame_refinement import MOST, against_nearest, against_reference, squared_distance, with_view
 from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
 from vggtgeo.slam.tracking.tracker import FramePose, scaled_record
 
 AWAY = np.array([0.006, -0.005, 0.004, 0.002, -0.003, 0.001])
@@ -75,7 +76,7 @@ def test_frames_that_stand_aside_come_back(run: RecordedRun) -> None:
     slam, number = run.slam, run.slam.tracker.reference[0]
     rows = [row for row in between(run.slam) if run.slam.frames[row].reference == number - 1]
     wrong = moved(waiting(run, slam, rows), rows, AWAY, 0.02)
-    found = against_reference(wrong)
+    found = replace(wrong, tracker=against_reference(wrong.map, wrong.tracker))
     before, after = off(run, wrong, rows), off(run, found, rows)
     assert len(before)
     assert before.min() > 0.005
@@ -103,7 +104,7 @@ def test_frames_that_no_keyframe_follows_are_placed_by_an_earlier_one(run: Recor
     true = run.sequence.pose(own.frame) @ rigid.invert(run.sequence.pose(slam.keyframes[number].frame))
     frames = (*slam.frames[:row], replace(own, relative=true), *slam.frames[row + 1 :])
     wrong = moved(waiting(run, replace(slam, tracker=replace(slam.tracker, frames=frames)), [row]), [row], AWAY, 0.02)
-    found = against_nearest(wrong, Roles())
+    found = replace(wrong, tracker=against_nearest(wrong.map, wrong.tracker, wrong.intrinsics, Roles()))
     assert found.frames[row].second.keyframe != number
     assert off(run, found, [row])[0] < 0.6 * off(run, wrong, [row])[0]
 
@@ -113,22 +114,11 @@ def test_pictures_do_not_wait_for_long(run: RecordedRun) -> None:
     slam, row = run.slam, between(run.slam)[-1]
     slam = waiting(run, replace(slam, tracker=replace(slam.tracker, frames=slam.frames[: row + 1])), [row] * (MOST - 1))
     seen = slam.tracker.between[0][1]
-    assert (
-        len(
-            with_view(
-                replace(slam, tracker=replace(slam.tracker, between=slam.tracker.between[1:])),
-                seen,
-                Roles(),
-                SlamSettings(),
-            ).tracker.between
-        )
-        == MOST - 1
-    )
-    assert not with_view(slam, seen, Roles(), SlamSettings()).tracker.between
-    free = replace(slam, map=replace(slam.map, metric=False))
-    assert len(with_view(free, seen, Roles(), SlamSettings()).tracker.between) == MOST - 1, (
-        "lengths of a map without unit"
-    )
+    settings = RefinementSettings()
+    waits = lambda known, tracker: len(with_view(known, tracker, seen, slam.intrinsics, Roles(), settings).between)
+    assert waits(slam.map, replace(slam.tracker, between=slam.tracker.between[1:])) == MOST - 1
+    assert waits(slam.map, slam.tracker) == 0
+    assert waits(replace(slam.map, metric=False), slam.tracker) == MOST - 1, "lengths of a map without unit"
 
 
 def test_poses_that_contradict_each_other_are_told_by_what_both_know(run: RecordedRun) -> None:

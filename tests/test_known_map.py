@@ -26,13 +26,13 @@ from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.tum_folder import write_tum_folder
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
-from vggtgeo.slam.sparse_map.known_map import as_map, entered, save_map
+from vggtgeo.slam.known_map import as_map, entered, save_map
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.judge import judge
-from vggtgeo.slam.window.pending_window import settled
 
 FRAMES, HALF = 18, 9
 FIXED = replace(SETTINGS, keyframes=replace(SETTINGS.keyframes, localise_only=True))

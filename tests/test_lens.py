@@ -24,15 +24,15 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import SquarePinhole
-from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
-from vggtgeo.slam.global_map.global_adjustment import _taken_lens
-from vggtgeo.slam.sparse_map.known_map import as_map, entered
+from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
+from vggtgeo.slam.global_map.global_adjustment import _taken_lens, undistorted
+from vggtgeo.slam.known_map import as_map, entered
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import SeenPoints
 from vggtgeo.slam.trust import judge as judging
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import FrameEvidence
-from vggtgeo.slam.window.pending_window import settled
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
 _solve = eqx.filter_jit(vg.solve)
@@ -177,7 +177,7 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
     before = replace(
         before, tracker=replace(before.tracker, frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
     )
-    assert can_undistort(before)
+    assert can_undistort(before.keyframes)
     after = undistorted(before, LENS)
     assert after.camera.lens is LENS
     np.testing.assert_array_equal(after.intrinsics, LENS.intrinsics)
@@ -221,7 +221,7 @@ def test_descriptors_that_hold_their_image_keep_the_pinhole() -> None:
     slam = run_of_room()
     first = slam.keyframes[0]
     other = replace(first, features=replace(first.features, descriptors=object()))
-    assert not can_undistort(replace(slam, map=replace(slam.map, keyframes=(other, *slam.keyframes[1:]))))
+    assert not can_undistort((other, *slam.keyframes[1:]))
 
 
 def test_a_camera_that_was_found_goes_with_its_map() -> None:

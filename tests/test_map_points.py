@@ -15,9 +15,9 @@ from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation import simulate
+from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
-from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.fusion import with_systematic
 from vggtgeo.slam.tracking.map_points import Refined, refine_by_map

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.pending_window import LAG, begin_window, is_due, settled
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import FramePose
-from vggtgeo.slam.window.pending_window import LAG, begin_window, is_due, settled
 from vggtgeo.slam.window.window import Window
 
 CAMERA = np.array([100.0, 100.0, 50.0, 50.0])

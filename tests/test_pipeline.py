@@ -26,9 +26,11 @@ from vggtgeo.results.summary import pieces
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import compile_global, expected_keyframes
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.global_shape import padded_count, shape_for
 from vggtgeo.slam.global_map.loops import close_loops
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -36,9 +38,8 @@ from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.factors import FREE_LENGTH
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
-from vggtgeo.slam.window.pending_window import settled
-from vggtgeo.slam.window.sliding_window import adjust, solve_jit, window_problem
+from vggtgeo.slam.window.sliding_window import solve_jit, window_problem
+from vggtgeo.slam.window_steps import adjust_window, camera_prior
 
 SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.
@@ -90,9 +91,9 @@ def test_how_long_a_window_takes_changes_nothing(room, tracked: Slam, monkeypatc
 
     def late(slam: Slam, settings: SlamSettings) -> Slam:
         time.sleep(0.1 * (len(slam.keyframes) % 3))
-        return adjust(slam, settings)
+        return adjust_window(slam, settings)
 
-    monkeypatch.setattr("vggtgeo.slam.pipeline.adjust", late)
+    monkeypatch.setattr("vggtgeo.slam.pipeline.adjust_window", late)
     again = _run(frames, camera)
     np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
 
@@ -271,7 +272,8 @@ def test_rgb_recovers_the_shape(room) -> None:
     between = [record.evidence for record in slam.frames if record.frame not in numbers]
     assert all(np.isfinite(evidence.sigma_translation) for evidence in between)  # and of those that waited for the map
     assert len(slam.map.odometry_factors) >= len(slam.keyframes) - 2
-    adjustment, _ = window_problem(slam, [slam.keyframes[number] for number in slam.window.members], SETTINGS)
+    prior = camera_prior(slam, SETTINGS)
+    adjustment, _ = window_problem(slam.map, slam.window, slam.intrinsics, prior, SETTINGS)
     (motions,) = (term for term in adjustment.problem.terms if isinstance(term, RelativePose))
     present = np.asarray(motions.weight) > 0
     roots, lengths = np.asarray(motions.root)[present], rigid.to_matrix(np.asarray(motions.measured))[present, :3, 3]
@@ -429,7 +431,7 @@ def test_back_from_a_jump_the_window_is_of_one_piece(room) -> None:
     assert len(slam.map.roots) == 2, slam.notes
     assert any("found again" in note for note in slam.notes), slam.notes
     assert slam.keyframes[-1].frame > 22, "a keyframe was made after the return"
-    assert len(set(piece_of(slam)[list(slam.window.members)])) == 1
+    assert len(set(piece_of(slam.map)[list(slam.window.members)])) == 1
     jumped = {keyframe.number for keyframe in slam.keyframes if 8 <= keyframe.frame < 22}
     assert not [pair.key for pair in slam.map.pairs if len(jumped & set(pair.key)) == 1]
 

@@ -16,23 +16,21 @@ from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
-from vggtgeo.slam.camera import calibration
 from vggtgeo.slam.camera.calibration import keyframe_pairs
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.rolling_shutter import (
     _descend,
     _Search,
-    camera_motions,
     carried,
     find_readout,
-    frame_interval,
     image_shift,
     pair_at_once,
     row_shifts,
     without_readout,
 )
+from vggtgeo.slam.global_map.carried_poses import carried_poses
+from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
-from vggtgeo.slam.tracking.carried_poses import carried_poses
 from vggtgeo.slam.trust.estimate import Estimate
 from vggtgeo.slam.trust.evidence import EvidenceRecorder, FrameEvidence, common
 from vggtgeo.slam.trust.shutter import check_shutter, corners_at_once
@@ -170,7 +168,7 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
     motions = dict(zip(by_number, some_motions(2), strict=False))
     at = {"seconds": seconds, "camera": slam.intrinsics, "size": (width, height)}
     edges = [edge for pair in slam.map.pairs for edge in directions(pair, by_number)]
-    expected = keyframe_pairs(slam, edges)
+    expected = keyframe_pairs(slam.map, slam.camera, edges)
     usual = float(np.median(np.concatenate([pair.depth for pair in expected])))
 
     def rolled_pixels(pixels: np.ndarray, inverse: np.ndarray, number: int) -> np.ndarray:
@@ -193,13 +191,10 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
         for k in slam.keyframes
     )
     seen = replace(slam, map=replace(slam.map, keyframes=keyframes))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calibration, "camera_motions", lambda _, room: np.stack([motions[n] for n in by_number])[:room])
-        wrong = keyframe_pairs(seen, [moved(edge) for edge in edges])
-        right = keyframe_pairs(
-            replace(seen, camera=replace(seen.camera, readout=Readout(seconds, False, 0.0))),
-            [moved(edge) for edge in edges],
-        )
+    disturbed_edges = [moved(edge) for edge in edges]
+    wrong = keyframe_pairs(seen.map, seen.camera, disturbed_edges)
+    rolling = replace(seen.camera, readout=Readout(seconds, False, 0.0))
+    right = keyframe_pairs(seen.map, rolling, disturbed_edges, np.stack([motions[n] for n in by_number]))
     for name in ("before", "after"):
         true, disturbed, repaired = (
             np.concatenate([getattr(pair, name) for pair in pairs]) for pairs in (expected, wrong, right)

@@ -9,10 +9,10 @@ from vggtgeo.models.classical import NoDepth, SiftMatcher
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.description import Description
 
 CAMERA = Camera((300.0, 300.0, 159.5, 119.5), 320, 240)
 ROLES = Roles(points=SiftMatcher(count=500), depth=NoDepth())

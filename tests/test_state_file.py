@@ -28,6 +28,7 @@ from vggtgeo.io.record_file import DATA, HEADER, Layout
 from vggtgeo.io.records import by_name
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRotation
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
@@ -35,7 +36,6 @@ from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import STATE, load_state, save_state
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import SeenPoints, Waiting
-from vggtgeo.slam.window.pending_window import settled
 from vggtgeo.slam.window.window_prior import WindowPrior
 
 MIDDLE = 4

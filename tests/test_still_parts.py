@@ -18,8 +18,8 @@ from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.source import opened
 from vggtgeo.results.still_search import StillSearch
 from vggtgeo.simulation.tum_folder import write_tum_folder
-from vggtgeo.slam.camera.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.perception.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
@@ -205,7 +205,7 @@ def test_each_rule_is_needed(
     the picture. Oracle: with that rule switched off there is a mask.
     """
     assert find_still_parts(make()) is None
-    monkeypatch.setattr(f"vggtgeo.slam.camera.still_parts.{rule}", off)
+    monkeypatch.setattr(f"vggtgeo.slam.perception.still_parts.{rule}", off)
     assert find_still_parts(make()) is not None
 
 

@@ -20,21 +20,21 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.global_map.join_submaps import join_pieces, scaled_piece
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import step
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
-from vggtgeo.slam.sparse_map.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking import relocalisation
-from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, track
-from vggtgeo.slam.window.pending_window import settled
 
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.

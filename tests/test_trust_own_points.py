@@ -14,10 +14,10 @@ from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
 from vggtgeo.slam.tracking.tracker import FramePose, SeenPoints, Tracker
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.judge import judge

@@ -13,7 +13,8 @@ from vggtgeo.models import pinhole
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import Readout
-from vggtgeo.slam.camera.rolling_shutter import camera_motions, image_shift
+from vggtgeo.slam.camera.rolling_shutter import image_shift
+from vggtgeo.slam.global_map.frame_motions import camera_motions
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.finding import Finding
 from vggtgeo.slam.trust.judge import judge

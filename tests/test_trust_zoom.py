@@ -14,7 +14,8 @@ from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
-from vggtgeo.slam.camera.rolling_shutter import camera_motions, image_shift
+from vggtgeo.slam.camera.rolling_shutter import image_shift
+from vggtgeo.slam.global_map.frame_motions import camera_motions
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.sparse_map.map import Map

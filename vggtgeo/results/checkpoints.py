@@ -35,7 +35,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 from vggtgeo.slam.trust.evidence import EvidenceSoFar, FrameEvidence
-from vggtgeo.slam.window.window_recorder import WindowRecord
+from vggtgeo.slam.window_recorder import WindowRecord
 
 _BEFORE, _SHOWN = 30, 110
 """Letters of a long setting that are shown, and those of them that lie before where it is another one."""

@@ -30,21 +30,21 @@ from vggtgeo.results.still_search import StillSearch
 from vggtgeo.results.summary import OWN, compare, summarise
 from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.camera.first_pass import begin_with_found_camera
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.first_pass import begin_with_found_camera
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
+from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
-from vggtgeo.slam.sparse_map.known_map import entered
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import EvidenceRecorder
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.input import check_input, check_refusals
 from vggtgeo.slam.trust.judge import judged_or_told
-from vggtgeo.slam.window.window_recorder import WindowRecord, WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
     "`known_map` was made without depth, so that its lengths have no unit: the depth of these frames, in metres, is "

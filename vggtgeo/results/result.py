@@ -40,14 +40,14 @@ from vggtgeo.results.summary import compare, summarise, with_writing
 from vggtgeo.results.summary_file import poses_in, read_summary, unusable
 from vggtgeo.results.unfinished import check_finished
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
+from vggtgeo.slam.known_map import save_map
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
-from vggtgeo.slam.sparse_map.known_map import save_map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.evidence import Evidence
 from vggtgeo.slam.trust.finding import Verdict
 from vggtgeo.slam.trust.judge import judge
-from vggtgeo.slam.window.pending_window import settled
-from vggtgeo.slam.window.window_recorder import WindowRecord
+from vggtgeo.slam.window_recorder import WindowRecord
 
 DepthChoice = bool | Literal["every"]
 """Whose depth a folder of results holds: nobody's, that of the keyframes, or of every frame."""

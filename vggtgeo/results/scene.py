@@ -22,10 +22,10 @@ from vggtgeo.io.files import atomic_open
 from vggtgeo.io.pictures import write_picture
 from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.results.frames_again import read_again
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.submaps import pieces_by_size
 
 VERSION = 1
 MASK = "image-mask.png"

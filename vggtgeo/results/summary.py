@@ -20,8 +20,8 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.results.files import piece_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.slam.trust.finding import Verdict
 
 

@@ -14,11 +14,11 @@ from vggtgeo.results.checkpoints import Checkpoints, Keeper, Notice, RunSoFar, c
 from vggtgeo.results.frames_in_hand import FramesInHand, read_only
 from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window.pending_window import settled
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,12 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.global_map.join_submaps import join_pieces
 from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
+from vggtgeo.slam.pending_window import begin_window, is_due, settled
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.connected import piece_of
@@ -21,10 +25,13 @@ from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.sparse_map.map import Map
-from vggtgeo.slam.sparse_map.pieces import join_pieces
-from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
+from vggtgeo.slam.start import (
+    MOST_WAITING,
+    begin_again_with_depth,
+    start_without_depth,
+    without_depth,
+)
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
 from vggtgeo.slam.tracking.relocalisation import (
@@ -49,8 +56,7 @@ from vggtgeo.slam.tracking.track import (
     track_by_map,
 )
 from vggtgeo.slam.tracking.tracker import FramePose
-from vggtgeo.slam.window.pending_window import begin_window, is_due, settled
-from vggtgeo.slam.window.sliding_window import adjust, enter
+from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 LOST_PATIENCE = 10
 """Frames that show something, but nothing of the map, before a new piece of map begins. Black frames do not count."""
@@ -100,8 +106,8 @@ def step(
     else:
         slam = _refer_to(slam, found.keyframe, roles)
         slam = _with_record(slam, record_of(frame, found))
-        slam = with_view(slam, data.view, roles, settings)
-    return place_waiting(slam, roles) if was_lost else slam
+        slam = _with_view(slam, data.view, roles, settings)
+    return _place_waiting(slam, roles) if was_lost else slam
 
 
 def _settled(slam: Slam, clock: Clock) -> Slam:
@@ -142,7 +148,7 @@ def _track(
     A pending window is taken up first where the frame has no pose, or becomes a keyframe.
     """
     with clock.measure("track"):
-        data = _with_lines(frame_data(frame, description, slam, roles), roles, settings)
+        data = _with_lines(frame_data(frame, description, slam.intrinsics, roles, slam.metric), roles, settings)
         # In a map of another run the place of the first frame is unknown: it is searched by appearance alone.
         unknown_place = _in_known_map(slam) and slam.tracker.reference is None
         found = None if unknown_place else _find(slam, data, roles, settings)
@@ -155,7 +161,7 @@ def _track(
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if slam.tracker.lost and (found is None or not found.accepted):
         with clock.measure("relocalise"):
-            found = relocalise(data, slam.keyframes, slam, roles) or found
+            found = relocalise(TrackingInput(data, slam.intrinsics, roles), slam.keyframes, slam.tracker) or found
     return slam, data, found
 
 
@@ -190,7 +196,7 @@ def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> 
     given = TrackingInput(data, slam.intrinsics, roles, prior, window)
     best: Track | None = None
     for keyframe in window:
-        found = track(given, keyframe, view_of(keyframe, slam, roles))
+        found = track(given, keyframe, view_of(keyframe, slam.tracker, slam.intrinsics, roles))
         if best is None or _rank(found) > _rank(best):
             best = found
         if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
@@ -201,7 +207,7 @@ def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> 
         return best
     piece = slam.keyframes[slam.map.roots[-1] :]
     if not best.accepted:
-        source = view_of(best.keyframe, slam, roles)
+        source = view_of(best.keyframe, slam.tracker, slam.intrinsics, roles)
         joint = track_by_map(given, piece, best.keyframe, source)
         return joint if joint.accepted else best
     return refined_by_map(best, given, piece)
@@ -241,13 +247,13 @@ def _insert_and_adjust(
 
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
-            entered = enter(slam, keyframe, roles, settings, tied_to=odometry.first)
+            entered = insert_keyframe(slam, keyframe, roles, settings, tied_to=odometry.first)
             entered = _with_odometry(entered, odometry)
             entered = constrain_rotation(entered, settings)
         with clock.measure("place frames" + own):
-            entered = against_reference(entered)
+            entered = replace(entered, tracker=against_reference(entered.map, entered.tracker))
         with clock.measure("adjust window" + own):
-            return adjust(entered, settings)
+            return adjust_window(entered, settings)
 
     if slam.metric and len(slam.map.roots) == 1:
         inserted = replace(
@@ -279,9 +285,16 @@ def _with_odometry(slam: Slam, odometry: MeasuredRelativePose) -> Slam:
 def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
     if slam.tracker.reference is not None and slam.tracker.reference[0] == keyframe.number:
         return slam
-    return against_reference(
-        replace(slam, tracker=replace(slam.tracker, reference=(keyframe.number, view_of(keyframe, slam, roles))))
-    )
+    reference = keyframe.number, view_of(keyframe, slam.tracker, slam.intrinsics, roles)
+    return replace(slam, tracker=against_reference(slam.map, replace(slam.tracker, reference=reference)))
+
+
+def _with_view(slam: Slam, view: RgbdView | None, roles: Roles, settings: SlamSettings) -> Slam:
+    return replace(slam, tracker=with_view(slam.map, slam.tracker, view, slam.intrinsics, roles, settings.refinement))
+
+
+def _place_waiting(slam: Slam, roles: Roles) -> Slam:
+    return replace(slam, tracker=place_waiting(slam.map, slam.tracker, slam.intrinsics, roles))
 
 
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
@@ -289,7 +302,7 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
 
     Those of its own piece: the place of another is a guess, by which matches would be found that mean nothing.
     """
-    label = piece_of(slam)
+    label = piece_of(slam.map)
     around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
     window = tuple(other for other in around if label[other] == label[number])[-(settings.window.size - 1) :]
     # Without metric depth one held pose leaves the unit free: two hold it.
@@ -310,7 +323,7 @@ def _missed(slam: Slam, data: FrameData, evidence: Evidence, roles: Roles, setti
     if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
-    waiting = wait(slam, frame, features, MOST_WAITING)
+    waiting = wait(slam.tracker, frame, features, MOST_WAITING)
     slam = replace(slam, tracker=replace(slam.tracker, lost=slam.tracker.lost + 1))
     shown = sum(len(other.features) > settings.tracking.least_inliers for other in waiting)
     patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE
@@ -320,7 +333,7 @@ def _missed(slam: Slam, data: FrameData, evidence: Evidence, roles: Roles, setti
             "nothing ties it to the one before, its place is only a guess"
         )
         begun = _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
-        return place_waiting(begun, roles) if _started(begun) else begun
+        return _place_waiting(begun, roles) if _started(begun) else begun
     reference, relative = (slam.frames[-1].reference, slam.frames[-1].relative) if slam.frames else (0, np.eye(4))
     record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, evidence)
     return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record), waiting=waiting))
@@ -338,11 +351,12 @@ def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settin
     if near is not None:
         prior = MotionPrior(found.pose, slam.tracker.velocity)
         given = TrackingInput(data, slam.intrinsics, roles, prior)
-        again = track(given, near, view_of(near, slam, roles))
+        again = track(given, near, view_of(near, slam.tracker, slam.intrinsics, roles))
         if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
             again = None  # drift may have put another keyframe there
     if again is None:
-        again = revisit(slam, data, found, roles)
+        given = TrackingInput(data, slam.intrinsics, roles)
+        again = revisit(given, found, slam.map, slam.tracker, slam.window.members)
     if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
         return slam, found
     near = again.keyframe

@@ -10,16 +10,16 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, GeometryResult, PointMatches, StartGuess
+from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
+from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track
 from vggtgeo.slam.tracking.tracker import FramePose, Waiting
-from vggtgeo.slam.window.sliding_window import adjust, enter, scale_anchor
+from vggtgeo.slam.window.sliding_window import scale_anchor
+from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
-NOMINAL_DEPTH = 2.5
-"""Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
 MOST_WAITING = 90
 LEAST_SHARED = 100
 """Matches that a waiting frame shares with the present one, if it is to begin the map in place of the first keyframe:
@@ -99,8 +99,9 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
     second = make_keyframe(
         number, frame, relative @ first.pose, Description.of(features), roles, settings, slam.intrinsics
     )
-    slam = enter(slam, second, roles, settings)
-    slam = adjust(replace(slam, map=replace(slam.map, factors=(*slam.map.factors, scale_anchor(slam)))), settings)
+    slam = insert_keyframe(slam, second, roles, settings)
+    anchor = scale_anchor(slam.map, slam.window.members)
+    slam = adjust_window(replace(slam, map=replace(slam.map, factors=(*slam.map.factors, anchor))), settings)
     first, second = slam.keyframes[first.number], slam.keyframes[number]
     slam = _place_waiting(slam, first, roles)
     inliers = int(np.count_nonzero(guess.inliers))

@@ -11,7 +11,7 @@ import numpy as np
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map
-from vggtgeo.slam.tracking.tracker import FramePose, Tracker
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker, frame_pose
 from vggtgeo.slam.window.window import Window
 
 
@@ -91,7 +91,7 @@ class Slam:
 
     def pose(self, record: FramePose) -> np.ndarray:
         """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
-        return record.relative @ self.keyframes[record.reference].pose
+        return frame_pose(self.map, record)
 
     @property
     def last_pose(self) -> np.ndarray:

@@ -34,6 +34,7 @@ from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.mast3r import Mast3rView
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
+from vggtgeo.slam.perception.rgbd_view import Points, RgbdView
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation
@@ -43,7 +44,6 @@ from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_checks import check_state
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.rgbd_view import Points, RgbdView
 from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, Waiting
 from vggtgeo.slam.window.adjustment import Adjustment
 from vggtgeo.slam.window.window import Window

@@ -18,7 +18,7 @@ from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window.window_recorder import WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecorder
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.live_map import LiveMap
 from vggtgeo.viewing.target import flush

@@ -61,6 +61,16 @@ class CameraEstimate:
         """Whether the camera was given, not guessed."""
         return was_given(self.given, self.sigma, self.self_calibrated)
 
+    def window_sigma(self, keyframes: int, known_sigma: float) -> np.ndarray:
+        """Standard deviation of the camera's prior in a window of a map of so many keyframes, float64 [4], pixels.
+
+        known_sigma: of held intrinsics, relative to the focal length. A self-calibrated camera is held as a given one
+        is, and so is a guess while there are two keyframes: focal lengths of 521 px became 524 and 580 by such two.
+        """
+        if not self.self_calibrated and (self.calibrated or keyframes >= MIN_KEYFRAMES_FOR_CAMERA):
+            return self.sigma
+        return np.full(4, known_sigma * self.given[0])
+
 
 def was_given(given: np.ndarray, sigma: np.ndarray, self_calibrated: bool) -> bool:
     """Whether a prior of the intrinsics, mean and standard deviation in pixels, is that of a camera that was given.

@@ -9,13 +9,16 @@ import numpy as np
 
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
 from vggtgeo.slam.camera.calibration import Refinement, Solve, free_focal, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
-from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted
+from vggtgeo.slam.camera.camera_of_pairs import CameraPair
+from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
-from vggtgeo.slam.camera.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
+from vggtgeo.slam.camera.rolling_shutter import find_readout, without_readout
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
+from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.global_map.global_shape import GlobalShape, global_solver, shape_of
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -157,12 +160,17 @@ def _with_its_camera(
     """The state after a trial whether a given camera is to be refined, or the lens of a guessed one taken out."""
     again = _solves(settings)
     if slam.camera.calibrated:
-        found = try_camera(keyframe_pairs(slam, edges), adjustment.problem, state, again)
+        found = try_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, again)
         return _taken_camera(slam, adjustment, found, settings)
     slam, adjustment, state = _with_its_pixels(slam, adjustment, state, again)
-    if slam.camera.lens is not None or not can_undistort(slam):
+    if slam.camera.lens is not None or not can_undistort(slam.keyframes):
         return slam
     return _taken_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, again))
+
+
+def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
+    motions = None if slam.camera.readout is None else camera_motions(slam, len(slam.keyframes))
+    return keyframe_pairs(slam.map, slam.camera, edges, motions)
 
 
 def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
@@ -244,6 +252,23 @@ def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> 
         f"{found.camera.intrinsics[0]:.1f} px, {found.warp:.0f} px at most; the images were undistorted by that"
     )
     return replace(adjusted, notes=(*adjusted.notes, note))
+
+
+def undistorted(slam: Slam, lens: Camera) -> Slam:
+    """The state as the ideal pinhole of `lens` sees it; poses and depths stay."""
+    frames = tuple(
+        record
+        if record.seen is None
+        else replace(record, seen=replace(record.seen, pixels=undistorted_pixels(record.seen.pixels, lens)))
+        for record in slam.frames
+    )
+    return replace(
+        slam,
+        map=undistorted_map(slam.map, lens),
+        tracker=replace(slam.tracker, frames=frames),
+        camera=replace(slam.camera, intrinsics=np.array(lens.intrinsics, np.float64), lens=lens),
+        window=replace(slam.window, solved=None, prior=None),
+    )
 
 
 def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:

@@ -22,8 +22,8 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.io.kept_program import KeptProgram
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
 from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients

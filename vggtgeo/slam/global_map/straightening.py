@@ -17,8 +17,7 @@ from vggtgeo.slam.global_map.unit_graph import UnitRatio, solve_units
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.units import longer, scaled_factor, scaled_keyframe, scaled_motion
-from vggtgeo.slam.start import NOMINAL_DEPTH
+from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.tracker import scaled_record
@@ -121,7 +120,7 @@ def _graph(
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])
     whole = replace(slam, map=replace(slam.map, factors=(*slam.map.factors, *loops)))
-    label = piece_of(whole)
+    label = piece_of(whole.map)
     held = np.zeros(len(poses), bool)
     held[np.unique(label, return_index=True)[1]] = True
     return PoseGraph(start, scaled_motions, scaled_loops, held)

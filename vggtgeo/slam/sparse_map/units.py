@@ -11,6 +11,8 @@ from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 
+NOMINAL_DEPTH = 2.5
+"""Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
 LEAST_SHARED = 20
 """Key points with a depth in both keyframes that tell the ratio of their units."""
 MOST_SCALE_ERROR = 0.03

@@ -19,16 +19,16 @@ from vggtgeo.models.roles import (
     PoseGuess,
     PoseQuery,
 )
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_alignment import Aligned
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.tracking.following import Located, located_by_flow
 from vggtgeo.slam.tracking.fusion import Motion, agreed, drawn_to, wanting, with_lines, with_systematic
 from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
-from vggtgeo.slam.tracking.rgbd_alignment import Aligned
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
 from vggtgeo.slam.tracking.tracker import SeenPoints
 
 PIXEL_SIGMA = 2.0

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from vggtgeo.models.roles import Features
+from vggtgeo.slam.perception.rgbd_view import RgbdView
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.sparse_map.units import longer, scaled_information
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +90,11 @@ class Tracker:
     lost: int = 0
     waiting: tuple[Waiting, ...] = ()
     between: tuple[tuple[int, RgbdView], ...] = ()
+
+
+def frame_pose(known: Map, record: FramePose) -> np.ndarray:
+    """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
+    return record.relative @ known.keyframes[record.reference].pose
 
 
 def scaled_record(record: FramePose, ratio: float) -> FramePose:

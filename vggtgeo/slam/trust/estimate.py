@@ -9,9 +9,9 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA, Readout, was_given
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.submaps import pieces_by_size
 
 
 @dataclass(frozen=True, eq=False)

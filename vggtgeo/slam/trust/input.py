@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.slam.camera.still_parts import StillParts
+from vggtgeo.slam.perception.still_parts import StillParts
 from vggtgeo.slam.trust.finding import Finding
 
 MOST_LEFT_OUT = 0.10

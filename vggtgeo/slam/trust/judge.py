@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.slam.trust.blind import check_blind, cuts
 from vggtgeo.slam.trust.calibration import camera_opinion, check_camera
 from vggtgeo.slam.trust.change_of_sides import check_sides

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from vggtgeo.slam.global_map.frame_poses import off_landmarks
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import off_landmarks
 from vggtgeo.slam.tracking.tracker import FramePose
 from vggtgeo.slam.trust.finding import Finding, spans
 

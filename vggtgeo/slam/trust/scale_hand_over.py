@@ -72,7 +72,7 @@ def hand_over_sigma(slam: Slam) -> np.ndarray:
     """Relative standard deviation of the scale behind each keyframe against that before it, float64 [n - 1]; NaN where
     a piece of map has fewer than two keyframes on either side.
     """
-    count, label = len(slam.keyframes), piece_of(slam)
+    count, label = len(slam.keyframes), piece_of(slam.map)
     sigma = np.full(max(count - 1, 0), np.nan)
     seen, across = _sensitivities(slam), _matches_across(slam)
     for step in range(count - 1):

@@ -28,7 +28,8 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.camera.rolling_shutter import camera_motions, pair_at_once
+from vggtgeo.slam.camera.rolling_shutter import pair_at_once
+from vggtgeo.slam.global_map.frame_motions import camera_motions
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam

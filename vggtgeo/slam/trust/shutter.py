@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vggtgeo.slam.camera.rolling_shutter import at_once, frame_motions
+from vggtgeo.slam.camera.rolling_shutter import at_once
+from vggtgeo.slam.global_map.frame_motions import frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import median_depths
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.trust.estimate import Estimate

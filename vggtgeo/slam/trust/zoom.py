@@ -20,7 +20,8 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.camera.rolling_shutter import camera_motions, pair_at_once
+from vggtgeo.slam.camera.rolling_shutter import pair_at_once
+from vggtgeo.slam.global_map.frame_motions import camera_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.sparse_map.covisibility import directions
 from vggtgeo.slam.state import Slam

@@ -22,10 +22,10 @@ from vggtgeo.io.records import by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
-from vggtgeo.slam.window.pending_window import settled
 
 MAP = Layout("map", VERSION, by_name(STATE_CLASSES))
 LEAST_KNOWN = 0.2

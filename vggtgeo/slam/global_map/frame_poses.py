@@ -15,11 +15,12 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.camera.rolling_shutter import at_once, camera_motions, frame_motions
+from vggtgeo.slam.camera.rolling_shutter import at_once
+from vggtgeo.slam.global_map.carried_poses import carried_poses
+from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.carried_poses import carried_poses
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.frame_refinement import tracked_information
 from vggtgeo.slam.tracking.tracker import FramePose

@@ -45,7 +45,7 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             for k in between:
                 poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
         last = row
-    return times, by_both(slam, poses)
+    return times, by_both(slam.map, slam.frames, poses)
 
 
 def _is_gross(arrived: np.ndarray, adjusted: np.ndarray, tie: MeasuredRelativePose) -> bool:

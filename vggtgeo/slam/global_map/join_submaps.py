@@ -16,7 +16,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePo
 from vggtgeo.slam.sparse_map.units import longer, ratio_of_units, scaled_factor, scaled_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import relocalise
-from vggtgeo.slam.tracking.track import FrameData, Track
+from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput
 from vggtgeo.slam.tracking.tracker import scaled_record
 from vggtgeo.slam.window.window_prior import WindowPrior
 
@@ -31,11 +31,11 @@ def join_pieces(slam: Slam, data: FrameData, roles: Roles, settings: SlamSetting
     """
     if len(slam.map.roots) < 2:
         return slam
-    label = piece_of(slam)
+    label = piece_of(slam.map)
     others = [keyframe for keyframe in slam.keyframes if label[keyframe.number] != label[-1]]
     if not others:
         return slam
-    place = relocalise(data, others, slam, roles, TRIED)
+    place = relocalise(TrackingInput(data, slam.intrinsics, roles), others, slam.tracker, TRIED)
     if place is None:
         return slam
     if slam.metric:
@@ -70,7 +70,7 @@ def scaled_piece(slam: Slam, ratio: float) -> Slam:
 
 def newest_piece(slam: Slam) -> Callable[[int], bool]:
     """Whether a keyframe, by its number, hangs together with the newest one."""
-    label = piece_of(slam)
+    label = piece_of(slam.map)
     return lambda number: bool(label[number] == label[-1])
 
 
