@@ -233,8 +233,8 @@ class WindowSettings(CheckedSettings):
         line_slots: Samples of segments a keyframe, at most.
         kernel: Robust kernel of points and lines, in the last adjustment too; widths in pixels.
         window_iterations: Iterations of an adjustment of the window, at most.
-        record_iterations: Keep what each iteration of the window's solver did in `Slam.iterations`, for a viewer;
-            changes no result.
+        record_iterations: Keep what each iteration of the window's solver did in `Slam.window.iterations`, for a
+            viewer; changes no result.
 
     Example:
         >>> import vggtgeo as vg
