@@ -21,9 +21,9 @@ from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.evaluation.association import associate
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, compile_alignment
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.tracking.rgbd_alignment import RgbdAlignment, compile_alignment
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
 
 GAP = 8
 

@@ -3,7 +3,8 @@
     D=../shared/data
     .venv/bin/python benchmarks/between_keyframes.py $D/building-walk $D/corridor-office $D/redkitchen $D/icl-office
 
-One run of each clip without its depth, whose frames are then taken either way (`vggtgeo/slam/tracking/frame_poses.py`):
+One run of each clip without its depth, whose frames are then taken either way
+(`vggtgeo/slam/global_map/frame_poses.py`):
 ATE after Sim(3) of all frames, and what a step from frame to frame is off, root mean square and largest, all in cm. The
 steps of the truth count in full: a truth that is jagged itself shows here.
 """
@@ -21,9 +22,9 @@ from vggtgeo.datasets import Sequence, open_sequence, without_depth
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.evaluation.association import associate
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.global_map.carried_poses import carried_poses
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.carried_poses import carried_poses
-from vggtgeo.slam.tracking.frame_poses import frame_poses
 
 Poses = Callable[[Slam], tuple[np.ndarray, np.ndarray]]
 

@@ -60,7 +60,11 @@ def _row(state: Path, count: int) -> list[str]:
     own = slam.keyframes
     keyframes = tuple(_beside(own[row % len(own)], row, row // len(own)) for row in range(count))
     ties = tuple(MeasuredRelativePose(row, row + 1, np.eye(4), np.eye(6)) for row in range(count - 1))
-    longer = replace(slam, keyframes=keyframes, pairs=(), factors=ties, frames=(), origins=(0,))
+    longer = replace(
+        slam,
+        map=replace(slam.map, keyframes=keyframes, pairs=(), factors=ties, roots=(0,)),
+        tracker=replace(slam.tracker, frames=()),
+    )
     before = _megabytes()
     with program_settings():
         began = time.perf_counter()

@@ -105,7 +105,7 @@ def _row(name: str, slam: Slam, true: np.ndarray, row_of: dict[int, int]) -> str
             frames.append((np.linalg.norm(off[:3]), np.linalg.norm(off[3:]), *stated))
     moved, turned, sigma_moved, sigma_turned = np.array(frames).T
     distances = []
-    for tie in slam.ties:
+    for tie in slam.map.odometry_factors:
         first, second = (row_of[slam.keyframes[number].frame] for number in tie.keyframes)
         off = _error(tie.pose, true[first], true[second])
         distances.append(off @ tie.information @ off)

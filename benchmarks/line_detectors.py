@@ -66,7 +66,7 @@ def line(name: str, detector: LineDetector | None, data: Path, folder: Path, end
     cells = [
         name,
         f"{np.mean([len(keyframe.lines) for keyframe in slam.keyframes]) if detector else 0:.0f}",
-        f"{np.mean([len(pair.lines) for pair in slam.pairs]) if detector else 0:.1f}",
+        f"{np.mean([len(pair.lines) for pair in slam.map.pairs]) if detector else 0:.1f}",
         f"{100 * truth['ate_se3_m']['rmse']:.2f}",
         f"{100 * truth['ate_sim3_m']['rmse']:.2f}",
         f"{100 * report.sim3.statistics.rmse:.2f}",

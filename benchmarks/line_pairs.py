@@ -26,11 +26,11 @@ from vggtgeo.models.roles import Features, LineFeatures
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
-from vggtgeo.slam.tracking.description import Description
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
-from vggtgeo.slam.tracking.track import Expectation, Sight, Track, track
+from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, track
 
 GAPS, FEW = (1, 3, 5), 100
 NEAR, FAR = (0.05, np.deg2rad(2.0)), (0.15, np.deg2rad(5.0))
@@ -81,17 +81,20 @@ class Pair:
 
     first: Shot
     second: Shot
-    expected: Expectation
+    expected: MotionPrior
     gap: int
 
-    def by(self, method: str, keyframe: Keyframe, expected: Expectation | None = None) -> Track:
+    def by(self, method: str, keyframe: Keyframe, expected: MotionPrior | None = None) -> Track:
         """The second shot's pose from the first."""
         points, lines, picture = METHODS[method]
         view = self.second.view if picture else None
         features = self.second.features if points else self.second.blind
-        sight = Sight(self.second.frame, Description.of(features), view, (lambda: self.second.lines) if lines else None)
+        data = FrameData(
+            self.second.frame, Description.of(features), view, (lambda: self.second.lines) if lines else None
+        )
         source = self.first.view if picture else None
-        return track(sight, keyframe, source, expected or self.expected, self.first.intrinsics, ROLES)
+        given = TrackingInput(data, self.first.intrinsics, ROLES, expected or self.expected)
+        return track(given, keyframe, source)
 
 
 def main() -> None:
@@ -129,7 +132,7 @@ def pairs(path: Path, every: int) -> Iterator[Pair]:
         for gap in GAPS:
             before, last = shots[i + gap - 2], shots[i + gap - 1]
             step = last.pose @ rigid.invert(before.pose)
-            yield Pair(shots[i], shots[i + gap], Expectation(step @ last.pose, step), gap)
+            yield Pair(shots[i], shots[i + gap], MotionPrior(step @ last.pose, step), gap)
 
 
 def place(

@@ -66,7 +66,7 @@ def _blocks(states: Iterator[Slam], waiting: list[float], block: int) -> Slam:
         waiting.clear()
         if len(slam.frames) % block == 0:
             grown, more = _memory() - memory, len(slam.keyframes) - keyframes
-            row = (len(slam.frames), len(slam.keyframes), len(slam.pairs), f"{1e3 * np.mean(seconds):.0f}")
+            row = (len(slam.frames), len(slam.keyframes), len(slam.map.pairs), f"{1e3 * np.mean(seconds):.0f}")
             row = (*row, f"{1e3 * max(seconds):.0f}", f"{_memory():.0f}", f"{grown / more:.1f}" if more else "")
             print("| " + " | ".join(map(str, row)) + " |", flush=True)
             memory, keyframes, seconds = _memory(), len(slam.keyframes), []

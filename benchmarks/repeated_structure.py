@@ -22,12 +22,12 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.simulation.sequence import SyntheticSequence
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.connected import loop_edges
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.window.pending_window import settled
 
 HEADER = (
     "| seed | returns | frames | keyframes | odometry, cm | adjusted, cm | loops | false | verdict |\n"
@@ -64,7 +64,7 @@ def _error(slam: Slam, truth: Trajectory) -> float:
 
 def _loops(slam: Slam, sequence: SyntheticSequence, apart: int) -> tuple[int, int]:
     """Loops that were taken, and those that join places of different sections."""
-    edges = loop_edges(slam, apart)
+    edges = loop_edges(slam.map, apart)
     places = np.array([rigid.centre(sequence.pose(keyframe.frame)) for keyframe in slam.keyframes])
     far = [np.linalg.norm(places[first] - places[second]) > 0.75 * SECTION for first, second in edges]
     return len(edges), int(np.sum(far))

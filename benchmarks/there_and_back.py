@@ -22,8 +22,8 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 
 
 def main() -> None:
@@ -61,7 +61,8 @@ def _print(name: str, slam: Slam, truth: Trajectory) -> None:
     errors = 100 * found.se3.statistics.rmse, 100 * found.sim3.statistics.rmse
     tracked = sum(record.tracked for record in slam.frames)
     print(
-        f"{name}: {tracked}/{len(slam.frames)} tracked, keyframes of each piece {sizes}, {len(slam.ties)} ties, "
+        f"{name}: {tracked}/{len(slam.frames)} tracked, keyframes of each piece {sizes}, "
+        f"{len(slam.map.odometry_factors)} odometry factors, "
         f"ATE of the largest {errors[0]:.2f} cm SE(3), {errors[1]:.2f} cm Sim(3)",
         flush=True,
     )

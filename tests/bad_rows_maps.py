@@ -16,11 +16,13 @@ from bad_row import Row, rows
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
 
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.known_map import MAP, save_map
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
-from vggtgeo.slam.sparse_map.known_map import MAP, save_map
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 
 WIDTH, HEIGHT = bad.WIDTH, bad.HEIGHT
@@ -67,7 +69,8 @@ def state() -> Slam:
     pair = Pair(0, 1, matches, LineMatches(np.zeros(1, int), np.zeros(1, int), np.ones(1)))
     motion = MeasuredRelativePose(0, 1, np.eye(4), np.eye(6))
     return Slam(
-        CAMERA, CAMERA, 0.1 * CAMERA, True, (keyframe(0), keyframe(1)), (pair,), factors=(motion,), origins=(0,)
+        map=Map(True, (keyframe(0), keyframe(1)), (pair,), (motion,), roots=(0,)),
+        camera=CameraEstimate(intrinsics=CAMERA, given=CAMERA, sigma=0.1 * CAMERA),
     )
 
 
@@ -83,12 +86,16 @@ def changed(change: Callable[[Slam], Slam]) -> Callable[[Path], Path]:
 
 def first(**fields: Any) -> Callable[[Path], Path]:
     """A map whose first keyframe has other fields."""
-    return changed(lambda slam: replace(slam, keyframes=(replace(slam.keyframes[0], **fields), slam.keyframes[1])))
+    return changed(
+        lambda slam: replace(
+            slam, map=replace(slam.map, keyframes=(replace(slam.keyframes[0], **fields), slam.keyframes[1]))
+        )
+    )
 
 
 def motion(**fields: Any) -> Callable[[Path], Path]:
     """A map whose keyframes are tied otherwise."""
-    return changed(lambda slam: replace(slam, factors=(replace(slam.factors[0], **fields),)))
+    return changed(lambda slam: replace(slam, map=replace(slam.map, factors=(replace(slam.map.factors[0], **fields),))))
 
 
 def headed(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], Path]:
@@ -146,9 +153,15 @@ MAPS: list[Row] = rows(
         ("a checkpoint", headed(lambda header: header.update(vggtgeo="checkpoint"))),
         ("a field that another version has", headed(lambda header: header["classes"][1][1].append("weather"))),
         ("the state of a run", of_a_run),
-        ("a time that is a text", headed(lambda header: header["tree"]["v"][4][0]["v"].__setitem__(12, "noon"))),
-        ("lengths that are text", headed(lambda header: header["tree"]["v"].__setitem__(3, "yes"))),
-        ("a number of a frame that is none", headed(lambda header: header["tree"]["v"][4][0]["v"].__setitem__(1, "x"))),
+        (
+            "a time that is a text",
+            headed(lambda header: header["tree"]["v"][0]["v"][1][0]["v"].__setitem__(12, "noon")),
+        ),
+        ("lengths that are text", headed(lambda header: header["tree"]["v"][0]["v"].__setitem__(0, "yes"))),
+        (
+            "a number of a frame that is none",
+            headed(lambda header: header["tree"]["v"][0]["v"][1][0]["v"].__setitem__(1, "x")),
+        ),
         ("a time that is NaN", first(recorded=float("nan"))),
         ("a pose with a NaN", first(pose=np.full((4, 4), np.nan))),
         ("key points at 1e300", first(features=replace(keyframe(0).features, pixels=FAR))),
@@ -157,14 +170,23 @@ MAPS: list[Row] = rows(
         ("a motion that is no pose", motion(pose=np.zeros((4, 4)))),
         ("information with a NaN", motion(information=np.full((6, 6), np.nan))),
         ("information that is negative", motion(information=-np.eye(6))),
-        ("deviations of poses that are negative", changed(lambda slam: replace(slam, pose_sigma=-np.ones((2, 2))))),
+        (
+            "deviations of poses that are negative",
+            changed(lambda slam: replace(slam, map=replace(slam.map, pose_sigma=-np.ones((2, 2))))),
+        ),
         ("lines without their descriptors", first(lines=replace(keyframe(0).lines, descriptors=np.ones((0, 64))))),
         (
             "matches of key points that are not there",
             changed(
                 lambda slam: replace(
                     slam,
-                    keyframes=(replace(slam.keyframes[0], features=Features(pixels(3), np.ones(3))), slam.keyframes[1]),
+                    map=replace(
+                        slam.map,
+                        keyframes=(
+                            replace(slam.keyframes[0], features=Features(pixels(3), np.ones(3))),
+                            slam.keyframes[1],
+                        ),
+                    ),
                 )
             ),
         ),

@@ -38,6 +38,8 @@ from vggtgeo.learning import WindowDataset
 from vggtgeo.results.files import read_uncertainty
 from vggtgeo.results.result import Result
 from vggtgeo.results.scene import Scene
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import load_state, save_state
 
@@ -140,7 +142,14 @@ def _mesh(folder: Path) -> bytes:
 
 def _state(folder: Path) -> bytes:
     four = np.array([50.0, 50.0, 31.5, 23.5])
-    save_state(folder / "good.npz", Slam(four, four, np.ones(4), metric=True, notes=("a note",)))
+    save_state(
+        folder / "good.npz",
+        Slam(
+            map=Map(metric=True),
+            camera=CameraEstimate(intrinsics=four, given=four, sigma=np.ones(4)),
+            notes=("a note",),
+        ),
+    )
     return (folder / "good.npz").read_bytes()
 
 

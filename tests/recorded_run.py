@@ -13,12 +13,12 @@ from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window.pending_window import settled
-from vggtgeo.slam.window.window_recorder import WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecorder
 
 FRAMES = 9
 # The shape of tests/test_pipeline.py, so that a process that runs both compiles the solver once.

@@ -9,9 +9,12 @@ import pytest
 from test_keyframe_depth import SIZE, keyframe
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking.carried_poses import carried_poses
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker
 
 KEYFRAMES = (0, 4, 8)
 
@@ -45,7 +48,11 @@ def _walked(begins: tuple[int, ...]) -> Slam:
             arrival = (number - 1, tracked[frame] @ rigid.invert(tracked[frame - 4]))
             records.append(FramePose(frame, float(frame), number, np.eye(4), True, 50, arrival=arrival))
     given = np.array([500.0, 500.0, 320.0, 240.0])
-    return Slam(given, given, np.full(4, 5.0), True, keyframes=keyframes, frames=tuple(records))
+    return Slam(
+        map=Map(metric=True, keyframes=keyframes),
+        camera=CameraEstimate(intrinsics=given, given=given, sigma=np.full(4, 5.0)),
+        tracker=Tracker(frames=tuple(records)),
+    )
 
 
 def test_frames_between_keyframes_share_what_the_adjustment_changed() -> None:
@@ -70,11 +77,11 @@ def test_a_keyframe_that_was_tracked_wrongly_leaves_the_frames_before_it_where_t
     """2.3 m between a keyframe as tracked and as adjusted are drift where its tracking left them open, and an error of
     that frame alone where it did not; without depth they are another unit. Oracle: the straight paths.
     """
-    slam = replace(_walked(begins=(0,)), metric=metric)
+    slam = replace(_walked(begins=(0,)), map=replace(_walked(begins=(0,)).map, metric=metric))
     known = np.diag(np.repeat([sigma, 0.1], 3) ** -2.0)
     arrivals = [record for record in slam.frames if record.arrival is not None]
     ties = tuple(MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known) for r in arrivals if r.arrival)
-    _, poses = carried_poses(replace(slam, factors=ties))
+    _, poses = carried_poses(replace(slam, map=replace(slam.map, factors=ties)))
     for first in (0, 4):
         step = _straight(length) @ rigid.invert(_straight(length)[0])
         assert np.allclose(poses[first : first + 4] @ rigid.invert(poses[first]), step[:4], atol=1e-12)

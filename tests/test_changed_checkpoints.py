@@ -17,15 +17,16 @@ from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, RunSoFar, load_
 from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.run_folder import open_run_folder
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.state import FramePose
-from vggtgeo.slam.window.window_recorder import WindowRecorder
+from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.window_recorder import WindowRecorder
 
 FACTS = {"identity": {"seed": "0"}, "frames": 1, "last": 0, "digest": "0"}
 
 
 def run(**other: Any) -> RunSoFar:
     """A run of one frame."""
-    slam = replace(state(), frames=(FramePose(0, 0.0, 0, np.eye(4), True, 8),))
+    slam = state()
+    slam = replace(slam, tracker=replace(slam.tracker, frames=(FramePose(0, 0.0, 0, np.eye(4), True, 8),)))
     return RunSoFar(**({"slam": slam, "callbacks": {}, "notices": (), "refused": {}, "seconds": {}} | other), **TIMES)
 
 
@@ -62,7 +63,8 @@ def test_times_that_are_none(tmp_path: Path) -> None:
 
 def test_a_state_that_does_not_fit(tmp_path: Path) -> None:
     """What is wrong with the state ends with what to do, too."""
-    kept = run(slam=replace(run().slam, velocity=np.full((4, 4), np.nan)))
+    slam = run().slam
+    kept = run(slam=replace(slam, tracker=replace(slam.tracker, velocity=np.full((4, 4), np.nan))))
     with pytest.raises(InputError, match=r"`velocity` .*16.*--no-resume"):
         asked(tmp_path, kept, FACTS)
 

@@ -405,8 +405,11 @@ def test_pieces_that_nothing_ties_to_the_map_are_left_out(tmp_path: Path) -> Non
     last = slam.keyframes[-1].number
     cut = replace(
         slam,
-        pairs=tuple(pair for pair in slam.pairs if last not in pair.key),
-        factors=tuple(factor for factor in slam.factors if last not in factor.keyframes),
+        map=replace(
+            slam.map,
+            pairs=tuple(pair for pair in slam.map.pairs if last not in pair.key),
+            factors=tuple(factor for factor in slam.map.factors if last not in factor.keyframes),
+        ),
     )
     whole, left = Scene.of(slam), Scene.of(cut)
     assert list(left.frames) == list(whole.frames[:-1])

@@ -20,30 +20,33 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.checkpoints import Checkpoints
-from vggtgeo.slam.camera import first_pass
+from vggtgeo.slam import first_pass
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.window.pending_window import settled
-from vggtgeo.slam.window.sliding_window import _camera_sigma
+from vggtgeo.slam.window_steps import camera_prior
 
 GUESS = Camera.guess(320, 240)
 LENS = Camera((280.0, 280.0, 158.0, 121.0), 320, 240, (-0.1, 0.01, 0.0, 0.0), known=False)
 
 
-def found(**changed: Any) -> Slam:
+def found(**camera: Any) -> Slam:
     """What the last adjustment of a first pass gives: the recorded run's map, with a camera of its own."""
     slam = recorded_run().slam
     keyframes = (slam.keyframes * first_pass.LEAST_KEYFRAMES)[: first_pass.LEAST_KEYFRAMES]
-    return replace(slam, keyframes=keyframes, intrinsics=np.array(LENS.intrinsics), **changed)
+    estimate = replace(slam.camera, intrinsics=np.array(LENS.intrinsics), **camera)
+    return replace(slam, map=replace(slam.map, keyframes=keyframes), camera=estimate)
 
 
 def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
     """The state that a first pass gives whose last adjustment ends with `end`."""
-    monkeypatch.setattr(first_pass, "run_frames", lambda *_: iter([replace(end, lens=None)]))
+    monkeypatch.setattr(
+        first_pass, "run_frames", lambda *_: iter([replace(end, camera=replace(end.camera, lens=None))])
+    )
     monkeypatch.setattr(first_pass, "finish", lambda *_: end)
     return first_pass.begin_with_found_camera(tuple, GUESS, ROLES, SETTINGS)
 
@@ -52,31 +55,41 @@ def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
     # Proves that camera and lens are handed on, with a word for the user, and nothing else of the pass.
     slam = begun(monkeypatch, found(lens=LENS))
     assert slam is not None
-    assert slam.camera_found
-    assert slam.lens == LENS
-    assert slam.intrinsics.tolist() == slam.given_intrinsics.tolist() == list(LENS.intrinsics)
+    assert slam.camera.self_calibrated
+    assert slam.camera.lens == LENS
+    assert slam.intrinsics.tolist() == slam.camera.given.tolist() == list(LENS.intrinsics)
     for focal in (280.0, 5000.0):
-        far = replace(slam, given_intrinsics=np.array([focal, focal, 158.0, 121.0]))
-        assert not far.calibrated, "the last adjustment estimates it once more"
-    assert (slam.frames, slam.keyframes, slam.factors) == ((), (), ())
+        far = replace(slam, camera=replace(slam.camera, given=np.array([focal, focal, 158.0, 121.0])))
+        assert not far.camera.calibrated, "the last adjustment estimates it once more"
+    assert (slam.frames, slam.keyframes, slam.map.factors) == ((), (), ())
     assert "280.0 px (images of 320 x 240) and a lens that distorts, k1 -0.100" in slam.notes[0]
     plain = begun(monkeypatch, found())
     assert plain is not None
-    assert plain.lens is None
+    assert plain.camera.lens is None
     assert plain.notes[0].endswith("focal length of 280.0 px (images of 320 x 240)")
 
 
 def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
     # Proves that a window of two keyframes leaves a camera that nobody gave where it is, that one of three does not,
     # and that the verdict knows which of them it has. Oracle: the standard deviations of the priors.
-    wide = replace(recorded_run().slam, intrinsics_sigma=np.full(4, 100.0), camera_found=False)
+    slam = recorded_run().slam
+    wide = replace(slam, camera=replace(slam.camera, sigma=np.full(4, 100.0), self_calibrated=False))
     for count, held in ((2, True), (3, False)):
-        slam = replace(wide, keyframes=wide.keyframes[:count])
-        assert bool(_camera_sigma(slam, SETTINGS)[0] < 1.0) == held
+        slam = replace(wide, map=replace(wide.map, keyframes=wide.keyframes[:count]))
+        assert bool(camera_prior(slam, SETTINGS).sigma[0] < 1.0) == held
         numbers = frozenset(range(count))
-        pairs = tuple(pair for pair in wide.pairs if numbers.issuperset(pair.key))
+        pairs = tuple(pair for pair in wide.map.pairs if numbers.issuperset(pair.key))
         frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
-        assert Claim.of(replace(slam, pairs=pairs, frames=frames, factors=(), origins=(0,))).guessed == held
+        assert (
+            Claim.of(
+                replace(
+                    slam,
+                    map=replace(slam.map, pairs=pairs, factors=(), roots=(0,)),
+                    tracker=replace(slam.tracker, frames=frames),
+                )
+            ).guessed
+            == held
+        )
 
 
 def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,10 +99,15 @@ def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.M
 
     def run(_: Any, camera: Camera, __: Any, ___: Any, ____: Clock, before: Slam | None) -> Any:
         tracked.append(camera.intrinsics[0] if before is None else before.intrinsics[0])
-        return iter([replace(found(), intrinsics=tracked[-1] * np.array([1.0, 1.0, 0.5, 0.4]))])
+        slam = found()
+        return iter(
+            [replace(slam, camera=replace(slam.camera, intrinsics=tracked[-1] * np.array([1.0, 1.0, 0.5, 0.4])))]
+        )
 
     def end(slam: Slam, *_: Any) -> Slam:
-        return replace(slam, intrinsics=np.array([answers[len(tracked) - 1]] * 2 + [160.0, 120.0]))
+        return replace(
+            slam, camera=replace(slam.camera, intrinsics=np.array([answers[len(tracked) - 1]] * 2 + [160.0, 120.0]))
+        )
 
     monkeypatch.setattr(first_pass, "run_frames", run)
     monkeypatch.setattr(first_pass, "finish", end)
@@ -108,18 +126,23 @@ def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     # and a focal length that is none give no camera.
     whole = found()
     for metric, least in ((False, 10), (True, 3)):
-        of = lambda count, metric=metric: replace(whole, metric=metric, keyframes=whole.keyframes[:count])
+        of = lambda count, metric=metric: replace(
+            whole, map=replace(whole.map, metric=metric, keyframes=whole.keyframes[:count])
+        )
         assert begun(monkeypatch, of(least)) is not None
         assert begun(monkeypatch, of(least - 1)) is None
     lost = tuple(replace(record, tracked=row > 5) for row, record in enumerate(whole.frames))
-    assert begun(monkeypatch, replace(whole, frames=lost)) is None
-    assert begun(monkeypatch, replace(whole, intrinsics=np.array([1e6, 1e6, 160.0, 120.0]))) is None
+    assert begun(monkeypatch, replace(whole, tracker=replace(whole.tracker, frames=lost))) is None
+    assert (
+        begun(monkeypatch, replace(whole, camera=replace(whole.camera, intrinsics=np.array([1e6, 1e6, 160.0, 120.0]))))
+        is None
+    )
 
 
 def test_how_free_a_guess_is() -> None:
     # Proves that the focal length of a guess is free, and that its principal point stays near the middle. Oracle: the
     # settings' words.
-    sigma = begin(GUESS, ROLES, SETTINGS).intrinsics_sigma
+    sigma = begin(GUESS, ROLES, SETTINGS).camera.sigma
     assert sigma == pytest.approx([0.3 * GUESS.intrinsics[0]] * 2 + [0.02 * 320, 0.02 * 240])
 
 
@@ -130,7 +153,8 @@ def test_windows_hold_a_found_camera() -> None:
     guess = replace(walk().camera, intrinsics=tuple(wrong.tolist()), known=False)
     ends = []
     for camera_found in (True, False):
-        first = replace(begin(guess, ROLES, SETTINGS), camera_found=camera_found)
+        first = begin(guess, ROLES, SETTINGS)
+        first = replace(first, camera=replace(first.camera, self_calibrated=camera_found))
         *_, slam = run_frames(iter(recorded_run().frames), guess, ROLES, SETTINGS, Clock(), first)
         ends.append(settled(slam).intrinsics)
     held, free = ends
@@ -150,7 +174,8 @@ class _Passes:
         if self._camera is None:
             return None
         own = np.array(self._camera.intrinsics)
-        return replace(begin(camera, roles, settings), intrinsics=own, given_intrinsics=own, camera_found=True)
+        slam = begin(camera, roles, settings)
+        return replace(slam, camera=replace(slam.camera, intrinsics=own, given=own, self_calibrated=True))
 
 
 def settings(frames: int = 150) -> vg.SlamSettings:
@@ -178,7 +203,7 @@ def test_a_guessed_camera_is_sought_first(monkeypatch: pytest.MonkeyPatch) -> No
     assert "first pass" in result.summary["seconds_by_stage"]
     run(monkeypatch, passes, settings=settings(2), start=1, stride=3)
     assert passes.counts == [FRAMES, 2]
-    assert run(monkeypatch, _Passes(None), end=3).record.slam.given_intrinsics.tolist() == list(GUESS.intrinsics)
+    assert run(monkeypatch, _Passes(None), end=3).record.slam.camera.given.tolist() == list(GUESS.intrinsics)
 
 
 def test_where_there_is_no_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +224,7 @@ def test_a_resumed_run_seeks_no_camera_again(tmp_path: Path, monkeypatch: pytest
     again = _Passes()
     result = run(monkeypatch, again, checkpoints=replace(kept, resume=True))
     assert again.counts == []
-    assert result.record.slam.camera_found
+    assert result.record.slam.camera.self_calibrated
     assert result.intrinsics == pytest.approx(np.array(LENS.intrinsics), abs=0.1)
 
 

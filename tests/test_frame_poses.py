@@ -11,13 +11,17 @@ from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import GeometryResult, PoseGuess
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.camera.rolling_shutter import frame_motions, image_shift
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
+from vggtgeo.slam.camera.rolling_shutter import image_shift
+from vggtgeo.slam.global_map.carried_poses import carried_poses
+from vggtgeo.slam.global_map.frame_motions import frame_motions
+from vggtgeo.slam.global_map.frame_poses import LEAST_POINTS, frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Slots
-from vggtgeo.slam.state import FramePose, Readout, SeenPoints, Slam
-from vggtgeo.slam.tracking.carried_poses import carried_poses
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.following import MOST_KEPT, Located
-from vggtgeo.slam.tracking.frame_poses import LEAST_POINTS, frame_poses
+from vggtgeo.slam.tracking.tracker import FramePose, SeenPoints, Tracker
 
 POINTS = 60
 MOVED = np.array([0.05, -0.02, 0.03, 0.01, 0.02, -0.01])
@@ -43,13 +47,16 @@ def walked(rng: np.random.Generator, points: int = POINTS) -> tuple[Slam, np.nda
         FramePose(1, 0.1, 0, exponential(AWAY) @ motion, True, points, unsure, seen=seen),
         FramePose(2, 0.2, 0, motion @ motion, True, points),
     )
-    known = {"keyframes": (first,), "frames": records, "pose_sigma": np.full((1, 2), 0.01)}
-    return Slam(INTRINSICS, INTRINSICS, np.full(4, 1.0), False, **known), pose
+    sparse_map = Map(False, keyframes=(first,), pose_sigma=np.full((1, 2), 0.01))
+    camera = CameraEstimate(INTRINSICS, INTRINSICS, np.full(4, 1.0))
+    return Slam(sparse_map, camera, Tracker(records)), pose
 
 
 def with_second(slam: Slam, **values: object) -> Slam:
     """The state with another second frame."""
-    return replace(slam, frames=(slam.frames[0], replace(slam.frames[1], **values), slam.frames[2]))
+    return replace(
+        slam, tracker=replace(slam.tracker, frames=(slam.frames[0], replace(slam.frames[1], **values), slam.frames[2]))
+    )
 
 
 def off(slam: Slam, pose: np.ndarray) -> float:
@@ -82,7 +89,7 @@ def test_without_depth_what_tracking_knew_counts_less() -> None:
     """
     slam, pose = walked(np.random.default_rng(0))
     slam = with_second(slam, evidence=Evidence(sigma_translation=0.02, sigma_rotation=0.01))
-    left, measured = off(slam, pose), off(replace(slam, metric=True), pose)
+    left, measured = off(slam, pose), off(replace(slam, map=replace(slam.map, metric=True)), pose)
     assert 4 * left < measured
 
 
@@ -95,7 +102,7 @@ def test_what_the_adjustment_did_to_points_and_keyframe_counts() -> None:
     points = replace(first.points, inverse_depth=2 * first.points.inverse_depth)
     half = pose @ rigid.invert(first.pose)
     half[:3, 3] /= 2
-    slam = replace(slam, keyframes=(replace(first, pose=first.pose @ world, points=points),))
+    slam = replace(slam, map=replace(slam.map, keyframes=(replace(first, pose=first.pose @ world, points=points),)))
     assert off(slam, half @ first.pose @ world) < 1e-3
 
 
@@ -110,10 +117,10 @@ def test_without_enough_points_a_pose_stays() -> None:
     gone = replace(first, points=replace(first.points, inverse_depth=np.full(LEAST_POINTS, np.nan)))
     for wrong in (
         with_second(slam, seen=SeenPoints(few.slots[1:], few.pixels[1:])),
-        replace(slam, keyframes=(gone,)),
+        replace(slam, map=replace(slam.map, keyframes=(gone,))),
         with_second(slam, relative=exponential(np.array([0, 0, -9.0, 0, 0, 0])), evidence=Evidence()),
         with_second(slam, tracked=False),
-        replace(slam, pose_sigma=None),
+        replace(slam, map=replace(slam.map, pose_sigma=None)),
     ):
         np.testing.assert_array_equal(frame_poses(wrong)[1], carried_poses(wrong)[1])
     assert not np.array_equal(frame_poses(slam)[1], carried_poses(slam)[1])
@@ -148,9 +155,9 @@ def test_a_rolling_shutter_is_taken_out_of_what_a_frame_shows(columns: bool) -> 
 
     points = replace(first.points, pixels=read(first.points.pixels, inverse, 0))
     seen = replace(seen, pixels=read(seen.pixels, there, 1).astype(np.float32))
-    rolling = with_second(replace(slam, keyframes=(replace(first, points=points),)), seen=seen)
+    rolling = with_second(replace(slam, map=replace(slam.map, keyframes=(replace(first, points=points),))), seen=seen)
     assert off(rolling, pose) > 0.001
-    assert off(replace(rolling, readout=readout), pose) < 0.2 * off(rolling, pose)
+    assert off(replace(rolling, camera=replace(rolling.camera, readout=readout)), pose) < 0.2 * off(rolling, pose)
 
 
 def test_a_frame_keeps_some_of_its_matches() -> None:

@@ -10,13 +10,15 @@ from recorded_run import RecordedRun, recorded_run
 from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.units import scaled_keyframe, scaled_record
-from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.global_map.frame_poses import frame_poses
+from vggtgeo.slam.perception.rgbd_view import RgbdView
+from vggtgeo.slam.settings.groups import RefinementSettings
+from vggtgeo.slam.settings.slam_settings import Roles
+from vggtgeo.slam.sparse_map.units import scaled_keyframe
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import MOST, against_nearest, against_reference, squared_distance, with_view
 from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
+from vggtgeo.slam.tracking.tracker import FramePose, scaled_record
 
 AWAY = np.array([0.006, -0.005, 0.004, 0.002, -0.003, 0.001])
 """Metres and radians."""
@@ -36,7 +38,9 @@ def between(slam: Slam) -> list[int]:
 def waiting(run: RecordedRun, slam: Slam, rows: list[int]) -> Slam:
     """The state with these frames waiting for a keyframe, and not placed by any so far."""
     frames = tuple(replace(record, second=None) for record in slam.frames)
-    return replace(slam, frames=frames, between=tuple((row, view(run, slam, row)) for row in rows))
+    return replace(
+        slam, tracker=replace(slam.tracker, frames=frames, between=tuple((row, view(run, slam, row)) for row in rows))
+    )
 
 
 def view(run: RecordedRun, slam: Slam, row: int) -> RgbdView:
@@ -51,7 +55,7 @@ def moved(slam: Slam, rows: list[int], away: np.ndarray, sigma: float) -> Slam:
         record, sign = frames[row], (-1) ** number
         evidence = replace(record.evidence, sigma_translation=sigma, sigma_rotation=sigma / 2)
         frames[row] = replace(record, relative=exponential(sign * away) @ record.relative, evidence=evidence)
-    return replace(slam, frames=tuple(frames))
+    return replace(slam, tracker=replace(slam.tracker, frames=tuple(frames)))
 
 
 def off(run: RecordedRun, slam: Slam, rows: list[int]) -> np.ndarray:
@@ -69,22 +73,22 @@ def test_frames_that_stand_aside_come_back(run: RecordedRun) -> None:
     """Frames 9 mm aside are brought back to less than half of that by the next keyframe, and keyframes are left alone;
     oracle: the renderer's poses.
     """
-    slam, number = run.slam, run.slam.reference[0]
+    slam, number = run.slam, run.slam.tracker.reference[0]
     rows = [row for row in between(run.slam) if run.slam.frames[row].reference == number - 1]
     wrong = moved(waiting(run, slam, rows), rows, AWAY, 0.02)
-    found = against_reference(wrong)
+    found = replace(wrong, tracker=against_reference(wrong.map, wrong.tracker))
     before, after = off(run, wrong, rows), off(run, found, rows)
     assert len(before)
     assert before.min() > 0.005
     assert after.max() < 0.5 * before.max(), (before, after)
     others = sorted({*range(len(slam.frames))} - {*between(slam)})
     np.testing.assert_allclose(frame_poses(found)[1][others], frame_poses(wrong)[1][others], atol=1e-12)
-    assert not found.between
+    assert not found.tracker.between
 
 
 def test_a_run_places_its_frames_by_the_keyframe_after_them(run: RecordedRun) -> None:
     """All frames that a later keyframe follows were placed by it; oracle: the order of the run."""
-    placed = [row for row in between(run.slam) if run.slam.frames[row].reference < run.slam.reference[0]]
+    placed = [row for row in between(run.slam) if run.slam.frames[row].reference < run.slam.tracker.reference[0]]
     assert placed
     for row in placed:
         record = run.slam.frames[row]
@@ -94,13 +98,13 @@ def test_a_run_places_its_frames_by_the_keyframe_after_them(run: RecordedRun) ->
 
 def test_frames_that_no_keyframe_follows_are_placed_by_an_earlier_one(run: RecordedRun) -> None:
     """Frames of the newest keyframe are placed by the one before it, in which they stand aside; oracle: true poses."""
-    slam, number = run.slam, run.slam.reference[0]
+    slam, number = run.slam, run.slam.tracker.reference[0]
     row = between(slam)[-1]
     own = replace(slam.frames[row], reference=number, relative=np.eye(4))
     true = run.sequence.pose(own.frame) @ rigid.invert(run.sequence.pose(slam.keyframes[number].frame))
     frames = (*slam.frames[:row], replace(own, relative=true), *slam.frames[row + 1 :])
-    wrong = moved(waiting(run, replace(slam, frames=frames), [row]), [row], AWAY, 0.02)
-    found = against_nearest(wrong, Roles())
+    wrong = moved(waiting(run, replace(slam, tracker=replace(slam.tracker, frames=frames)), [row]), [row], AWAY, 0.02)
+    found = replace(wrong, tracker=against_nearest(wrong.map, wrong.tracker, wrong.intrinsics, Roles()))
     assert found.frames[row].second.keyframe != number
     assert off(run, found, [row])[0] < 0.6 * off(run, wrong, [row])[0]
 
@@ -108,12 +112,13 @@ def test_frames_that_no_keyframe_follows_are_placed_by_an_earlier_one(run: Recor
 def test_pictures_do_not_wait_for_long(run: RecordedRun) -> None:
     """The picture that would be one too many is the last that waits: all of them are placed; oracle: the count."""
     slam, row = run.slam, between(run.slam)[-1]
-    slam = waiting(run, replace(slam, frames=slam.frames[: row + 1]), [row] * (MOST - 1))
-    seen = slam.between[0][1]
-    assert len(with_view(replace(slam, between=slam.between[1:]), seen, Roles(), SlamSettings()).between) == MOST - 1
-    assert not with_view(slam, seen, Roles(), SlamSettings()).between
-    free = replace(slam, metric=False)
-    assert len(with_view(free, seen, Roles(), SlamSettings()).between) == MOST - 1, "lengths of a map without unit"
+    slam = waiting(run, replace(slam, tracker=replace(slam.tracker, frames=slam.frames[: row + 1])), [row] * (MOST - 1))
+    seen = slam.tracker.between[0][1]
+    settings = RefinementSettings()
+    waits = lambda known, tracker: len(with_view(known, tracker, seen, slam.intrinsics, Roles(), settings).between)
+    assert waits(slam.map, replace(slam.tracker, between=slam.tracker.between[1:])) == MOST - 1
+    assert waits(slam.map, slam.tracker) == 0
+    assert waits(replace(slam.map, metric=False), slam.tracker) == MOST - 1, "lengths of a map without unit"
 
 
 def test_poses_that_contradict_each_other_are_told_by_what_both_know(run: RecordedRun) -> None:
@@ -127,7 +132,12 @@ def test_poses_that_contradict_each_other_are_told_by_what_both_know(run: Record
     assert pytest.approx(27.86, abs=0.01) == AGREEMENT_GATE
     rows = [row for row, record in enumerate(run.slam.frames) if record.second is not None]
     contradicted = moved(run.slam, rows, 100 * AWAY, 0.001)
-    alone = replace(contradicted, frames=tuple(replace(record, second=None) for record in contradicted.frames))
+    alone = replace(
+        contradicted,
+        tracker=replace(
+            contradicted.tracker, frames=tuple(replace(record, second=None) for record in contradicted.frames)
+        ),
+    )
     np.testing.assert_allclose(frame_poses(contradicted)[1], frame_poses(alone)[1], atol=1e-12)
 
 
@@ -139,8 +149,10 @@ def test_in_a_larger_world_frames_are_placed_as_before(run: RecordedRun) -> None
     assert any(record.second is not None for record in slam.frames)
     scaled = replace(
         slam,
-        keyframes=tuple(scaled_keyframe(keyframe, 3.0) for keyframe in slam.keyframes),
-        frames=tuple(_known_as_well(scaled_record(record, 3.0), 3.0) for record in slam.frames),
+        map=replace(slam.map, keyframes=tuple(scaled_keyframe(keyframe, 3.0) for keyframe in slam.keyframes)),
+        tracker=replace(
+            slam.tracker, frames=tuple(_known_as_well(scaled_record(record, 3.0), 3.0) for record in slam.frames)
+        ),
     )
     before, after = frame_poses(slam)[1], frame_poses(scaled)[1]
     np.testing.assert_allclose(after[:, :3, 3], 3 * before[:, :3, 3], atol=1e-9)

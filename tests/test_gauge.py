@@ -23,9 +23,9 @@ from vggtgeo.geometry import rigid
 from vggtgeo.simulation.small_window import SimulatedWindow, simulate_window
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.window.sliding_window import make_room
+from vggtgeo.slam.window.window import Window
 from vggtgeo.slam.window.window_prior import WindowPrior
 
 KEYFRAMES, POINTS = 7, 12
@@ -192,9 +192,8 @@ def test_the_keyframe_that_the_next_is_tied_to_stays() -> None:
     the next. Oracle: the numbers.
     """
     settings = SlamSettings(window=WindowSettings(size=4, point_slots=16, line_slots=12))
-    k = np.array([100.0, 100.0, 50.0, 50.0])
-    slam = Slam(k, k, np.ones(4), True, window=(3, 4, 5, 6))
-    assert make_room(slam, settings).window == (4, 5, 6)
-    assert make_room(slam, settings, needed=3).window == (3, 5, 6)
-    assert make_room(slam, settings, needed=5).window == (4, 5, 6)
-    assert make_room(replace(slam, window=(4, 5, 6)), settings, needed=4).window == (4, 5, 6)
+    window = Window(members=(3, 4, 5, 6))
+    assert make_room(window, settings).members == (4, 5, 6)
+    assert make_room(window, settings, needed=3).members == (3, 5, 6)
+    assert make_room(window, settings, needed=5).members == (4, 5, 6)
+    assert make_room(Window(members=(4, 5, 6)), settings, needed=4).members == (4, 5, 6)

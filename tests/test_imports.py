@@ -28,6 +28,27 @@ STAIR = (
 )
 """Packages of `vggtgeo`, the lowest first: each imports of those below it; those of one step nothing of each other."""
 STEP = {package: step for step, packages in enumerate(STAIR) for package in packages}
+SLAM_STAIR = (
+    ("clock", "made_ahead", "precision", "threads"),
+    ("perception",),
+    ("settings",),
+    ("sparse_map",),
+    ("camera", "tracking", "window"),
+    ("state",),
+    ("callback", "keyframe_decision", "pending_window", "submaps", "window_steps"),
+    ("state_checks", "window_recorder"),
+    ("global_map",),
+    ("manhattan", "start"),
+    ("pipeline",),
+    ("state_file",),
+    ("known_map",),
+    ("run",),
+    ("first_pass",),
+    ("verdict",),
+)
+"""Folders and files of `vggtgeo.slam`, the lowest first: each imports of those below it; those of one step nothing of
+each other."""
+SLAM_STEP = {part: step for step, parts in enumerate(SLAM_STAIR) for part in parts}
 LATE = {"vggtgeo.cli"}
 """Packages whose functions import the project: a command's help must not load what the command needs."""
 NEVER_AT_MODULE_LEVEL = {"evo", "onnx", "onnxscript", "pyarrow", "ray", "rerun", "rosbags", "torch"}
@@ -74,6 +95,7 @@ def _module(file: Path) -> str:
 MODULES = {_module(file): file for file in FILES}
 ABOVE = [file for file in FILES if file.is_relative_to(ROOT / "vggtgeo") and file.parent != ROOT / "vggtgeo"]
 """The files on the stair; `vggtgeo/__init__.py` stands on top of it."""
+IN_SLAM = [file for file in ABOVE if _module(file).startswith("vggtgeo.slam.")]
 
 
 def test_imported_sees_every_form() -> None:
@@ -119,6 +141,22 @@ def test_nothing_imports_upward(file: Path) -> None:
         package = module.split(".")[1]
         if package not in (own, "solvers", "models"):
             assert STEP[package] < STEP[own], f"`vggtgeo.{own}` imports `{module}`"
+
+
+def test_the_stair_of_slam_has_a_step_for_every_folder_and_file() -> None:
+    # Proves that no part of `slam` is left out of the test below. Oracle: the folders and files.
+    parts = {_module(file).split(".")[2] for file in IN_SLAM}
+    assert parts == set(SLAM_STEP)
+
+
+@pytest.mark.parametrize("file", IN_SLAM, ids=lambda file: str(Path(file).relative_to(ROOT)))
+def test_nothing_in_slam_imports_upward(file: Path) -> None:
+    # Proves that stages know nothing of the state that holds them, nor of each other. Oracle: the steps above.
+    own = _module(file).split(".")[2]
+    for module in modules(file.read_text()):
+        if module.startswith("vggtgeo.slam."):
+            part = module.split(".")[2]
+            assert part == own or SLAM_STEP[part] < SLAM_STEP[own], f"`slam.{own}` imports `{module}`"
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(Path(file).relative_to(ROOT)))

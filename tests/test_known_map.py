@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS
 from same_leaves import differences
-from test_state_file import rewritten
 from typer.testing import CliRunner
 from vggtgeo.models.classical import NoDepth, OrbMatcher, SiftMatcher
 from vggtgeo.models.roles import Features
@@ -27,13 +26,12 @@ from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.tum_folder import write_tum_folder
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
-from vggtgeo.slam.sparse_map.known_map import as_map, entered, save_map
+from vggtgeo.slam.known_map import as_map, entered, save_map
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.window.pending_window import settled
 
 FRAMES, HALF = 18, 9
 FIXED = replace(SETTINGS, keyframes=replace(SETTINGS.keyframes, localise_only=True))
@@ -95,7 +93,7 @@ def test_a_map_of_another_matcher_is_refused_at_once(known: Slam, points: Any) -
 def test_a_map_comes_back_to_the_bit(known: Slam) -> None:
     """All fields of the map, and none of the run; its keyframes are of frames before any run. Oracle: the state."""
     assert list(differences(as_map(first_half()), known)) == []
-    assert (known.frames, known.window, known.solved, known.notes) == ((), (), None, ())
+    assert (known.frames, known.window.members, known.window.solved, known.notes) == ((), (), None, ())
     count = len(first_half().keyframes)
     assert [keyframe.frame for keyframe in known.keyframes] == list(range(-count, 0))
     for before, after in zip(first_half().keyframes, known.keyframes, strict=True):
@@ -106,7 +104,7 @@ def test_a_map_comes_back_to_the_bit(known: Slam) -> None:
 @pytest.mark.long
 def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: Path) -> None:
     """The time stamps of two runs in one map are those of their clocks, through two files and in the run's folder,
-    where each line belongs to one keyframe; oracle: the time stamps of the runs. A map of version 1 has none.
+    where each line belongs to one keyframe; oracle: the time stamps of the runs.
     """
     first = [keyframe.timestamp for keyframe in first_half().keyframes]
     slam = run(HALF, known_map=known)
@@ -124,25 +122,6 @@ def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: P
     write_trajectories(tmp_path / "alone", first_half())
     assert not (tmp_path / "alone/map-times.txt").exists()
 
-    def older(header: dict[str, Any]) -> None:
-        place = [name for name, _ in header["classes"]].index("Keyframe")
-        header["version"] = 1
-        header["classes"][place][1].remove("recorded")
-        # Of versions 8, 7, 4 and 3.
-        later = ("between", "readout", "camera_found", "lens")
-        for field in later:
-            assert header["classes"][header["tree"]["c"]][1].pop() == field
-            header["tree"]["v"].pop()
-        for keyframe in header["tree"]["v"][4]:
-            assert keyframe["c"] == place
-            keyframe["v"].pop()
-
-    old = vg.load_map(rewritten(tmp_path / "both.map", older))
-    plain = replace(both, keyframes=tuple(replace(keyframe, recorded=None) for keyframe in both.keyframes))
-    assert list(differences(plain, old)) == []
-    with pytest.raises(vg.InputError, match="is no map that vggtgeo wrote, or was changed since"):
-        vg.load_map(rewritten(tmp_path / "both.map", lambda header: header.update(version=1, classes=5)))
-
 
 def test_the_state_of_a_run_is_a_map(known: Slam) -> None:
     """A run goes on in the map of another that is still in memory, whose frames and clock are not its own: it yielded
@@ -151,7 +130,7 @@ def test_the_state_of_a_run_is_a_map(known: Slam) -> None:
     camera = sequence().camera
     assert list(differences(entered(first_half(), camera, ROLES.points), entered(known, camera, ROLES.points))) == []
     with pytest.raises(vg.InputError, match="`known_map` has no keyframe"):
-        entered(replace(known, keyframes=()), camera, ROLES.points)
+        entered(replace(known, map=replace(known.map, keyframes=())), camera, ROLES.points)
 
 
 def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:
@@ -175,11 +154,12 @@ def test_known_space_gets_no_second_keyframes(known: Slam) -> None:
 
 def test_localising_leaves_the_map_as_it_is(known: Slam) -> None:
     """Frames are placed, and no keyframe, match, tie or camera changes, however far they lead; oracle: the map."""
-    known = replace(known, factors=())  # so that going from keyframe to keyframe would tie them anew
+    # Without factors, so that going from keyframe to keyframe would add them anew.
+    known = replace(known, map=replace(known.map, factors=()))
     slam = vg.finish(run(0, settings=FIXED, known_map=known), ROLES, FIXED)
     assert len({record.reference for record in slam.frames}) > 1
-    for name in ("keyframes", "pairs", "factors", "intrinsics", "origins", "pose_sigma"):
-        assert list(differences(getattr(known, name), getattr(slam, name))) == [], name
+    assert list(differences(known.map, slam.map)) == []
+    assert list(differences(known.intrinsics, slam.intrinsics)) == []
     assert np.mean([record.tracked for record in slam.frames]) > 0.5
     assert worst_error(slam) < 0.03
 
@@ -189,7 +169,7 @@ def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     """Frames of another room have no pose in the map; oracle: it is another room."""
     slam = run(0, 6, seed=3, settings=FIXED, known_map=known)
     assert not any(record.tracked for record in slam.frames)
-    assert len(slam.waiting) == 6
+    assert len(slam.tracker.waiting) == 6
     assert "0 of 6 frames were found in the known map" in judge(slam).reasons[0]
     assert not Claim.of(first_half()).in_known_map
 
@@ -210,8 +190,9 @@ def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
     save_state(tmp_path / "state", first_half())
     with pytest.raises(vg.InputError, match="is a state; expected a map"):
         vg.load_map(tmp_path / "state")
+    slam = first_half()
     with pytest.raises(vg.InputError, match="there is no keyframe to save"):
-        save_map(tmp_path / "map", replace(first_half(), keyframes=()))
+        save_map(tmp_path / "map", replace(slam, map=replace(slam.map, keyframes=())))
     read = object.__new__(Result)
     object.__setattr__(read, "record", None)
     with pytest.raises(vg.InputError, match="`save_map`"):

@@ -16,6 +16,7 @@ import pytest
 from recorded_run import ROLES, SETTINGS, recorded_run
 from vggtgeo.models import pinhole
 from vggtgeo.models.classical import NoDepth, SiftMatcher
+from vggtgeo.slam.trust.evidence import FrameEvidence
 
 import vggtgeo as vg
 from vggtgeo.datasets import Frame
@@ -23,14 +24,12 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import SquarePinhole
-from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift, undistorted
-from vggtgeo.slam.global_map.global_adjustment import _taken_lens
-from vggtgeo.slam.sparse_map.known_map import as_map, entered
-from vggtgeo.slam.state import SeenPoints, Slam
-from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.judge import aligned
-from vggtgeo.slam.verdict.witness import FrameEvidence
-from vggtgeo.slam.window.pending_window import settled
+from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
+from vggtgeo.slam.global_map.global_adjustment import _taken_lens, undistorted
+from vggtgeo.slam.known_map import as_map, entered
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import SeenPoints
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
 _solve = eqx.filter_jit(vg.solve)
@@ -123,8 +122,8 @@ def test_few_keyframes_tell_no_lens() -> None:
 def test_a_lens_that_does_not_pay_is_not_taken() -> None:
     # Proves that the state stays where matches do not ask for a lens, or it folds the image. Oracle: the state.
     slam = settled(recorded_run().states[-1])
-    assert slam.solved is not None
-    adjustment, state = slam.solved
+    assert slam.window.solved is not None
+    adjustment, state = slam.window.solved
     left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
     for found in (None, left_out, replace(left_out, warp=float("inf"))):
         assert _taken_lens(slam, adjustment, found) is slam
@@ -168,10 +167,12 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
     # old place.
     before = run_of_room()
     kept = SeenPoints(np.arange(2, dtype=np.int32), np.array([[20.0, 15.0], [140.0, 90.0]], np.float32))
-    before = replace(before, frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
-    assert can_undistort(before)
+    before = replace(
+        before, tracker=replace(before.tracker, frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
+    )
+    assert can_undistort(before.keyframes)
     after = undistorted(before, LENS)
-    assert after.lens is LENS
+    assert after.camera.lens is LENS
     np.testing.assert_array_equal(after.intrinsics, LENS.intrinsics)
     for old, new in zip(before.keyframes, after.keyframes, strict=True):
         for name in ("points", "samples"):
@@ -187,7 +188,7 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
         np.testing.assert_array_equal(new.depth[grid[:, 1], grid[:, 0]], old.depth[rows, columns])
         off = new.image[grid[:, 1], grid[:, 0]].astype(int) - old.image[rows, columns]
         assert np.median(np.abs(off)) <= 8
-    for old_pair, new_pair in zip(before.pairs, after.pairs, strict=True):
+    for old_pair, new_pair in zip(before.map.pairs, after.map.pairs, strict=True):
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_i), old_pair.points.pixels_i, atol=1e-3)
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_j), old_pair.points.pixels_j, atol=1e-3)
     last = after.frames[-1].seen
@@ -212,7 +213,7 @@ def test_descriptors_that_hold_their_image_keep_the_pinhole() -> None:
     slam = run_of_room()
     first = slam.keyframes[0]
     other = replace(first, features=replace(first.features, descriptors=object()))
-    assert not can_undistort(replace(slam, keyframes=(other, *slam.keyframes[1:])))
+    assert not can_undistort((other, *slam.keyframes[1:]))
 
 
 def test_a_camera_that_was_found_goes_with_its_map() -> None:
@@ -220,10 +221,10 @@ def test_a_camera_that_was_found_goes_with_its_map() -> None:
     # the run began with; and that a run in the map holds what was found. Oracle: the rule.
     guess = np.array([160.0, 160.0, 79.5, 59.5])
     known = as_map(undistorted(run_of_room(), LENS))
-    known = replace(known, given_intrinsics=guess, intrinsics_sigma=np.full(4, 48.0))
+    known = replace(known, camera=replace(known.camera, given=guess, sigma=np.full(4, 48.0)))
     within = entered(known, replace(LENS, known=True), SiftMatcher())
-    assert within.camera_found
-    assert within.given_intrinsics.tolist() == list(LENS.intrinsics)
+    assert within.camera.self_calibrated
+    assert within.camera.given.tolist() == list(LENS.intrinsics)
     with pytest.raises(vg.InputError, match=r"is of a camera with fx, fy, cx, cy = 140\.0, 140\.0, 80\.0, 58\.0 px"):
         entered(known, Camera((160.0, 160.0, 79.5, 59.5), 160, 120), SiftMatcher())
 
@@ -264,7 +265,7 @@ def test_a_phone_without_calibration_from_end_to_end(tmp_path: Path) -> None:
     assert evaluate_trajectory(result.trajectory, frames.ground_truth()).sim3.statistics.rmse < 0.02
     result.save_map(tmp_path / "office.map")
     known = vg.load_map(tmp_path / "office.map")
-    assert known.lens is not None
+    assert known.camera.lens is not None
     fixed = replace(vg.SlamSettings(), keyframes=replace(vg.SlamSettings().keyframes, localise_only=True))
     *_, again = vg.run(frames, vg.Roles(depth=NoDepth()), fixed, start=20, end=24, known_map=known)
     places = [np.linalg.inv(again.pose(record))[:3, 3] for record in again.frames if record.tracked]

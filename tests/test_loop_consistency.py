@@ -13,13 +13,13 @@ from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import BELIEF
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.connected import loop_edges
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.tracking.fusion import with_systematic
 from vggtgeo.slam.tracking.odometry import Odometry
-from vggtgeo.slam.window.pending_window import settled
 
 STEP, SIDE = 0.2, 50
 """Metres between keyframes, and keyframes along each side of the corridor."""
@@ -190,7 +190,7 @@ def test_a_rendered_corridor_of_equal_sections_is_not_folded(returns: bool) -> N
     error = lambda slam: evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
     assert any("contradict the rest of the map" in note for note in after.notes), after.notes
     assert error(after) < 2 * error(before), f"{100 * error(before):.2f} -> {100 * error(after):.2f} cm"
-    edges = loop_edges(after, settings.window.size)
+    edges = loop_edges(after.map, settings.window.size)
     places = np.array([rigid.centre(sequence.pose(keyframe.frame)) for keyframe in after.keyframes])
     assert all(np.linalg.norm(places[first] - places[second]) < 0.5 * SECTION for first, second in edges)
     assert bool(edges) or not returns

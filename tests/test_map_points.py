@@ -15,17 +15,18 @@ from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation import simulate
+from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
-from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.fusion import with_systematic
 from vggtgeo.slam.tracking.map_points import Refined, refine_by_map
 from vggtgeo.slam.tracking.track import (
     PIXEL_SIGMA,
     SEARCH_RADIUS,
-    Expectation,
-    Sight,
+    FrameData,
+    MotionPrior,
+    TrackingInput,
     refined_by_map,
     tie_to,
     track,
@@ -104,10 +105,11 @@ def test_a_tie_counts_what_other_keyframes_know_only_once(view: View) -> None:
     Oracle: the track before the refinement.
     """
     keyframes, frame, true, intrinsics = view
-    sight = Sight(Frame(8, 0.8, frame.image, None, ""), Description.of(frame.features), None)
-    expected = Expectation(true, np.eye(4))
-    own = track(sight, keyframes[2], None, expected, intrinsics, ROLES)
-    refined = refined_by_map(own, sight, keyframes, expected, intrinsics)
+    data = FrameData(Frame(8, 0.8, frame.image, None, ""), Description.of(frame.features), None)
+    expected = MotionPrior(true, np.eye(4))
+    given = TrackingInput(data, intrinsics, ROLES, expected)
+    own = track(given, keyframes[2], None)
+    refined = refined_by_map(own, given, keyframes)
     assert refined.evidence.map_points > 0
     assert np.linalg.eigvalsh(refined.measured - own.measured)[0] > 0
     tie = tie_to(refined, 9)
@@ -123,11 +125,11 @@ def test_keyframes_with_too_few_points_each_place_a_frame_together(view: View) -
     keyframes, frame, true, intrinsics = view
     poor = tuple(_knowing(keyframe, frame, true, intrinsics, 10) for keyframe in keyframes)
     wrong = exponential(np.array([0.05, -0.04, 0.04, 0.03, -0.035, 0.02])) @ true
-    sight = Sight(Frame(8, 0.8, frame.image, None, ""), Description.of(frame.features), None)
-    expected = Expectation(wrong, np.eye(4))
+    data = FrameData(Frame(8, 0.8, frame.image, None, ""), Description.of(frame.features), None)
+    given = TrackingInput(data, intrinsics, ROLES, MotionPrior(wrong, np.eye(4)))
     for keyframe in poor:
-        assert not track(sight, keyframe, None, expected, intrinsics, ROLES).accepted
-    found = track_by_map(sight, poor, poor[-1], None, expected, intrinsics, ROLES)
+        assert not track(given, keyframe, None).accepted
+    found = track_by_map(given, poor, poor[-1], None)
     off = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(true))
     assert found.accepted, found.evidence
     assert off < 0.01, f"{100 * off:.1f} cm"

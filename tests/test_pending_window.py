@@ -10,12 +10,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.pending_window import LAG, begin_window, is_due, settled
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.window.pending_window import LAG, begin_window, is_due, settled
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.window.window import Window
 
 CAMERA = np.array([100.0, 100.0, 50.0, 50.0])
-STATE = Slam(CAMERA, CAMERA, np.ones(4), True, window=(0, 1), notes=("before",))
+STATE = Slam(
+    map=Map(metric=True),
+    camera=CameraEstimate(intrinsics=CAMERA, given=CAMERA, sigma=np.ones(4)),
+    window=Window(members=(0, 1)),
+    notes=("before",),
+)
 
 
 def _tie(first: int, second: int) -> MeasuredRelativePose:
@@ -25,20 +34,29 @@ def _tie(first: int, second: int) -> MeasuredRelativePose:
 def test_what_was_noted_meanwhile_is_kept() -> None:
     """Window, camera and notes of the adjustment, and the frames, factors and notes of tracking; oracle: by hand."""
     early, found, late = _tie(0, 1), _tie(1, 2), _tie(0, 2)
-    begun = replace(STATE, factors=(early,))
+    begun = replace(STATE, map=replace(STATE.map, factors=(early,)))
     slam = begin_window(
         begun,
         lambda: replace(
-            begun, intrinsics=2 * CAMERA, window=(1, 2), factors=(early, found), notes=("before", "adjusted")
+            begun,
+            camera=replace(begun.camera, intrinsics=2 * CAMERA),
+            window=replace(begun.window, members=(1, 2)),
+            map=replace(begun.map, factors=(early, found)),
+            notes=("before", "adjusted"),
         ),
     )
     frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
-    slam = replace(slam, frames=(frame,), factors=(*slam.factors, late), notes=(*slam.notes, "tracked"))
+    slam = replace(
+        slam,
+        tracker=replace(slam.tracker, frames=(frame,)),
+        map=replace(slam.map, factors=(*slam.map.factors, late)),
+        notes=(*slam.notes, "tracked"),
+    )
     after = settled(slam)
     assert after.pending is None
-    assert after.window == (1, 2)
+    assert after.window.members == (1, 2)
     assert after.frames == (frame,)
-    assert after.factors == (early, found, late)
+    assert after.map.factors == (early, found, late)
     assert after.notes == ("before", "adjusted", "tracked")
     np.testing.assert_array_equal(after.intrinsics, 2 * CAMERA)
     assert settled(after) is after
@@ -50,20 +68,27 @@ def test_it_is_due_by_the_number_of_frames() -> None:
     assert slam.pending is not None
     slam.pending.result.result()
     frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
-    assert [is_due(replace(slam, frames=(frame,) * count)) for count in (1, LAG, LAG + 1)] == [False, False, True]
+    assert [
+        is_due(replace(slam, tracker=replace(slam.tracker, frames=(frame,) * count))) for count in (1, LAG, LAG + 1)
+    ] == [False, False, True]
     assert not is_due(settled(slam))
 
 
 @pytest.mark.parametrize("again", [lambda slam: pickle.loads(pickle.dumps(slam)), copy.deepcopy])
 def test_a_state_that_waits_for_a_window_pickles_and_copies(again: Callable[[Slam], Slam]) -> None:
     """A Future has a lock, which does neither: the copy has the result. Oracle: that of the state itself."""
-    slam = begin_window(STATE, lambda: replace(STATE, intrinsics=2 * CAMERA, window=(1, 2)))
+    slam = begin_window(
+        STATE,
+        lambda: replace(
+            STATE, camera=replace(STATE.camera, intrinsics=2 * CAMERA), window=replace(STATE.window, members=(1, 2))
+        ),
+    )
     found = again(slam)
     assert found.pending is not None
     assert slam.pending is not None
     assert found.pending.due == slam.pending.due
     after = settled(found)
-    assert after.window == (1, 2)
+    assert after.window.members == (1, 2)
     np.testing.assert_array_equal(after.intrinsics, 2 * CAMERA)
 
 

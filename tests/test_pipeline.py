@@ -26,9 +26,11 @@ from vggtgeo.results.summary import list_submaps
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import compile_global, expected_keyframes
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.global_shape import padded_count, shape_for
 from vggtgeo.slam.global_map.loops import close_loops
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -36,9 +38,8 @@ from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.factors import FREE_LENGTH
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
-from vggtgeo.slam.window.pending_window import settled
-from vggtgeo.slam.window.sliding_window import adjust, solve_jit, window_problem
+from vggtgeo.slam.window.sliding_window import solve_jit, window_problem
+from vggtgeo.slam.window_steps import adjust_window, camera_prior
 
 SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.
@@ -90,9 +91,9 @@ def test_how_long_a_window_takes_changes_nothing(room, tracked: Slam, monkeypatc
 
     def late(slam: Slam, settings: SlamSettings) -> Slam:
         time.sleep(0.1 * (len(slam.keyframes) % 3))
-        return adjust(slam, settings)
+        return adjust_window(slam, settings)
 
-    monkeypatch.setattr("vggtgeo.slam.pipeline.adjust", late)
+    monkeypatch.setattr("vggtgeo.slam.pipeline.adjust_window", late)
     again = _run(frames, camera)
     np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
 
@@ -102,8 +103,8 @@ def test_two_ends_lines_recover_the_truth(room) -> None:
     """ATE below 1.5 cm where each segment has two unknowns; oracle: the renderer's poses."""
     frames, camera, truth = room
     slam = _run(frames, camera, settings=updated(SETTINGS, {"line": {"two_ends_lines": True}}))
-    assert slam.solved is not None
-    assert slam.solved[0].problem.fraction is not None
+    assert slam.window.solved is not None
+    assert slam.window.solved[0].problem.fraction is not None
     assert evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse < 0.015
 
 
@@ -147,7 +148,7 @@ def _shaken(slam: Slam, metres: float, degrees: float, from_keyframe: int = 1, t
         centre = np.zeros(3) if together else rigid.centre(keyframes[number].pose)
         motion[:3, 3] = centre + metres * shift - motion[:3, :3] @ centre
         keyframes[number] = replace(keyframes[number], pose=keyframes[number].pose @ rigid.invert(motion))
-    return replace(slam, keyframes=tuple(keyframes))
+    return replace(slam, map=replace(slam.map, keyframes=tuple(keyframes)))
 
 
 @pytest.mark.parametrize(
@@ -206,12 +207,12 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
         updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth_terms": {"surface_points": 0.0}}),
     )
     apart = _shaken(tracked, 0.05, 2.0, from_keyframe=middle, together=True)
-    within = [pair for pair in apart.pairs if (pair.first < middle) == (pair.second < middle)]
-    tied = [f for f in apart.factors if len({number < middle for number in f.keyframes}) == 1]
-    apart = replace(apart, pairs=tuple(within), factors=tuple(tied))
-    assert len(within) < len(tracked.pairs)
+    within = [pair for pair in apart.map.pairs if (pair.first < middle) == (pair.second < middle)]
+    tied = [f for f in apart.map.factors if len({number < middle for number in f.keyframes}) == 1]
+    apart = replace(apart, map=replace(apart.map, pairs=tuple(within), factors=tuple(tied)))
+    assert len(within) < len(tracked.map.pairs)
     closed = close_loops(apart, ROLES, settings)
-    assert any(pair.first < middle <= pair.second for pair in closed.pairs[len(within) :])
+    assert any(pair.first < middle <= pair.second for pair in closed.map.pairs[len(within) :])
     error = _keyframe_error(adjust_all(closed, settings), room[2])
     assert error < 0.01, f"{error:.4f} m"
     assert _keyframe_error(adjust_all(apart, settings), room[2]) > 0.015
@@ -221,10 +222,17 @@ def _visited_twice(slam: Slam, motion: np.ndarray) -> Slam:
     """The map with every keyframe once more, as of a second visit that began a piece of its own, off by `motion`."""
     count = len(slam.keyframes)
     again = tuple(replace(k, number=k.number + count, pose=k.pose @ rigid.invert(motion)) for k in slam.keyframes)
-    pairs = tuple(replace(p, first=p.first + count, second=p.second + count) for p in slam.pairs)
-    ties = tuple(replace(t, first=t.first + count, second=t.second + count) for t in slam.ties)
-    everything = {"keyframes": (*slam.keyframes, *again), "pairs": (*slam.pairs, *pairs)}
-    return replace(slam, **everything, factors=(*slam.factors, *ties), origins=(0, count))
+    pairs = tuple(replace(p, first=p.first + count, second=p.second + count) for p in slam.map.pairs)
+    ties = tuple(replace(t, first=t.first + count, second=t.second + count) for t in slam.map.odometry_factors)
+    known = slam.map
+    twice = replace(
+        known,
+        keyframes=(*known.keyframes, *again),
+        pairs=(*known.pairs, *pairs),
+        factors=(*known.factors, *ties),
+        roots=(0, count),
+    )
+    return replace(slam, map=twice)
 
 
 @pytest.mark.long
@@ -239,7 +247,7 @@ def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
     count = len(tracked.keyframes)
     closed = close_loops(_visited_twice(tracked, motion), ROLES, settings)
     assert any("straightened the map" in note for note in closed.notes), closed.notes
-    assert sum(pair.first < count <= pair.second for pair in closed.pairs) >= 3
+    assert sum(pair.first < count <= pair.second for pair in closed.map.pairs) >= 3
     for slam, bound in ((closed, 0.10), (adjust_all(closed, settings), 0.005)):
         poses = np.array([keyframe.pose for keyframe in slam.keyframes])
         centres = rigid.invert(poses)[:, :3, 3]
@@ -263,8 +271,9 @@ def test_rgb_recovers_the_shape(room) -> None:
     numbers = {keyframe.frame for keyframe in slam.keyframes}
     between = [record.evidence for record in slam.frames if record.frame not in numbers]
     assert all(np.isfinite(evidence.sigma_translation) for evidence in between)  # and of those that waited for the map
-    assert len(slam.ties) >= len(slam.keyframes) - 2
-    adjustment, _ = window_problem(slam, [slam.keyframes[number] for number in slam.window], SETTINGS)
+    assert len(slam.map.odometry_factors) >= len(slam.keyframes) - 2
+    prior = camera_prior(slam, SETTINGS)
+    adjustment, _ = window_problem(slam.map, slam.window, slam.intrinsics, prior, SETTINGS)
     (motions,) = (term for term in adjustment.problem.terms if isinstance(term, RelativePose))
     present = np.asarray(motions.weight) > 0
     roots, lengths = np.asarray(motions.root)[present], rigid.to_matrix(np.asarray(motions.measured))[present, :3, 3]
@@ -334,7 +343,7 @@ def test_depth_that_fails_on_keyframes_leaves_map_and_scale(room, tracked: Slam,
     assert any(keyframe.frame in blind for keyframe in slam.keyframes), "no keyframe was without depth"
     error = evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
     assert slam.metric
-    assert len(slam.origins) == 1
+    assert len(slam.map.roots) == 1
     assert error < 0.02, f"ATE {error:.4f} m"
 
 
@@ -395,7 +404,7 @@ def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
     elsewhere = [replace(other.frame(60 + i), index=8 + i, timestamp=(8 + i) / 10) for i in range(14)]
     slam = _run([*frames[:8], *elsewhere], camera)
     assert any("tracking was lost at frame 8" in note for note in slam.notes), slam.notes
-    assert len(slam.origins) == 2
+    assert len(slam.map.roots) == 2
     assert len(slam.frames) == 22
     (tmp_path / "trajectory-5.txt").write_text("of a piece that was joined since")
     write_trajectories(tmp_path, slam)
@@ -419,12 +428,12 @@ def test_back_from_a_jump_the_window_is_of_one_piece(room) -> None:
     elsewhere = [other.frame(60 + i) for i in range(14)]
     seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:8], *elsewhere, *frames[7:16]))]
     slam = _run(seen, camera)
-    assert len(slam.origins) == 2, slam.notes
+    assert len(slam.map.roots) == 2, slam.notes
     assert any("found again" in note for note in slam.notes), slam.notes
     assert slam.keyframes[-1].frame > 22, "a keyframe was made after the return"
-    assert len(set(piece_of(slam)[list(slam.window)])) == 1
+    assert len(set(piece_of(slam.map)[list(slam.window.members)])) == 1
     jumped = {keyframe.number for keyframe in slam.keyframes if 8 <= keyframe.frame < 22}
-    assert not [pair.key for pair in slam.pairs if len(jumped & set(pair.key)) == 1]
+    assert not [pair.key for pair in slam.map.pairs if len(jumped & set(pair.key)) == 1]
 
 
 def test_a_frame_of_another_size_is_named(room) -> None:

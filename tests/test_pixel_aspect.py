@@ -156,14 +156,16 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(global_adjustment, "find_aspect", stretched)
     monkeypatch.setattr(global_adjustment, "can_undistort", lambda slam: False)
     slam = recorded_run().states[-1]
-    guess = replace(slam, intrinsics_sigma=np.full(4, 100.0), camera_found=False, pending=None)
+    guess = replace(slam, camera=replace(slam.camera, sigma=np.full(4, 100.0), self_calibrated=False), pending=None)
     assert camera_of(guess) is vg.cameras.SquarePinhole
     done = adjust_all(guess, SETTINGS)
     fx, fy, *_ = done.intrinsics
     assert fy / fx == pytest.approx(1.2, rel=0.02)
     assert any("its pixels are not square" in note for note in done.notes)
     assert len(tried) == 1
-    again = replace(guess, intrinsics=done.intrinsics, given_intrinsics=done.intrinsics, camera_found=True)
+    again = replace(
+        guess, camera=replace(guess.camera, intrinsics=done.intrinsics, given=done.intrinsics, self_calibrated=True)
+    )
     assert camera_of(again) is vg.cameras.Pinhole
     adjust_all(again, SETTINGS)
     assert len(tried) == 1

@@ -119,8 +119,8 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     np.testing.assert_allclose(
         np.sqrt(nominal.rotation**2 - stated.rotation**2), turn * 2 * np.sin(angles / 2), atol=1e-4
     )
-    given = result.record.slam.given_intrinsics + [0.0, 0.0, 3.0, 0.0]
-    moved = replace(result.record.slam, given_intrinsics=given)
+    given = result.record.slam.camera.given + [0.0, 0.0, 3.0, 0.0]
+    moved = replace(result.record.slam, camera=replace(result.record.slam.camera, given=given))
     measured = pose_uncertainty.frame_uncertainty(moved)
     assert measured is not None
     np.testing.assert_allclose(measured.translation, stated.translation)

@@ -116,7 +116,7 @@ def test_depth_that_knows_nothing_leaves_every_other_network_its_part(
     assert set(counted) == set(NEEDED["paper"])
     assert counted["vggt"] >= 3
     assert np.isfinite(frame_trajectory(slam).poses).all()
-    assert slam.waiting or not slam.metric
+    assert slam.tracker.waiting or not slam.metric
 
 
 @pytest.mark.long

@@ -37,10 +37,10 @@ def run() -> RecordedRun:
 
 def iterations_of(slam: Slam) -> IterationRecord | None:
     """A record as the solver makes it (tests/test_solve.py): the cameras go to their places along a line."""
-    if slam.solved is None or slam.energies is None:
+    if slam.window.solved is None or slam.window.energies is None:
         return None
-    ends = [np.asarray(state.poses.wxyz_xyz) for state in (slam.solved[0].initial, slam.solved[1])]
-    rows = np.linspace(0, 1, len(slam.energies))
+    ends = [np.asarray(state.poses.wxyz_xyz) for state in (slam.window.solved[0].initial, slam.window.solved[1])]
+    rows = np.linspace(0, 1, len(slam.window.energies))
     moved = np.stack([(1 - share) * ends[0] + share * ends[1] for share in rows])
     return IterationRecord(*(jnp.asarray(column) for column in (1e-3 * rows, rows, 1 + rows, moved)))
 
@@ -55,7 +55,10 @@ def recording(run: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Pat
     stream = open_target(str(path), "test", path).stream
     callback = RerunCallback(stream)
     for slam in run.states:
-        callback.on_frame(replace(slam, iterations=iterations_of(slam)), run.frames[slam.frames[-1].frame])
+        callback.on_frame(
+            replace(slam, window=replace(slam.window, iterations=iterations_of(slam))),
+            run.frames[slam.frames[-1].frame],
+        )
     callback.on_finish(run.slam, run.cloud)
     stream.disconnect()
     return path
@@ -120,7 +123,9 @@ def moved(slam: Slam, number: int, along: tuple[float, float, float]) -> Slam:
     to_world = rigid.invert(keyframe.pose)
     to_world[:3, 3] += along
     changed = replace(keyframe, pose=rigid.invert(to_world))
-    return replace(slam, keyframes=(*slam.keyframes[:number], changed, *slam.keyframes[number + 1 :]))
+    return replace(
+        slam, map=replace(slam.map, keyframes=(*slam.keyframes[:number], changed, *slam.keyframes[number + 1 :]))
+    )
 
 
 def test_a_keyframe_that_moves_takes_its_cloud_along(run: RecordedRun, tmp_path: Path) -> None:
@@ -160,10 +165,14 @@ def test_points_without_depth_are_logged_again_when_they_left_the_window(run: Re
     """Of a map of free scale the points are shown; those of a keyframe that were twice as far as they are now are
     logged again once it has left the window, and not before. Oracle: the inverse depths.
     """
-    right = replace(run.slam, metric=False, window=(0, 1))
+    right = replace(run.slam, map=replace(run.slam.map, metric=False), window=replace(run.slam.window, members=(0, 1)))
     points = right.keyframes[0].points
     far = replace(right.keyframes[0], points=replace(points, inverse_depth=points.inverse_depth / 2))
-    states = [replace(right, keyframes=(far, *right.keyframes[1:])), right, replace(right, window=(1,))]
+    states = [
+        replace(right, map=replace(right.map, keyframes=(far, *right.keyframes[1:]))),
+        right,
+        replace(right, window=replace(right.window, members=(1,))),
+    ]
     found = components_of(logged(states, tmp_path / "free.rrd"), "/world/live/0", "Points3D:positions")
     assert sorted(found) == [0, 2]
     np.testing.assert_allclose(np.array(found[0]), 2 * np.array(found[2]), rtol=1e-5)
@@ -173,11 +182,19 @@ def test_loops_and_lost_frames_are_shown(run: RecordedRun, tmp_path: Path) -> No
     """A map without a loop gets one, and frames that had a pose lose it: each is drawn from then on, between the places
     by hand; a piece that nothing joins has a path of its own and no line to it. Oracle: the poses.
     """
-    slam = replace(run.slam, factors=(), pairs=())
+    slam = replace(run.slam, map=replace(run.slam.map, factors=(), pairs=()))
     first, second = slam.keyframes[0], slam.keyframes[2]
-    loop = replace(slam, factors=(MeasuredRelativePose(0, 2, second.pose @ rigid.invert(first.pose), np.eye(6)),))
+    loop = replace(
+        slam,
+        map=replace(slam.map, factors=(MeasuredRelativePose(0, 2, second.pose @ rigid.invert(first.pose), np.eye(6)),)),
+    )
     lost = [replace(record, tracked=record.frame not in (3, 4)) for record in run.slam.frames]
-    states = [slam, loop, replace(run.slam, frames=tuple(lost)), replace(slam, frames=tuple(lost))]
+    states = [
+        slam,
+        loop,
+        replace(run.slam, tracker=replace(run.slam.tracker, frames=tuple(lost))),
+        replace(slam, tracker=replace(slam.tracker, frames=tuple(lost))),
+    ]
     path = logged(states, tmp_path / "lost.rrd")
     ends = [rigid.centre(keyframe.pose) for keyframe in (first, second)]
     strips = components_of(path, "/world/loops", "LineStrips3D:strips")

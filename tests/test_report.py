@@ -80,7 +80,10 @@ def test_a_run_that_was_found_nowhere_in_a_known_map_has_a_page(run: RecordedRun
     """Localised only, and in another place: keyframes and a map, and no frame with a pose. All is written but the
     path; it ended in an error after all the work.
     """
-    nowhere = replace(run.slam, frames=tuple(replace(record, tracked=False) for record in run.slam.frames))
+    nowhere = replace(
+        run.slam,
+        tracker=replace(run.slam.tracker, frames=tuple(replace(record, tracked=False) for record in run.slam.frames)),
+    )
     page = _page(run, tmp_path, nowhere, truth=None)
     assert "No frame has a pose." in page
     assert "The map seen from" not in page
@@ -180,7 +183,7 @@ def test_the_page_without_depth_and_without_windows(run: RecordedRun, tmp_path: 
     """A run without depth, map, truth or window has a page that says so."""
     without = [replace(k.images, depth=np.full_like(k.depth, np.nan)) for k in run.slam.keyframes]
     blank = [replace(k, images=images) for k, images in zip(run.slam.keyframes, without, strict=True)]
-    slam = replace(run.slam, keyframes=tuple(blank), metric=False)
+    slam = replace(run.slam, map=replace(run.slam.map, keyframes=tuple(blank), metric=False))
     empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     text = _page(run, tmp_path, slam, cloud=empty, records=[], truth=None)
     for words in ("No window was adjusted", "The sequence has no depth", "too few points", "lengths have no unit"):

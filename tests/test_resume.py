@@ -28,6 +28,8 @@ from vggtgeo.results.run_folder import open_run_folder
 from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.judge import judge
 from vggtgeo.slam.verdict.witness import FrameEvidence
@@ -199,7 +201,7 @@ def test_a_state_that_cannot_be_kept_costs_nothing(
 
 def test_warnings_are_counted_once() -> None:
     """What was warned of before the kill and is read again counts once, what is new counts; oracle: the list."""
-    slam = Slam(np.ones(4), np.ones(4), np.ones(4), metric=True)
+    slam = Slam(map=Map(metric=True), camera=CameraEstimate(intrinsics=np.ones(4), given=np.ones(4), sigma=np.ones(4)))
     said = [InputWarning("a guess"), LeftOutWarning("frame 3", 2), "words"]
     before = RunSoFar(slam, {}, tuple(map(Notice.of, said)), {"depth": (4, 1, 9, 2)}, {}, 0.0, 0.0)
     now = [LeftOutWarning("frame 3", 2), LeftOutWarning("frame 4"), LeftOutWarning("frame 4"), InputWarning("a guess")]

@@ -16,23 +16,21 @@ from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
-from vggtgeo.slam.camera import calibration
 from vggtgeo.slam.camera.calibration import keyframe_pairs
+from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.rolling_shutter import (
     _descend,
     _Search,
-    camera_motions,
     carried,
     find_readout,
-    frame_interval,
     image_shift,
     pair_at_once,
     row_shifts,
     without_readout,
 )
+from vggtgeo.slam.global_map.carried_poses import carried_poses
+from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
-from vggtgeo.slam.state import Readout
-from vggtgeo.slam.tracking.carried_poses import carried_poses
 
 WIDTH, HEIGHT = SIZE
 KEYFRAMES = 8
@@ -166,8 +164,8 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
     height, width = slam.keyframes[0].size
     motions = dict(zip(by_number, some_motions(2), strict=False))
     at = {"seconds": seconds, "camera": slam.intrinsics, "size": (width, height)}
-    edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
-    expected = keyframe_pairs(slam, edges)
+    edges = [edge for pair in slam.map.pairs for edge in directions(pair, by_number)]
+    expected = keyframe_pairs(slam.map, slam.camera, edges)
     usual = float(np.median(np.concatenate([pair.depth for pair in expected])))
 
     def rolled_pixels(pixels: np.ndarray, inverse: np.ndarray, number: int) -> np.ndarray:
@@ -189,11 +187,11 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
         replace(k, points=replace(k.points, pixels=rolled_pixels(k.points.pixels, k.points.prior, k.number)))
         for k in slam.keyframes
     )
-    seen = replace(slam, keyframes=keyframes)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calibration, "camera_motions", lambda _, room: np.stack([motions[n] for n in by_number])[:room])
-        wrong = keyframe_pairs(seen, [moved(edge) for edge in edges])
-        right = keyframe_pairs(replace(seen, readout=Readout(seconds, False, 0.0)), [moved(edge) for edge in edges])
+    seen = replace(slam, map=replace(slam.map, keyframes=keyframes))
+    disturbed_edges = [moved(edge) for edge in edges]
+    wrong = keyframe_pairs(seen.map, seen.camera, disturbed_edges)
+    rolling = replace(seen.camera, readout=Readout(seconds, False, 0.0))
+    right = keyframe_pairs(seen.map, rolling, disturbed_edges, np.stack([motions[n] for n in by_number]))
     for name in ("before", "after"):
         true, disturbed, repaired = (
             np.concatenate([getattr(pair, name) for pair in pairs]) for pairs in (expected, wrong, right)
@@ -232,13 +230,16 @@ def test_frames_far_apart_say_nothing_of_the_motion() -> None:
     slam = recorded_run().slam
     second = slam.keyframes[1].frame
     paused = tuple(replace(f, timestamp=f.timestamp + 5.0 * (f.frame > second)) for f in slam.frames)
-    whole, short = camera_motions(slam, len(slam.keyframes)), camera_motions(replace(slam, frames=paused), 3)
+    whole, short = (
+        camera_motions(slam, len(slam.keyframes)),
+        camera_motions(replace(slam, tracker=replace(slam.tracker, frames=paused)), 3),
+    )
     times, poses = carried_poses(slam)
     there = lie.exp(jnp.asarray(short[1] * (times[second] - times[second - 1]))).as_matrix() @ poses[second - 1]
     assert np.allclose(there, poses[second], atol=1e-6)
     assert not np.allclose(short[1], whole[1], atol=1e-6)
     lost = tuple(replace(f, tracked=f.frame in (0, second)) for f in slam.frames)
-    assert np.all(camera_motions(replace(slam, frames=lost), 3)[1] == 0)
+    assert np.all(camera_motions(replace(slam, tracker=replace(slam.tracker, frames=lost)), 3)[1] == 0)
 
 
 @pytest.mark.slow

@@ -9,10 +9,10 @@ from vggtgeo.models.classical import NoDepth, SiftMatcher
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.description import Description
 
 CAMERA = Camera((300.0, 300.0, 159.5, 119.5), 320, 240)
 ROLES = Roles(points=SiftMatcher(count=500), depth=NoDepth())
@@ -57,7 +57,7 @@ def test_the_first_keyframe_gives_way_to_what_is_seen(images: list[np.ndarray], 
     assert slam.keyframes[-1].frame == first
     assert len(slam.keyframes) == 1
     assert [record.frame for record in slam.frames if record.tracked] == [first]
-    waiting = [frame.frame for frame in slam.waiting]
+    waiting = [frame.frame for frame in slam.tracker.waiting]
     assert sorted(waiting) == [number for number in range(len(images)) if number != first]
     assert slam.frames[first].reference == slam.keyframes[-1].number
 
@@ -65,5 +65,5 @@ def test_the_first_keyframe_gives_way_to_what_is_seen(images: list[np.ndarray], 
 def test_what_waits_is_placed_in_order() -> None:
     """The keyframe that gave way waits before all others, so that the oldest are the first to be forgotten."""
     slam = _seen([BLANK, VIEW, VIEW, VIEW])
-    assert [frame.frame for frame in slam.waiting] == [0, 2, 3]
+    assert [frame.frame for frame in slam.tracker.waiting] == [0, 2, 3]
     assert np.array_equal(slam.keyframes[-1].image, VIEW)

@@ -26,14 +26,16 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.record_file import DATA, HEADER, Layout
 from vggtgeo.io.records import by_name
+from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRotation
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.state import PendingWindow, Readout, SeenPoints, Slam, Waiting
+from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import STATE, load_state, save_state
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.window.pending_window import settled
+from vggtgeo.slam.tracking.tracker import SeenPoints, Waiting
 from vggtgeo.slam.window.window_prior import WindowPrior
 
 MIDDLE = 4
@@ -55,8 +57,8 @@ def full(slam: Slam) -> Slam:
     waiting = Waiting(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
     compressed = (slam.keyframes[0].compressed(), *slam.keyframes[1:])
     slam = settled(slam)
-    assert slam.solved is not None
-    adjustment, state = slam.solved
+    assert slam.window.solved is not None
+    adjustment, state = slam.window.solved
     one = jnp.ones(1)
     under_way: Future[Slam] = Future()
     under_way.set_result(slam)
@@ -64,19 +66,24 @@ def full(slam: Slam) -> Slam:
     seen = SeenPoints(np.zeros(1, np.int32), np.ones((1, 2), np.float32))
     return replace(
         slam,
-        frames=(*slam.frames[:-1], replace(slam.frames[-1], seen=seen)),
-        keyframes=compressed,
-        waiting=(waiting,),
-        prior=WindowPrior(adjustment.keyframes, no_prior(4)),
-        factors=(*slam.factors, MeasuredRotation(0, np.eye(3), np.eye(3)), MeasuredBaseline(0, 1, 0.1, 1e-3)),
-        iterations=tries,
-        held=(0,),
-        axes=(np.eye(3),),
+        tracker=replace(
+            slam.tracker, frames=(*slam.frames[:-1], replace(slam.frames[-1], seen=seen)), waiting=(waiting,)
+        ),
+        map=replace(
+            slam.map,
+            keyframes=compressed,
+            factors=(*slam.map.factors, MeasuredRotation(0, np.eye(3), np.eye(3)), MeasuredBaseline(0, 1, 0.1, 1e-3)),
+            axes=(np.eye(3),),
+            pose_sigma=np.ones((2, 2)),
+        ),
+        window=replace(slam.window, prior=WindowPrior(adjustment.keyframes, no_prior(4)), iterations=tries, held=(0,)),
+        camera=replace(
+            slam.camera,
+            lens=Camera((140.0, 140.0, 80.0, 60.0), 160, 120, (-0.1, 0.0, 0.0, 0.0), known=False),
+            readout=Readout(0.02, False, 3.0),
+        ),
         notes=("a note",),
-        pose_sigma=np.ones((2, 2)),
         pending=PendingWindow(7, slam, under_way),
-        lens=Camera((140.0, 140.0, 80.0, 60.0), 160, 120, (-0.1, 0.0, 0.0, 0.0), known=False),
-        readout=Readout(0.02, False, 3.0),
     )
 
 
@@ -102,11 +109,17 @@ def test_the_walk_sees_a_difference() -> None:
     pose = slam.keyframes[0].pose
     off = pose.copy()
     off[0, 3] = np.nextafter(off[0, 3], 1)
-    changed = lambda **values: replace(slam, keyframes=(replace(slam.keyframes[0], **values), *slam.keyframes[1:]))
+    changed = lambda **values: replace(
+        slam, map=replace(slam.map, keyframes=(replace(slam.keyframes[0], **values), *slam.keyframes[1:]))
+    )
     for other in (
-        changed(pose=off), changed(pose=np.asfortranarray(pose)), changed(place=None),
-        replace(slam, lost=1), replace(slam, frames=slam.frames[:-1]), replace(slam, solved=None),
-    ):  # fmt: skip
+        changed(pose=off),
+        changed(pose=np.asfortranarray(pose)),
+        changed(place=None),
+        replace(slam, tracker=replace(slam.tracker, lost=1)),
+        replace(slam, tracker=replace(slam.tracker, frames=slam.frames[:-1])),
+        replace(slam, window=replace(slam.window, solved=None)),
+    ):
         assert list(differences(slam, other)), other
 
 
@@ -279,12 +292,17 @@ def test_every_flipped_bit_of_the_content_is_noticed(tmp_path: Path) -> None:
 
 def _first(slam: Slam, **changes: Any) -> Slam:
     """The state with another first keyframe."""
-    return replace(slam, keyframes=(replace(slam.keyframes[0], **changes), *slam.keyframes[1:]))
+    return replace(slam, map=replace(slam.map, keyframes=(replace(slam.keyframes[0], **changes), *slam.keyframes[1:])))
 
 
 def _last(slam: Slam, **values: Any) -> Slam:
     """The state with other values in its last frame."""
-    return replace(slam, frames=(*slam.frames[:-1], replace(slam.frames[-1], **values)))
+    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames[:-1], replace(slam.frames[-1], **values))))
+
+
+def _camera(slam: Slam, **values: Any) -> Slam:
+    """The state with another camera."""
+    return replace(slam, camera=replace(slam.camera, **values))
 
 
 def _cut(slots: Slots) -> Slots:
@@ -294,10 +312,10 @@ def _cut(slots: Slots) -> Slots:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda slam: replace(slam, window=(7,)), "names keyframes that are not there"),
-        (lambda slam: replace(slam, keyframes=()), "names keyframes that are not there"),
-        (lambda slam: replace(slam, intrinsics=np.ones(3)), "`intrinsics` has shape [3], expected [4]"),
-        (lambda slam: replace(slam, given_intrinsics=-slam.intrinsics), "expected positive pixels"),
+        (lambda slam: replace(slam, window=replace(slam.window, members=(7,))), "names keyframes that are not there"),
+        (lambda slam: replace(slam, map=replace(slam.map, keyframes=())), "names keyframes that are not there"),
+        (lambda slam: _camera(slam, intrinsics=np.ones(3)), "`intrinsics` has shape [3], expected [4]"),
+        (lambda slam: _camera(slam, given=-slam.intrinsics), "expected positive pixels"),
         (lambda slam: _first(slam, number=1), "not numbered one after the other"),
         (lambda slam: _first(slam, pose=2.0 * np.eye(4)), "`pose` is not a rigid motion"),
         (lambda slam: _first(slam, pose=np.full((4, 4), np.nan)), "`pose` has 16 values that are not finite"),
@@ -310,7 +328,9 @@ def _cut(slots: Slots) -> Slots:
             "expected four of one size",
         ),
         (
-            lambda slam: replace(slam, pairs=(replace(slam.pairs[0], second=9), *slam.pairs[1:])),
+            lambda slam: replace(
+                slam, map=replace(slam.map, pairs=(replace(slam.map.pairs[0], second=9), *slam.map.pairs[1:]))
+            ),
             "names keyframes that are not there",
         ),
         (lambda slam: _last(slam, seen=SeenPoints(np.array([99_999], np.int32), np.ones((1, 2)))), "`slots` has the"),
@@ -331,14 +351,14 @@ def test_states_whose_parts_do_not_belong_together(
 def test_matches_of_key_points_that_are_not_there_are_refused(tmp_path: Path) -> None:
     """Rows of matches are looked at, those of points and those of lines; oracle: the sentence."""
     slam = recorded_run().slam
-    pair = slam.pairs[0]
+    pair = slam.map.pairs[0]
     points = replace(pair.points, index_j=pair.points.index_j + 10_000)
     lines = LineMatches(np.array([0]), np.array([10_000]), np.array([1.0]))
     for wrong, sentence in (
         (replace(pair, points=points), "index_j of points"),
         (replace(pair, lines=lines), "of lines"),
     ):
-        STATE.write(tmp_path / "state.npz", replace(slam, pairs=(wrong, *slam.pairs[1:])))
+        STATE.write(tmp_path / "state.npz", replace(slam, map=replace(slam.map, pairs=(wrong, *slam.map.pairs[1:]))))
         with pytest.raises(InputError, match=sentence):
             load_state(tmp_path / "state.npz")
 
@@ -357,7 +377,7 @@ def test_a_damaged_image_of_a_keyframe_is_told(tmp_path: Path) -> None:
     ):
         images = replace(small.images, **{name: replace(getattr(small.images, name), **wrong)})
         keyframes = (replace(small, images=images), *slam.keyframes[1:])
-        STATE.write(tmp_path / "state.npz", replace(slam, keyframes=keyframes))
+        STATE.write(tmp_path / "state.npz", replace(slam, map=replace(slam.map, keyframes=keyframes)))
         with pytest.raises(InputError, match=rf"`.*state.npz` .* the {name} of keyframe 0 {sentence}"):
             load_state(tmp_path / "state.npz")
 
@@ -365,5 +385,5 @@ def test_a_damaged_image_of_a_keyframe_is_told(tmp_path: Path) -> None:
 def test_reading_keeps_the_callers_precision(saved: Path) -> None:
     """Double precision is the pipeline's own, the caller's switch stays; oracle: the switch, and the type read."""
     with jax.enable_x64(False):
-        assert load_state(saved).solved[1].intrinsics.dtype == jnp.float64
+        assert load_state(saved).window.solved[1].intrinsics.dtype == jnp.float64
         assert jnp.asarray(np.ones(2)).dtype == jnp.float32

@@ -18,8 +18,8 @@ from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.source import open_source
 from vggtgeo.results.static_overlay import StaticOverlaySearch
 from vggtgeo.simulation.tum_folder import write_tum_folder
-from vggtgeo.slam.camera.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.perception.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.verdict.input import check_still_parts
@@ -205,7 +205,7 @@ def test_each_rule_is_needed(
     the picture. Oracle: with that rule switched off there is a mask.
     """
     assert find_still_parts(make()) is None
-    monkeypatch.setattr(f"vggtgeo.slam.camera.still_parts.{rule}", off)
+    monkeypatch.setattr(f"vggtgeo.slam.perception.still_parts.{rule}", off)
     assert find_still_parts(make()) is not None
 
 
@@ -254,7 +254,8 @@ def test_a_lens_that_was_found_undistorts_the_mask(monkeypatch: pytest.MonkeyPat
     lens = vg.Camera(CAMERA.intrinsics, WIDTH, HEIGHT, (-0.3, 0.05, 0.0, 0.0))
     parts = StillParts(np.tile(np.arange(HEIGHT)[:, None] < 30, (1, WIDTH)))
     settings, given = vg.SlamSettings(), {}
-    known = replace(begin(CAMERA, vg.Roles(), settings), lens=lens)
+    known = begin(CAMERA, vg.Roles(), settings)
+    known = replace(known, camera=replace(known.camera, lens=lens))
     described = lambda frames, camera, roles, clock, waiting: given.update(camera=camera, roles=roles) or iter(())
     monkeypatch.setattr("vggtgeo.slam.run._described", described)
     assert not list(run_frames(iter(()), CAMERA, vg.Roles(still_parts=parts), settings, Clock(), known))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from vggtgeo.models.roles import Features
 
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.description import Description
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
 
 INTRINSICS = np.array([260.0, 255.0, 159.5, 119.5])
 

@@ -20,21 +20,21 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.global_map.join_submaps import join_pieces, scaled_piece
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import step
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
-from vggtgeo.slam.sparse_map.pieces import join_pieces, scaled_piece
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking import relocalisation
-from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
-from vggtgeo.slam.tracking.track import Expectation, Sight, Track, track
-from vggtgeo.slam.window.pending_window import settled
+from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, track
 
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
@@ -210,9 +210,10 @@ def _by_lines(room: Room, keep: Callable[[np.ndarray], np.ndarray]) -> tuple[Tra
     segments = ROLES.lines.detect(frames[2].image)
     kept = keep(segments.endpoints)
     segments = Segments(segments.endpoints[kept], segments.scores[kept])
-    sight = Sight(frames[2], blank, None, lambda: ROLES.line_matches.describe(frames[2].image, segments))
+    data = FrameData(frames[2], blank, None, lambda: ROLES.line_matches.describe(frames[2].image, segments))
     wrong = exponential(np.array([0.03, -0.02, 0.02, 0.02, -0.025, 0.015])) @ poses[2]
-    return track(sight, keyframe, None, Expectation(wrong, np.eye(4)), intrinsics, ROLES), poses[2]
+    given = TrackingInput(data, intrinsics, ROLES, MotionPrior(wrong, np.eye(4)))
+    return track(given, keyframe, None), poses[2]
 
 
 def test_lines_alone_hold_a_frame(room: Room) -> None:
@@ -310,7 +311,7 @@ def test_black_frames_are_lost_and_the_map_goes_on(room: Room) -> None:
     dark = range(12, 17)
     slam = _run([_black(frame) if frame.index in dark else frame for frame in frames], camera)
     assert [record.frame for record in slam.frames if not record.tracked] == list(dark)
-    assert len(slam.origins) == 1
+    assert len(slam.map.roots) == 1
     assert len(frame_trajectory(slam)) == len(frames) - len(dark), "a frame without a pose is not in the trajectory"
     assert _error(slam, truth) < 0.015
 
@@ -323,7 +324,7 @@ def test_a_camera_that_comes_back_is_found_again(room: Room) -> None:
     away = [replace(other.frame(60 + i), index=24 + i, timestamp=(24 + i) / 10) for i in range(5)]
     back = [replace(frames[2 + i], index=29 + i, timestamp=(29 + i) / 10) for i in range(6)]
     slam = _run([*frames[:24], *away, *back], camera)
-    assert len(slam.origins) == 1
+    assert len(slam.map.roots) == 1
     assert any("found again" in note for note in slam.notes), slam.notes
     true = rigid.invert(truth.poses) @ truth.poses[0]
     for record in slam.frames[24:29]:
@@ -344,7 +345,7 @@ def test_a_keyframe_without_a_match_is_tied(room: Room) -> None:
     ]
     slam = _run(soft, camera)
     assert all(record.tracked for record in slam.frames)
-    tied = {factor.keyframes[1] for factor in slam.factors}
+    tied = {factor.keyframes[1] for factor in slam.map.factors}
     assert tied == set(range(1, len(slam.keyframes))), "every keyframe but the first is tied to another"
     assert _error(slam, truth) < 0.025
 
@@ -370,22 +371,24 @@ def test_a_place_that_drift_has_moved_is_used_again(
     monkeypatch.setattr(relocalisation, "MOST_DRIFT", 1.0)  # the room is small for so much drift
     frames, camera, truth = room
     slam, old = _run(frames, camera), 3
-    assert min(slam.window) > old - 1
+    assert min(slam.window.members) > old - 1
     drift, away = np.eye(4), np.eye(4)
     drift[:3, 3] = 0.3, 0.0, 0.26
     away[2, 3] = 2.0
     moved = (replace(k, pose=k.pose @ drift) if k.number < old else k for k in slam.keyframes)
     crossing = lambda tie: min(tie.keyframes) < old <= max(tie.keyframes)
     # As if the way to here had been long, no motion ties the two parts directly; or one that puts them elsewhere.
-    cut = tuple(replace(tie, pose=away @ tie.pose) for tie in slam.ties if crossing(tie) and contradicted)
-    kept = (*(factor for factor in slam.factors if not crossing(factor)), *cut)
-    slam = replace(slam, keyframes=tuple(moved), factors=kept)
+    cut = tuple(
+        replace(tie, pose=away @ tie.pose) for tie in slam.map.odometry_factors if crossing(tie) and contradicted
+    )
+    kept = (*(factor for factor in slam.map.factors if not crossing(factor)), *cut)
+    slam = replace(slam, map=replace(slam.map, keyframes=tuple(moved), factors=kept))
     played = [*range(29, -1, -1)]
     for index, row in enumerate(played, start=len(frames)):
         frame = replace(frames[row], index=index, timestamp=index / 10)
         slam = step(slam, frame, Description.of(ROLES.points.describe(frame.image)), ROLES, SETTINGS)
     back = [record for record in slam.frames[len(frames) :] if record.tracked and record.reference < old]
-    new = [tie for tie in slam.ties if crossing(tie) and tie not in cut]
+    new = [tie for tie in slam.map.odometry_factors if crossing(tie) and tie not in cut]
     if contradicted:
         assert not back
         assert not new
@@ -416,7 +419,7 @@ def test_pieces_join_where_they_meet(room: Room) -> None:
     slam = _run(frames, sequence.camera)
     assert any("a new piece of map" in note for note in slam.notes), slam.notes
     assert any("is joined to the one before" in note for note in slam.notes), slam.notes
-    assert len(slam.origins) == 1
+    assert len(slam.map.roots) == 1
     slam = finish(slam, ROLES, updated(SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 10}}))
     times = np.arange(len(numbers)) / 10
     assert _error(slam, Trajectory(times, truth.poses[numbers])) < 0.04
@@ -429,14 +432,18 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
     frames, camera, _ = room
     roles = replace(ROLES, depth=NoDepth())
     seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:16], *frames[14:4:-1]))]
-    whole = replace(_run(seen, camera), metric=False)
+    whole = _run(seen, camera)
+    whole = replace(whole, map=replace(whole.map, metric=False))
     origin = len(whole.keyframes) // 2
     own = lambda ends: len({number < origin for number in ends}) == 1
     torn_apart = replace(
         whole,
-        origins=(0, origin),
-        pairs=tuple(pair for pair in whole.pairs if own(pair.key)),
-        factors=tuple(factor for factor in whole.factors if own(factor.keyframes)),
+        map=replace(
+            whole.map,
+            roots=(0, origin),
+            pairs=tuple(pair for pair in whole.map.pairs if own(pair.key)),
+            factors=tuple(factor for factor in whole.map.factors if own(factor.keyframes)),
+        ),
     )
     apart = scaled_piece(torn_apart, 1.6)
     moved = np.eye(4)
@@ -444,9 +451,9 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
     moved[:3, 3] = [0.5, -1.0, 2.0]
     torn = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
     newest = whole.keyframes[-1]
-    sight = Sight(seen[newest.frame], Description.of(newest.features), None)
-    joined = join_pieces(replace(apart, keyframes=torn), sight, roles, SETTINGS)
-    assert joined.origins == (0,), joined.notes
+    data = FrameData(seen[newest.frame], Description.of(newest.features), None)
+    joined = join_pieces(replace(apart, map=replace(apart.map, keyframes=torn)), data, roles, SETTINGS)
+    assert joined.map.roots == (0,), joined.notes
     for before, after in zip(whole.keyframes[origin:], joined.keyframes[origin:], strict=True):
         off = np.linalg.norm(rigid.centre(before.pose) - rigid.centre(after.pose))
         assert off < 0.05, f"keyframe {before.number} is {100 * off:.1f} hundredths of the unit off"

@@ -44,13 +44,13 @@ from .results.result import Result as Result
 from .simulation import simulate as simulate
 from .simulation import simulate_window as simulate_window
 from .slam.callback import Callback as Callback
+from .slam.known_map import load_map as load_map
 from .slam.run import finish as finish
 from .slam.run import frame_trajectory as frame_trajectory
 from .slam.run import run as run
 from .slam.settings.presets import perception as perception
 from .slam.settings.slam_settings import Roles as Roles
 from .slam.settings.slam_settings import SlamSettings as SlamSettings
-from .slam.sparse_map.known_map import load_map as load_map
 from .slam.verdict.finding import Verdict as Verdict
 from .solvers.adjoint import ArrowAdjoint as ArrowAdjoint
 from .solvers.levenberg_marquardt import SchurLevenbergMarquardt as SchurLevenbergMarquardt

@@ -99,9 +99,9 @@ class ProgressBar(Callback):
 
 
 def _state(slam: Slam) -> str:
-    if slam.lost:
+    if slam.tracker.lost:
         return "lost"
-    return "waiting for parallax" if slam.waiting else "tracking"
+    return "waiting for parallax" if slam.tracker.waiting else "tracking"
 
 
 def errors_line(truth: Mapping[str, Any], free: bool) -> str:

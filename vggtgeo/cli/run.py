@@ -111,8 +111,8 @@ def run(
         switches["localise_only"] = {"keyframes": {"localise_only": True}}
     slam_settings = pipeline_settings(settings, assignments or (), switches)
     from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.slam.known_map import load_map
     from vggtgeo.slam.run import default_roles
-    from vggtgeo.slam.sparse_map.known_map import load_map
 
     if save_map is not None:
         check_map_file(save_map)
@@ -181,7 +181,7 @@ def check_recording_file(target: str, output: Path) -> None:
 
 
 def _is_map(file: Path) -> bool:
-    from vggtgeo.slam.sparse_map.known_map import MAP
+    from vggtgeo.slam.known_map import MAP
 
     try:
         MAP.facts(file)

@@ -108,7 +108,7 @@ class WindowWriter:
 class RunWindows(Callback):
     """Writes every window that a run adjusts: give it to `vggtgeo.reconstruct` as a callback, close `writer` after it.
 
-    label: of the state that has a window adjusted (`slam.solved`), for labels such as its keyframes' true poses.
+    label: of the state that has a window adjusted (`slam.window.solved`), for labels such as its keyframes' true poses.
 
     Example:
         >>> with vg.learning.WindowWriter("windows") as writer:  # doctest: +SKIP
@@ -127,10 +127,10 @@ class RunWindows(Callback):
         self._write(slam)
 
     def _write(self, slam: Slam) -> None:
-        if slam.solved is None or slam.solved is self._last:
+        if slam.window.solved is None or slam.window.solved is self._last:
             return
-        self._last = slam.solved
-        adjustment, _ = slam.solved
+        self._last = slam.window.solved
+        adjustment, _ = slam.window.solved
         labels = {"keyframes": _padded(adjustment.keyframes, len(adjustment.initial.poses.wxyz_xyz))}
         more = self._label(slam) if self._label is not None else {}
         self._writer.add((adjustment.problem, adjustment.initial, adjustment.index), **labels, **more)

@@ -15,9 +15,9 @@ from vggtgeo.mapping.consistency import DIFFERENCE_RANGE, PosedDepth, confirm
 from vggtgeo.mapping.dense import fill_holes
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.models import pinhole
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
 
 NEAREST = 4
 """Keyframes from which a frame's depth is taken."""
@@ -65,7 +65,7 @@ class FrameDepths:
     def __init__(self, slam: Slam, depth_maps: Sequence[DepthMap | None]):
         self._slam = slam
         self._poses = frame_poses(slam)[1]
-        self._submap = piece_of(slam)
+        self._submap = piece_of(slam.map)
         self._views: Mapping[int, PosedDepth] = {
             keyframe.number: PosedDepth(depth_map, keyframe.pose, np.asarray(slam.intrinsics, np.float64))
             for keyframe, depth_map in zip(slam.keyframes, depth_maps, strict=True)

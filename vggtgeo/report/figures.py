@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from vggtgeo.figures.plots import trajectory_figure
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.slam.window.window_recorder import WindowRecord
+from vggtgeo.slam.window_recorder import WindowRecord
 
 COLOURS = {
     "#1f5fbf": "var(--blue)",

@@ -21,7 +21,7 @@ from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Verdict
-from vggtgeo.slam.window.window_recorder import WindowRecord
+from vggtgeo.slam.window_recorder import WindowRecord
 
 _Value = TypeVar("_Value")
 SAMPLES = 4

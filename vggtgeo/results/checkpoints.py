@@ -33,9 +33,9 @@ from vggtgeo.results.summary import versions
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
+from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 from vggtgeo.slam.verdict.witness import EvidenceSoFar, FrameEvidence
-from vggtgeo.slam.window.window_recorder import WindowRecord
+from vggtgeo.slam.window_recorder import WindowRecord
 
 _CONTEXT, _EXCERPT = 30, 110
 """Characters of a long setting that an error shows, and how many of them lie before the first difference."""
@@ -130,7 +130,7 @@ class RunSoFar:
 
 
 KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, WindowRecord)
-CHECKPOINT = Layout("checkpoint", VERSION, by_name(KEPT_CLASSES), UPGRADES)
+CHECKPOINT = Layout("checkpoint", VERSION, by_name(KEPT_CLASSES))
 
 
 def run_identity(
@@ -236,7 +236,7 @@ def digest_of(frame: Frame) -> str:
 
 def digest_of_map(known: Slam) -> str:
     """Return the SHA-256 of the poses and the key points of a map."""
-    digest = hashlib.sha256(repr(len(known.pairs)).encode())
+    digest = hashlib.sha256(repr(len(known.map.pairs)).encode())
     for keyframe in known.keyframes:
         digest.update(keyframe.pose.tobytes())
         digest.update(np.ascontiguousarray(keyframe.features.pixels).data)

@@ -16,9 +16,9 @@ from vggtgeo.io.pictures import write_picture
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 
 DEPTH_UNIT = 5000.0
 """Counts per metre in the 16-bit depth images, as in the TUM RGB-D format."""

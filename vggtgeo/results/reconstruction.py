@@ -27,21 +27,21 @@ from vggtgeo.results.static_overlay import StaticOverlaySearch
 from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.camera.first_pass import begin_with_found_camera
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.first_pass import begin_with_found_camera
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
+from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
-from vggtgeo.slam.sparse_map.known_map import entered
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.input import check_input, check_refusals
 from vggtgeo.slam.verdict.judge import judge_or_report
 from vggtgeo.slam.verdict.witness import EvidenceRecorder
-from vggtgeo.slam.window.window_recorder import WindowRecord, WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
     "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not used; start "
@@ -128,7 +128,7 @@ def reconstruct(
         )
         before = load_checkpoint(source.resumable(checkpoints), identity)
         # Corners for the verdict are undistorted by the known map's camera, or later by the one of this run.
-        evidence_camera = source.camera if first is None or first.lens is None else source.camera.pinhole
+        evidence_camera = source.camera if first is None or first.camera.lens is None else source.camera.pinhole
         windows, evidence, overlay = WindowRecorder(), EvidenceRecorder(evidence_camera), StaticOverlaySearch()
         hooks = RunCallbacks((windows, evidence, overlay, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
@@ -247,7 +247,7 @@ def _conclude(
         **run.facts,
     }
     notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
-    valid = (slam.lens or run.source.camera).undistorter().valid
+    valid = (slam.camera.lens or run.source.camera).undistorter().valid
     record = RunRecord(slam, built, tuple(windows), run.source.truth, notices, run.title, valid)
     return Result.assemble(record, verdict, summary)
 

@@ -71,7 +71,7 @@ def _sensor_depths(slam: Slam, frames: Frames | None) -> Iterator[tuple[int, Dep
     """Rows of `slam.frames`, each with the frame's depth image, undistorted."""
     left = set(range(len(slam.frames)))
     if frames is not None and frames.has_depth and slam.metric:
-        undistorter, sensor = (slam.lens or frames.camera).undistorter(), SensorDepth()
+        undistorter, sensor = (slam.camera.lens or frames.camera).undistorter(), SensorDepth()
         for row, frame in reread_frames(slam, frames):
             left.remove(row)
             depth = None

@@ -40,14 +40,14 @@ from vggtgeo.results.summary import add_writing_time, compare_with_truth, summar
 from vggtgeo.results.summary_file import load_poses, read_summary, summary_error
 from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
+from vggtgeo.slam.known_map import save_map
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
-from vggtgeo.slam.sparse_map.known_map import save_map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
 from vggtgeo.slam.verdict.witness import Evidence
-from vggtgeo.slam.window.pending_window import settled
-from vggtgeo.slam.window.window_recorder import WindowRecord
+from vggtgeo.slam.window_recorder import WindowRecord
 
 DepthChoice = bool | Literal["every"]
 """Which depth images to save: none, those of the keyframes, or those of every frame."""

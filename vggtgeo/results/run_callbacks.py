@@ -11,8 +11,8 @@ from vggtgeo.io.given import check_kind
 from vggtgeo.results.checkpoints import RunSoFar
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.tracking.rgbd_alignment import compile_alignment
 from vggtgeo.slam.window.sliding_window import warm_up
 
 

@@ -22,10 +22,10 @@ from vggtgeo.io.files import atomic_open
 from vggtgeo.io.pictures import write_picture
 from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.results.reread_frames import reread_frames
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.submaps import pieces_by_size
 
 VERSION = 1
 MASK = "image-mask.png"
@@ -84,7 +84,7 @@ class Scene:
         """
         keyframes = _largest_submap(slam)
         numbers = {keyframe.number for keyframe in keyframes}
-        pairs = [pair for pair in slam.pairs if numbers.issuperset(pair.key)]
+        pairs = [pair for pair in slam.map.pairs if numbers.issuperset(pair.key)]
         height, width = keyframes[0].size
         return cls(
             np.array([keyframe.frame for keyframe in keyframes]),
@@ -254,7 +254,7 @@ def write_scene(folder: Path, slam: Slam, valid: np.ndarray | None = None, frame
 def _other_frames(folder: Path, slam: Slam, scene: Scene, frames: Frames) -> Iterator[tuple[int, float, np.ndarray]]:
     """Write the images of tracked frames that are not views yet; yield number, time and pose, world -> camera."""
     submap, poses = {keyframe.number for keyframe in _largest_submap(slam)}, frame_poses(slam)[1]
-    known, undistorter = set(scene.frames.tolist()), (slam.lens or frames.camera).undistorter()
+    known, undistorter = set(scene.frames.tolist()), (slam.camera.lens or frames.camera).undistorter()
     for row, frame in reread_frames(slam, frames):
         record = slam.frames[row]
         if record.tracked and record.reference in submap and record.frame not in known:

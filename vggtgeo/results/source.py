@@ -151,5 +151,5 @@ def reduction_summary(source: Source, slam: Slam) -> dict[str, Any]:
     enlarge = lambda camera: camera.resized(source.read.width, source.read.height)
     original = enlarge(replace(source.camera, intrinsics=(fx, fy, cx, cy)))
     camera = dict(zip(("fx", "fy", "cx", "cy"), original.intrinsics, strict=True))
-    lens = {} if slam.lens is None else {"lens": lens_parameters(enlarge(slam.lens))}
+    lens = {} if slam.camera.lens is None else {"lens": lens_parameters(enlarge(slam.camera.lens))}
     return {"images_reduced": {"from": read, "to": size, "intrinsics_as_read": camera}, **lens}

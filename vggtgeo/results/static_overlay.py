@@ -12,7 +12,14 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.source import Source
 from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.camera.still_parts import APART, PICTURES, StillParts, find_still_parts, small_grey, still_parts_of
+from vggtgeo.slam.perception.still_parts import (
+    APART,
+    PICTURES,
+    StillParts,
+    find_still_parts,
+    small_grey,
+    still_parts_of,
+)
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Finding
 from vggtgeo.slam.verdict.input import check_still_parts

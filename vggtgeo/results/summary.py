@@ -20,8 +20,8 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.results.files import submap_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 
 
@@ -73,15 +73,15 @@ def summarise(
         "frames": len(slam.frames),
         "frames_tracked": tracked,
         "keyframes": len(slam.keyframes),
-        "pairs": len(slam.pairs),
+        "pairs": len(slam.map.pairs),
         "pieces": list_submaps(slam),
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
         "scale": scale_name(slam, verdict),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
         **_pose_sigma(slam),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
-        **({} if slam.lens is None else {"lens": lens_parameters(slam.lens)}),
-        **({} if slam.readout is None else {"rolling_shutter": asdict(slam.readout)}),
+        **({} if slam.camera.lens is None else {"lens": lens_parameters(slam.camera.lens)}),
+        **({} if slam.camera.readout is None else {"rolling_shutter": asdict(slam.camera.readout)}),
         "seconds_by_stage": {name: round(value, 3) for name, value in seconds.items()},
         "notes": list(slam.notes),
         **counts,

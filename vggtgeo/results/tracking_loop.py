@@ -14,11 +14,12 @@ from vggtgeo.io.interruption import Interruption
 from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, Notice, RunSoFar, check_same_frame
 from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.window.pending_window import settled
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import FramePose
 
 
 class PendingFrames:

@@ -29,23 +29,26 @@ def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
     """The state after the newest keyframe's segments have spoken, where they show the axes of the world."""
     if not settings.line.manhattan:
         return slam
-    keyframe = slam.keyframes[slam.window[-1]]
+    keyframe = slam.keyframes[slam.window.members[-1]]
     rotation = keyframe.pose[:3, :3]
-    axes = mean_rotation(slam.axes) if slam.axes else None
+    axes = mean_rotation(slam.map.axes) if slam.map.axes else None
     predicted = None if axes is None else rotation @ axes
     view = ManhattanEstimator().estimate(keyframe.lines.segments.endpoints, slam.intrinsics, predicted)
     if view is None:
         return slam
     if axes is None:
-        return replace(slam, axes=(rotation.T @ view.rotation,))
-    if len(slam.axes) < FIRST_VIEWS:
-        return replace(slam, axes=(*slam.axes, rotation.T @ nearest_frame(view.rotation, rotation @ axes)))
+        return replace(slam, map=replace(slam.map, axes=(rotation.T @ view.rotation,)))
+    if len(slam.map.axes) < FIRST_VIEWS:
+        return replace(
+            slam,
+            map=replace(slam.map, axes=(*slam.map.axes, rotation.T @ nearest_frame(view.rotation, rotation @ axes))),
+        )
     off = Rotation.from_matrix(rotation @ axes @ view.rotation.T).as_rotvec()
     if np.linalg.norm(off) > LARGEST_DISAGREEMENT:
         return slam
     # `view.information` is that of `Log(R M^T)` at the tracked pose; degrees apart, the root at zero is the same.
     measured = MeasuredRotation(keyframe.number, view.rotation @ axes.T, view.information)
-    return replace(slam, factors=(*slam.factors, measured))
+    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, measured)))
 
 
 def mean_rotation(rotations: tuple[np.ndarray, ...]) -> np.ndarray:

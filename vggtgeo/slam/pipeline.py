@@ -10,25 +10,44 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.global_map.join_submaps import join_pieces
+from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
+from vggtgeo.slam.pending_window import begin_window, is_due, settled
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
-from vggtgeo.slam.sparse_map.pieces import join_pieces
-from vggtgeo.slam.start import MOST_WAITING, begin_again_with_depth, start_without_depth, without_depth
-from vggtgeo.slam.state import FramePose, Slam
-from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.start import (
+    MOST_WAITING,
+    begin_again_with_depth,
+    start_without_depth,
+    without_depth,
+)
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
-from vggtgeo.slam.tracking.relocalisation import place_waiting, record_of, relocalise, revisit, sight_of, view_of, wait
+from vggtgeo.slam.tracking.relocalisation import (
+    frame_data,
+    place_waiting,
+    record_of,
+    relocalise,
+    revisit,
+    view_of,
+    wait,
+)
 from vggtgeo.slam.tracking.track import (
-    Expectation,
-    Sight,
+    FrameData,
+    MotionPrior,
     Track,
+    TrackingInput,
     moved_with,
     refined_by_map,
     tie_between,
@@ -36,8 +55,8 @@ from vggtgeo.slam.tracking.track import (
     track,
     track_by_map,
 )
-from vggtgeo.slam.window.pending_window import begin_window, is_due, settled
-from vggtgeo.slam.window.sliding_window import adjust, enter
+from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 LOST_PATIENCE = 10
 """Frames that show something, but nothing of the map, before a new piece of map begins. Black frames do not count."""
@@ -54,7 +73,7 @@ def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
         focal = settings.camera.guessed_intrinsics_sigma * intrinsics[0]
         centre = settings.camera.guessed_centre_sigma * np.array([camera.width, camera.height])
         sigma = np.array([focal, focal, *centre])
-    return Slam(intrinsics, intrinsics, sigma, roles.metric)
+    return Slam(Map(roles.metric), CameraEstimate(intrinsics, given=intrinsics, sigma=sigma))
 
 
 @in_double_precision
@@ -74,7 +93,21 @@ def step(
             features = description.features
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
             return begun or start_without_depth(slam, frame, features, roles, settings)
-    return _follow(slam, frame, description, roles, settings, clock)
+
+    slam, data, found = _track(slam, frame, description, roles, settings, clock)
+    if found is None or not found.accepted:
+        return _missed(slam, data, Evidence() if found is None else found.evidence, roles, settings)
+    was_lost = bool(slam.tracker.lost)
+    slam = _moved(slam, frame, found)
+
+    slam, found, becomes_keyframe = _decide(slam, data, found, roles, settings, clock)
+    if becomes_keyframe:
+        slam = _insert_and_adjust(slam, data, found, roles, settings, clock)
+    else:
+        slam = _refer_to(slam, found.keyframe, roles)
+        slam = _with_record(slam, record_of(frame, found))
+        slam = _with_view(slam, data.view, roles, settings)
+    return _place_waiting(slam, roles) if was_lost else slam
 
 
 def _settled(slam: Slam, clock: Clock) -> Slam:
@@ -84,12 +117,14 @@ def _settled(slam: Slam, clock: Clock) -> Slam:
 
 def _started(slam: Slam) -> bool:
     """Whether there is a map to track in. A later keyframe may well be without depth: its neighbours have some."""
-    return len(slam.window) > 1 or bool(np.any(np.isfinite(slam.keyframes[slam.window[-1]].points.inverse_depth)))
+    return len(slam.window.members) > 1 or bool(
+        np.any(np.isfinite(slam.keyframes[slam.window.members[-1]].points.inverse_depth))
+    )
 
 
 def _in_known_map(slam: Slam) -> bool:
     """Whether there is a map that no frame has been tracked in so far, or none that became a keyframe."""
-    return not slam.window
+    return not slam.window.members
 
 
 def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
@@ -99,158 +134,167 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, len(features))
     return replace(
         slam,
-        keyframes=(*slam.keyframes, keyframe),
-        window=(number,),
-        prior=None,
-        solved=None,
-        origins=(*slam.origins, number),
-        held=(),
-        axes=(),
-        frames=(*slam.frames, record),
-        velocity=np.eye(4),
-        reference=None,
-        lost=0,
+        map=replace(slam.map, keyframes=(*slam.keyframes, keyframe), roots=(*slam.map.roots, number), axes=()),
+        window=replace(slam.window, members=(number,), prior=None, solved=None, held=()),
+        tracker=replace(slam.tracker, frames=(*slam.frames, record), velocity=np.eye(4), reference=None, lost=0),
     )
 
 
-def _follow(
+def _track(
     slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock
-) -> Slam:
+) -> tuple[Slam, FrameData, Track | None]:
+    """The frame and its pose by the map, and the state that the pose belongs to.
+
+    A pending window is taken up first where the frame has no pose, or becomes a keyframe.
+    """
     with clock.measure("track"):
-        sight = _with_lines(sight_of(frame, description, slam, roles), roles, settings)
-        # In a map of another run nothing tells where the first frame is: it is searched by what it looks like alone.
-        blind = _in_known_map(slam) and slam.reference is None
-        found = None if blind else _find(slam, sight, roles, settings)
+        data = _with_lines(frame_data(frame, description, slam.intrinsics, roles, slam.metric), roles, settings)
+        # In a map of another run the place of the first frame is unknown: it is searched by appearance alone.
+        unknown_place = _in_known_map(slam) and slam.tracker.reference is None
+        found = None if unknown_place else _find(slam, data, roles, settings)
     if slam.pending is not None and (found is None or not found.accepted):
         slam = _settled(slam, clock)
         with clock.measure("track"):
-            found = _find(slam, sight, roles, settings)
+            found = _find(slam, data, roles, settings)
     if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
         slam = _settled(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
-    if slam.lost and (found is None or not found.accepted):
+    if slam.tracker.lost and (found is None or not found.accepted):
         with clock.measure("relocalise"):
-            place = relocalise(sight, slam.keyframes, slam, roles)
-        if place is not None:
-            return _found_again(slam, sight, place, roles, settings, clock)
-    if found is None or not found.accepted:
-        return _missed(slam, sight, Evidence() if found is None else found.evidence, roles, settings)
-    was_lost = bool(slam.lost)
-    if was_lost:
+            found = relocalise(TrackingInput(data, slam.intrinsics, roles), slam.keyframes, slam.tracker) or found
+    return slam, data, found
+
+
+def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
+    """The state with the motion to a tracked frame, which is unknown after tracking was lost."""
+    if slam.tracker.lost:
         slam = _noted_found(slam, frame)
-    velocity = np.eye(4) if was_lost else found.pose @ rigid.invert(slam.last_pose)
-    slam = _enter_frame(replace(slam, velocity=velocity, lost=0), sight, found, roles, settings, clock)
-    return place_waiting(slam, roles) if was_lost else slam
+        velocity = np.eye(4)
+    else:
+        velocity = found.pose @ rigid.invert(slam.last_pose)
+    return replace(slam, tracker=replace(slam.tracker, velocity=velocity, lost=0))
 
 
-def _find(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Track:
+def _decide(
+    slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
+) -> tuple[Slam, Track, bool]:
+    """Whether a tracked frame becomes a keyframe; not where an old one shows it as well, which is then its keyframe."""
+    if _needs_keyframe(found, settings):
+        with clock.measure("track"):
+            tied, found = _seen_before(slam, data, found, roles, settings)
+            slam = slam if settings.keyframes.localise_only else tied
+    return slam, found, not settings.keyframes.localise_only and _needs_keyframe(found, settings)
+
+
+def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Track:
     """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
-    predicted = rigid.orthonormal(slam.velocity @ slam.last_pose)
-    expected = Expectation(predicted, slam.velocity, slam.lost)
-    first = slam.reference[0] if slam.reference is not None else slam.window[-1]
-    others = [number for number in reversed(slam.window) if number != first][:2]
-    window = [slam.keyframes[number] for number in (first, *others)]
+    predicted = rigid.orthonormal(slam.tracker.velocity @ slam.last_pose)
+    prior = MotionPrior(predicted, slam.tracker.velocity, slam.tracker.lost)
+    first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
+    others = [number for number in reversed(slam.window.members) if number != first][:2]
+    window = tuple(slam.keyframes[number] for number in (first, *others))
+    given = TrackingInput(data, slam.intrinsics, roles, prior, window)
     best: Track | None = None
     for keyframe in window:
-        found = track(sight, keyframe, view_of(keyframe, slam, roles), expected, slam.intrinsics, roles, window)
+        found = track(given, keyframe, view_of(keyframe, slam.tracker, slam.intrinsics, roles))
         if best is None or _rank(found) > _rank(best):
             best = found
         if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
             break
     assert best is not None
     # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
-    if not settings.tracking.search_map or (best.accepted and not sight.description.described):
+    if not settings.tracking.search_map or (best.accepted and not data.description.described):
         return best
-    piece = slam.keyframes[slam.origins[-1] :]
+    piece = slam.keyframes[slam.map.roots[-1] :]
     if not best.accepted:
-        source = view_of(best.keyframe, slam, roles)
-        joint = track_by_map(sight, piece, best.keyframe, source, expected, slam.intrinsics, roles)
+        source = view_of(best.keyframe, slam.tracker, slam.intrinsics, roles)
+        joint = track_by_map(given, piece, best.keyframe, source)
         return joint if joint.accepted else best
-    return refined_by_map(best, sight, piece, expected, slam.intrinsics)
+    return refined_by_map(best, given, piece)
 
 
-def _with_lines(sight: Sight, roles: Roles, settings: SlamSettings) -> Sight:
-    """The sight with a way to its segments, where lines take part in tracking."""
+def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameData:
+    """The data with a way to its segments, where lines take part in tracking."""
     if not settings.line.in_tracking:
-        return sight
-    return replace(sight, find_lines=lambda: find_lines(sight.frame.image, roles, settings))
+        return data
+    return replace(data, find_lines=lambda: find_lines(data.frame.image, roles, settings))
 
 
 def _rank(found: Track) -> tuple[bool, int]:
     return found.accepted, found.evidence.inliers
 
 
-def _enter_frame(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
-    """Hang a tracked frame on its keyframe, or make it one."""
-    frame = sight.frame
-    if _needs_keyframe(found, settings):
-        with clock.measure("track"):
-            tied, found = _seen_before(slam, sight, found, roles, settings)
-            slam = slam if settings.keyframes.localise_only else tied
-    if settings.keyframes.localise_only or not _needs_keyframe(found, settings):
-        slam = _refer_to(slam, found.keyframe, roles)
-        slam = replace(slam, frames=(*slam.frames, record_of(frame, found)))
-        return with_view(slam, sight.view, roles, settings)
-    number = len(slam.keyframes)
+def _insert_and_adjust(
+    slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
+) -> Slam:
+    """The state with the frame as a keyframe, whose window is matched and adjusted.
+
+    Beside tracking where the keyframe's own depth places the next frames, and where there is one submap only.
+    """
+    frame, number = data.frame, len(slam.keyframes)
     with clock.measure("keyframe"):
         keyframe = make_keyframe(
-            number, frame, found.pose, sight.description, roles, settings, slam.intrinsics, sight.found_lines
+            number, frame, found.pose, data.description, roles, settings, slam.intrinsics, data.found_lines
         )
-    slam = _mapped(slam, keyframe, found, sight, roles, settings, clock)
-    arrival = (found.keyframe.number, found.relative)
-    evidence = found.evidence
-    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, evidence.inliers, evidence, arrival)
-    return replace(slam, frames=(*slam.frames, record))
-
-
-def _mapped(
-    slam: Slam, keyframe: Keyframe, found: Track, sight: Sight, roles: Roles, settings: SlamSettings, clock: Clock
-) -> Slam:
-    """The state with a new keyframe, whose window is matched and adjusted.
-
-    Beside tracking where the keyframe's own depth places the next frames, and where there is one piece of map only.
-    """
-    tie, tied_to = tie_to(found, keyframe.number), found.keyframe.number
-    if tied_to not in slam.window:
-        slam = _window_around(slam, tied_to, settings)
-    reference = (keyframe.number, sight.view)
+    tracked = found.keyframe.number, found.relative
+    record = FramePose(
+        *(frame.index, frame.timestamp, number, np.eye(4), True, found.evidence.inliers, found.evidence), tracked
+    )
+    odometry = tie_to(found, number)
+    if odometry.first not in slam.window.members:
+        slam = _window_around(slam, odometry.first, settings)
+    slam = replace(slam, tracker=replace(slam.tracker, reference=(number, data.view)))
 
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
-            entered = enter(slam, keyframe, roles, settings, tied_to=tied_to)
-            entered = _with_pair(replace(entered, factors=(*slam.factors, tie), reference=reference), tie)
+            entered = insert_keyframe(slam, keyframe, roles, settings, tied_to=odometry.first)
+            entered = _with_odometry(entered, odometry)
             entered = constrain_rotation(entered, settings)
         with clock.measure("place frames" + own):
-            entered = against_reference(entered)
+            entered = replace(entered, tracker=against_reference(entered.map, entered.tracker))
         with clock.measure("adjust window" + own):
-            return adjust(entered, settings)
+            return adjust_window(entered, settings)
 
-    if slam.metric and len(slam.origins) == 1:
-        begun = replace(
+    if slam.metric and len(slam.map.roots) == 1:
+        inserted = replace(
             slam,
-            keyframes=(*slam.keyframes, keyframe),
-            window=(*slam.window, keyframe.number),
-            factors=(*slam.factors, tie),
-            reference=reference,
-            between=(),
+            map=replace(slam.map, keyframes=(*slam.keyframes, keyframe), factors=(*slam.map.factors, odometry)),
+            tracker=replace(slam.tracker, between=()),
+            window=replace(slam.window, members=(*slam.window.members, number)),
         )
-        return begin_window(begun, lambda: adjusted(" (own thread)"))
+        return _with_record(begin_window(inserted, lambda: adjusted(" (own thread)")), record)
     slam = adjusted("")
     with clock.measure("relocalise"):
-        return join_pieces(slam, sight, roles, settings)
+        return _with_record(join_pieces(slam, data, roles, settings), record)
 
 
-def _with_pair(slam: Slam, tie: MeasuredRelativePose) -> Slam:
-    """A pair for the tie, if without a match, so that the surfaces of both are compared in the last adjustment."""
-    if any(pair.key == (tie.first, tie.second) for pair in slam.pairs):
-        return slam
-    return replace(slam, pairs=(*slam.pairs, without_matches(tie.first, tie.second)))
+def _with_record(slam: Slam, record: FramePose) -> Slam:
+    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record)))
+
+
+def _with_odometry(slam: Slam, odometry: MeasuredRelativePose) -> Slam:
+    """The state with an odometry factor, and a pair of its keyframes, if without a match: so the last adjustment
+    aligns the surfaces of both.
+    """
+    known = replace(slam.map, factors=(*slam.map.factors, odometry))
+    if all(pair.key != odometry.keyframes for pair in known.pairs):
+        known = replace(known, pairs=(*known.pairs, without_matches(*odometry.keyframes)))
+    return replace(slam, map=known)
 
 
 def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
-    if slam.reference is not None and slam.reference[0] == keyframe.number:
+    if slam.tracker.reference is not None and slam.tracker.reference[0] == keyframe.number:
         return slam
-    return against_reference(replace(slam, reference=(keyframe.number, view_of(keyframe, slam, roles))))
+    reference = keyframe.number, view_of(keyframe, slam.tracker, slam.intrinsics, roles)
+    return replace(slam, tracker=against_reference(slam.map, replace(slam.tracker, reference=reference)))
+
+
+def _with_view(slam: Slam, view: RgbdView | None, roles: Roles, settings: SlamSettings) -> Slam:
+    return replace(slam, tracker=with_view(slam.map, slam.tracker, view, slam.intrinsics, roles, settings.refinement))
+
+
+def _place_waiting(slam: Slam, roles: Roles) -> Slam:
+    return replace(slam, tracker=place_waiting(slam.map, slam.tracker, slam.intrinsics, roles))
 
 
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
@@ -258,37 +302,29 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
 
     Those of its own piece: the place of another is a guess, by which matches would be found that mean nothing.
     """
-    label = piece_of(slam)
+    label = piece_of(slam.map)
     around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
     window = tuple(other for other in around if label[other] == label[number])[-(settings.window.size - 1) :]
     # Without metric depth one held pose leaves the unit free: two hold it.
     held = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
-    return replace(slam, window=window, prior=None, solved=None, held=held)
+    return replace(slam, window=replace(slam.window, members=window, prior=None, solved=None, held=held))
 
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:
-    note = f"found again at frame {frame.index} ({frame.name}), {slam.lost} frames after tracking was lost"
-    if _in_known_map(slam) and slam.reference is None:
+    note = f"found again at frame {frame.index} ({frame.name}), {slam.tracker.lost} frames after tracking was lost"
+    if _in_known_map(slam) and slam.tracker.reference is None:
         note = f"frame {frame.index} ({frame.name}) is the first that was found in the map"
     return replace(slam, notes=(*slam.notes, note))
 
 
-def _found_again(slam: Slam, sight: Sight, place: Track, roles: Roles, settings: SlamSettings, clock: Clock) -> Slam:
-    """Go on in the map where the camera was found."""
-    frame = sight.frame
-    slam = replace(_noted_found(slam, frame), velocity=np.eye(4), lost=0)
-    slam = _enter_frame(slam, sight, place, roles, settings, clock)
-    return place_waiting(slam, roles)
-
-
-def _missed(slam: Slam, sight: Sight, evidence: Evidence, roles: Roles, settings: SlamSettings) -> Slam:
+def _missed(slam: Slam, data: FrameData, evidence: Evidence, roles: Roles, settings: SlamSettings) -> Slam:
     """No pose; after too many such frames begin a piece of map of its own."""
-    frame, features = sight.frame, sight.features
-    if slam.lost == 0:
+    frame, features = data.frame, data.features
+    if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
-        slam = replace(slam, notes=(*slam.notes, note), velocity=np.eye(4))
-    waiting = wait(slam, frame, features, MOST_WAITING)
-    slam = replace(slam, lost=slam.lost + 1)
+        slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
+    waiting = wait(slam.tracker, frame, features, MOST_WAITING)
+    slam = replace(slam, tracker=replace(slam.tracker, lost=slam.tracker.lost + 1))
     shown = sum(len(other.features) > settings.tracking.least_inliers for other in waiting)
     patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE
     if not patient and len(features) > settings.tracking.least_inliers:
@@ -297,58 +333,40 @@ def _missed(slam: Slam, sight: Sight, evidence: Evidence, roles: Roles, settings
             "nothing ties it to the one before, its place is only a guess"
         )
         begun = _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
-        return place_waiting(begun, roles) if _started(begun) else begun
+        return _place_waiting(begun, roles) if _started(begun) else begun
     reference, relative = (slam.frames[-1].reference, slam.frames[-1].relative) if slam.frames else (0, np.eye(4))
     record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, evidence)
-    return replace(slam, frames=(*slam.frames, record), waiting=waiting)
+    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record), waiting=waiting))
 
 
-def _seen_before(slam: Slam, sight: Sight, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
+def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
     """The frame by an old keyframe that stands where it does, if there is one that shows it as well as the present one:
     the map grows with space, not with time.
 
     What the two keyframes know of each other by this frame ties them.
     """
-    near = _nearest(slam, found, settings)
+    others = (keyframe for keyframe in slam.keyframes if keyframe.number != found.keyframe.number)
+    near = nearest_keyframe(found.pose, others, settings.keyframes)
     again = None
     if near is not None:
-        expected = Expectation(found.pose, slam.velocity)
-        again = track(sight, near, view_of(near, slam, roles), expected, slam.intrinsics, roles)
+        prior = MotionPrior(found.pose, slam.tracker.velocity)
+        given = TrackingInput(data, slam.intrinsics, roles, prior)
+        again = track(given, near, view_of(near, slam.tracker, slam.intrinsics, roles))
         if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
             again = None  # drift may have put another keyframe there
     if again is None:
-        again = revisit(slam, sight, found, roles)
+        given = TrackingInput(data, slam.intrinsics, roles)
+        again = revisit(given, found, slam.map, slam.tracker, slam.window.members)
     if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
         return slam, found
     near = again.keyframe
-    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.ties):
+    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):
         return slam, again
-    return replace(slam, factors=(*slam.factors, tie_between(found, again))), again
-
-
-def _nearest(slam: Slam, found: Track, settings: SlamSettings) -> Keyframe | None:
-    """Of all other keyframes the nearest that stands where the frame does."""
-    best, least = None, 1.0
-    for keyframe in slam.keyframes:
-        if keyframe.number == found.keyframe.number:
-            continue
-        distance = (
-            np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(found.pose))
-            / settings.keyframes.keyframe_distance
-        )
-        if distance < least:
-            turned = rigid.angle_between(keyframe.pose, found.pose) / settings.keyframes.keyframe_angle
-            away = max(float(distance), float(turned))
-            if away < least:
-                best, least = keyframe, away
-    return best
+    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie_between(found, again)))), again
 
 
 def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
-    """Whether the frame sees what its keyframe, the nearest there is, does not."""
-    distance = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(found.keyframe.pose))
-    return bool(
-        distance > settings.keyframes.keyframe_distance
-        or rigid.angle_between(found.pose, found.keyframe.pose) > settings.keyframes.keyframe_angle
-        or found.evidence.inliers < settings.tracking.least_inliers
+    return needs_keyframe(
+        *(found.pose, found.keyframe.pose, found.evidence.inliers),
+        *(settings.tracking.least_inliers, settings.keyframes),
     )

@@ -23,20 +23,20 @@ from vggtgeo.io.given import check_kind, check_whole
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.loops import close_loops
+from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.made_ahead import made_ahead
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
-from vggtgeo.slam.sparse_map.known_map import entered
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.description import Description
-from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.slam.tracking.frame_refinement import against_nearest
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
-from vggtgeo.slam.window.pending_window import settled
 
 AHEAD = 3
 """Frames that are prepared before they are needed."""
@@ -122,7 +122,7 @@ def run_frames(
     """
     slam = begin(camera, roles, settings) if known is None else known
     # Frames of a map whose camera's lens was found are as that lens drew them.
-    seen_by = slam.lens or camera
+    seen_by = slam.camera.lens or camera
     if roles.still_parts is not None:
         roles = replace(roles, still_parts=roles.still_parts.undistorted(seen_by))
     last = slam.frames[-1].timestamp if slam.frames else -math.inf
@@ -157,7 +157,7 @@ def finish(
         return slam
     clock = clock or Clock()
     with clock.measure("place frames"):
-        slam = against_nearest(slam, roles)
+        slam = replace(slam, tracker=against_nearest(slam.map, slam.tracker, slam.intrinsics, roles))
     with clock.measure("loops"):
         slam = close_loops(slam, roles, settings)
     with clock.measure("global adjustment"):

@@ -10,15 +10,16 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, GeometryResult, PointMatches, StartGuess
+from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
-from vggtgeo.slam.state import FramePose, Slam, Waiting
-from vggtgeo.slam.tracking.description import Description
-from vggtgeo.slam.tracking.track import Sight, track
-from vggtgeo.slam.window.sliding_window import adjust, enter, scale_anchor
+from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track
+from vggtgeo.slam.tracking.tracker import FramePose, Waiting
+from vggtgeo.slam.window.sliding_window import scale_anchor
+from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
-NOMINAL_DEPTH = 2.5
-"""Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
 MOST_WAITING = 90
 LEAST_SHARED = 100
 """Matches that a waiting frame shares with the present one, if it is to begin the map in place of the first keyframe:
@@ -41,7 +42,7 @@ def begin_again_with_depth(
     depth = roles.depth.estimate(frame.image, frame.depth, tuple(slam.intrinsics))
     if not np.any(np.isfinite(depth.depth)):
         return None
-    blind = slam.keyframes[slam.window[-1]]
+    blind = slam.keyframes[slam.window.members[-1]]
     keyframe = make_keyframe(
         blind.number, frame, blind.pose, Description.of(features), roles, settings, slam.intrinsics
     )
@@ -52,15 +53,15 @@ def begin_again_with_depth(
         replace(record, tracked=False, inliers=0) if record.frame == blind.frame else record for record in slam.frames
     )
     record = FramePose(frame.index, frame.timestamp, blind.number, np.eye(4), True, len(features))
-    waiting = (Waiting(blind.frame, blind.timestamp, blind.image, blind.features), *slam.waiting)
+    waiting = (Waiting(blind.frame, blind.timestamp, blind.image, blind.features), *slam.tracker.waiting)
     slam = replace(
         slam,
-        keyframes=(*slam.keyframes[:-1], keyframe),
-        frames=(*before, record),
-        waiting=waiting,
+        map=replace(slam.map, keyframes=(*slam.keyframes[:-1], keyframe)),
+        tracker=replace(slam.tracker, frames=(*before, record), waiting=waiting),
         notes=(*slam.notes, note),
     )
-    return replace(_place_waiting(slam, keyframe, roles), waiting=())
+    slam = _place_waiting(slam, keyframe, roles)
+    return replace(slam, tracker=replace(slam.tracker, waiting=()))
 
 
 def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
@@ -82,7 +83,10 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
             f"neither frame {first.frame} nor frame {frame.index} has metric depth: "
             "the scale is free from here on, and later depth is not used"
         )
-        slam, roles = replace(slam, metric=False, notes=(*slam.notes, note)), without_depth(roles)
+        slam, roles = (
+            replace(slam, map=replace(slam.map, metric=False), notes=(*slam.notes, note)),
+            without_depth(roles),
+        )
     scale = NOMINAL_DEPTH / float(np.median(guess.points[guess.inliers, 2]))
     relative = guess.pose.copy()
     relative[:3, 3] *= scale
@@ -90,25 +94,26 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
     inverse[matches.index_i[guess.inliers]] = 1.0 / (scale * guess.points[guess.inliers, 2])
     first = replace(first, points=replace(first.points, inverse_depth=inverse))
     keyframes = (*slam.keyframes[:-1], first)
-    slam = replace(slam, keyframes=keyframes)
+    slam = replace(slam, map=replace(slam.map, keyframes=keyframes))
     number = len(keyframes)
     second = make_keyframe(
         number, frame, relative @ first.pose, Description.of(features), roles, settings, slam.intrinsics
     )
-    slam = enter(slam, second, roles, settings)
-    slam = adjust(replace(slam, factors=(*slam.factors, scale_anchor(slam))), settings)
+    slam = insert_keyframe(slam, second, roles, settings)
+    anchor = scale_anchor(slam.map, slam.window.members)
+    slam = adjust_window(replace(slam, map=replace(slam.map, factors=(*slam.map.factors, anchor))), settings)
     first, second = slam.keyframes[first.number], slam.keyframes[number]
     slam = _place_waiting(slam, first, roles)
     inliers = int(np.count_nonzero(guess.inliers))
     # The frames between were placed in the map of this moment: what becomes of it later is shared out over them.
     arrival = (first.number, second.pose @ rigid.invert(first.pose))
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, inliers, arrival=arrival)
-    return replace(slam, frames=(*slam.frames, record), waiting=())
+    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record), waiting=()))
 
 
 def _two_views(slam: Slam, frame: Frame, features: Features, roles: Roles) -> tuple[Keyframe, PointMatches, StartGuess]:
     """The first keyframe, its matches with the frame, and what both say of motion and structure."""
-    first = slam.keyframes[slam.window[-1]]
+    first = slam.keyframes[slam.window.members[-1]]
     matches = roles.points.match(first.features, features)
     guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics, (first.image, frame.image))
     return first, matches, guess
@@ -118,8 +123,8 @@ def _later_first(slam: Slam, features: Features, roles: Roles, settings: SlamSet
     """The state whose map will begin at the oldest waiting frame that shares enough with the present one, as all behind
     it do; None where the last one does not: the present one may be blurred or dark.
     """
-    chosen, old = None, slam.keyframes[slam.window[-1]]
-    for waiting in reversed(slam.waiting):
+    chosen, old = None, slam.keyframes[slam.window.members[-1]]
+    for waiting in reversed(slam.tracker.waiting):
         if waiting.frame < old.frame or len(roles.points.match(waiting.features, features)) < LEAST_SHARED:
             break
         chosen = waiting
@@ -138,30 +143,34 @@ def _later_first(slam: Slam, features: Features, roles: Roles, settings: SlamSet
         else record
         for record in slam.frames
     )
-    others = tuple(waiting for waiting in slam.waiting if waiting.frame != chosen.frame)
+    others = tuple(waiting for waiting in slam.tracker.waiting if waiting.frame != chosen.frame)
     back = Waiting(old.frame, old.timestamp, old.image, old.features)
     return replace(
-        slam, keyframes=(*slam.keyframes[:-1], first), frames=tuple(records), waiting=(back, *others)[-MOST_WAITING:]
+        slam,
+        map=replace(slam.map, keyframes=(*slam.keyframes[:-1], first)),
+        tracker=replace(slam.tracker, frames=tuple(records), waiting=(back, *others)[-MOST_WAITING:]),
     )
 
 
 def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
-    waiting = (*slam.waiting, Waiting(frame.index, frame.timestamp, frame.image, features))
-    record = FramePose(frame.index, frame.timestamp, slam.window[-1], np.eye(4), False, 0)
-    return replace(slam, waiting=waiting[-MOST_WAITING:], frames=(*slam.frames, record))
+    waiting = (*slam.tracker.waiting, Waiting(frame.index, frame.timestamp, frame.image, features))
+    record = FramePose(frame.index, frame.timestamp, slam.window.members[-1], np.eye(4), False, 0)
+    return replace(slam, tracker=replace(slam.tracker, waiting=waiting[-MOST_WAITING:], frames=(*slam.frames, record)))
 
 
 def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
     """Give the frames that waited their poses by the new map, as far as they are to be believed."""
     placed = {}
-    for waiting in slam.waiting:
+    for waiting in slam.tracker.waiting:
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
-        sight = Sight(frame, Description.of(waiting.features), None)
-        found = track(sight, first, None, None, slam.intrinsics, roles)
+        data = FrameData(frame, Description.of(waiting.features), None)
+        found = track(TrackingInput(data, slam.intrinsics, roles), first, None)
         if found.accepted:
             evidence = found.evidence
             record = FramePose(
                 *(frame.index, frame.timestamp, first.number, found.relative, True, evidence.inliers, evidence)
             )
             placed[frame.index] = replace(record, seen=found.seen)
-    return replace(slam, frames=tuple(placed.get(record.frame, record) for record in slam.frames))
+    return replace(
+        slam, tracker=replace(slam.tracker, frames=tuple(placed.get(record.frame, record) for record in slam.frames))
+    )

@@ -31,17 +31,17 @@ def check_state(slam: Slam) -> None:
         raise ValueError("its keyframes are not numbered one after the other")
     _check_camera(slam)
     map_in_threads(_check_keyframe, slam.keyframes)  # each of its images is decoded
-    for factor in slam.factors:
+    for factor in slam.map.factors:
         _check_factor(factor)
     for one, other in pairwise(slam.keyframes):
         if one.size != other.size:
             raise ValueError(f"its images are of {other.size} and of {one.size} pixels, expected one size")
         if one.place is not None and other.place is not None:
             check_array("place", other.place, one.place.shape)
-    for pair in slam.pairs:
+    for pair in slam.map.pairs:
         _check_pair(pair, slam)
-    named = [number for factor in slam.factors for number in factor.keyframes]
-    named += [*slam.window, *slam.origins, *slam.held, *(record.reference for record in slam.frames)]
+    named = [number for factor in slam.map.factors for number in factor.keyframes]
+    named += [*slam.window.members, *slam.map.roots, *slam.window.held, *(record.reference for record in slam.frames)]
     named += [record.second.keyframe for record in slam.frames if record.second is not None]
     named += [record.arrival[0] for record in slam.frames if record.arrival is not None]
     if not all(0 <= number < count for number in named):
@@ -54,18 +54,18 @@ def check_state(slam: Slam) -> None:
 
 def _check_camera(slam: Slam) -> None:
     """The camera, how it moves, and how well its places are known."""
-    for name in ("intrinsics", "given_intrinsics", "intrinsics_sigma"):
-        values = getattr(slam, name)
+    for name in ("intrinsics", "given", "sigma"):
+        values = getattr(slam.camera, name)
         check_array(name, values, (4,))
         if not (values[:2] > 0).all():
             raise ValueError(f"`{name}` begins with {values[:2].tolist()}, expected positive pixels")
         _check_near(name, values)
-    check_pose("velocity", slam.velocity)
-    if slam.lost < 0:
-        raise ValueError(f"`lost` is {slam.lost}, expected a count of frames")
-    if slam.pose_sigma is not None:
-        check_array("pose_sigma", slam.pose_sigma, (None, 2), finite=False)
-        _check_not_negative("pose_sigma", slam.pose_sigma)
+    check_pose("velocity", slam.tracker.velocity)
+    if slam.tracker.lost < 0:
+        raise ValueError(f"`lost` is {slam.tracker.lost}, expected a count of frames")
+    if slam.map.pose_sigma is not None:
+        check_array("pose_sigma", slam.map.pose_sigma, (None, 2), finite=False)
+        _check_not_negative("pose_sigma", slam.map.pose_sigma)
 
 
 def _check_keyframe(keyframe: Keyframe) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import jaxlie
 
@@ -28,22 +27,26 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import path_of
-from vggtgeo.io.record_file import AGAIN, Header, Layout
-from vggtgeo.io.records import by_name, with_field
+from vggtgeo.io.record_file import AGAIN, Layout
+from vggtgeo.io.records import by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.mast3r import Mast3rView
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
+from vggtgeo.slam.perception.rgbd_view import Points, RgbdView
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, KeyframeImages
-from vggtgeo.slam.state import FramePose, PendingWindow, Readout, SecondMotion, SeenPoints, Slam, Waiting
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_checks import check_state
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.rgbd_view import Points, RgbdView
+from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, Waiting
 from vggtgeo.slam.window.adjustment import Adjustment
+from vggtgeo.slam.window.window import Window
 from vggtgeo.slam.window.window_prior import WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
@@ -51,6 +54,10 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 STATE_CLASSES: tuple[type, ...] = (
     *(
         Slam,
+        Map,
+        CameraEstimate,
+        Tracker,
+        Window,
         Camera,
         PendingWindow,
         FramePose,
@@ -70,109 +77,8 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 14
-
-
-def _with_recorded_times(header: Header) -> Header:
-    """Version 1 did not know when a map's keyframes were recorded."""
-    tree, classes = with_field(header["tree"], header["classes"], "Keyframe", "recorded")
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_lens(header: Header) -> Header:
-    """Version 2 did not know lenses that a run found."""
-    tree, classes = with_field(header["tree"], header["classes"], "Slam", "lens")
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_first_pass(header: Header) -> Header:
-    """Version 3 did not know first passes."""
-    tree, classes = with_field(header["tree"], header["classes"], "Slam", "camera_found", False)
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_readout(header: Header) -> Header:
-    """Version 6 did not know rolling shutters."""
-    tree, classes = with_field(header["tree"], header["classes"], "Slam", "readout")
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_second_motions(header: Header) -> Header:
-    """Version 7 placed frames against a second keyframe when a map was done."""
-    tree, classes = with_field(header["tree"], header["classes"], "FramePose", "second")
-    tree, classes = with_field(tree, classes, "Slam", "between", [])
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_fisheyes(header: Header) -> Header:
-    """Version 10 did not know fisheyes."""
-    tree, classes = with_field(header["tree"], header["classes"], "Camera", "fisheye", False)
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_seen_points(header: Header) -> Header:
-    """Version 11 did not place frames against the points of the map as it is in the end."""
-    tree, classes = with_field(header["tree"], header["classes"], "FramePose", "seen")
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _with_rows(header: Header) -> Header:
-    """Version 12 had one row of landmarks a keyframe."""
-    tree, classes = header["tree"], header["classes"]
-    for kind, field in (("Problem", "host"), ("Edges", "row_of"), ("SlotIndex", "part"), ("SlotIndex", "step")):
-        tree, classes = with_field(tree, classes, kind, field)
-    return {**header, "tree": tree, "classes": classes}
-
-
-def _as_it_is(header: Header) -> Header:
-    """What the next version added has gone since."""
-    return header
-
-
-def _without_old_checks(header: Header) -> Header:
-    """Version 13 kept what single checks of the verdict needed."""
-    gone = {
-        "Slam": ("focal_wanted", "focal_without_lens", "focal_with_lens"),
-        "FrameEvidence": ("depth_median", "depth_changed", "contrast", "enlarged", "edges_elsewhere"),
-    }
-    kept = {
-        number: [place for place, field in enumerate(fields) if field not in gone.get(kind, ())]
-        for number, (kind, fields) in enumerate(header["classes"])
-    }
-
-    def without(part: Any) -> Any:
-        if isinstance(part, list):
-            return [without(item) for item in part]
-        if not isinstance(part, dict):
-            return part
-        inside = {key: without(item) for key, item in part.items()}
-        if part.keys() == {"c", "v"}:
-            inside["v"] = [inside["v"][place] for place in kept[part["c"]] if place < len(inside["v"])]
-        return inside
-
-    classes = [
-        [kind, [fields[place] for place in kept[number]]] for number, (kind, fields) in enumerate(header["classes"])
-    ]
-    return {**header, "tree": without(header["tree"]), "classes": classes}
-
-
-UPGRADES = {
-    1: _with_recorded_times,
-    2: _with_lens,
-    3: _with_first_pass,
-    4: _as_it_is,
-    5: _as_it_is,
-    6: _with_readout,
-    7: _with_second_motions,
-    8: _as_it_is,
-    9: _as_it_is,
-    10: _with_fisheyes,
-    11: _with_seen_points,
-    12: _with_rows,
-    13: _without_old_checks,
-}
-"""Of states, and of maps and checkpoints, which hold them."""
-STATE = Layout("state", VERSION, by_name(STATE_CLASSES), UPGRADES)
+VERSION = 15
+STATE = Layout("state", VERSION, by_name(STATE_CLASSES))
 
 
 def save_state(path: str | os.PathLike[str], slam: Slam) -> None:

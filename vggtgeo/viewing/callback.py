@@ -18,7 +18,7 @@ from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window.window_recorder import WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecorder
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.live_map import LiveMap
 from vggtgeo.viewing.target import flush
@@ -53,8 +53,8 @@ class RerunCallback(Callback):
         self.stream.set_time("time", duration=frame.timestamp)
         entities.log_camera(self.stream, slam.last_pose, slam.intrinsics, frame.image)
         entities.log_tracking(self.stream, slam)
-        if bool(slam.lost) != self._was_lost:
-            self._was_lost = bool(slam.lost)
+        if bool(slam.tracker.lost) != self._was_lost:
+            self._was_lost = bool(slam.tracker.lost)
             entities.log_lost(self.stream, slam)
         for note in slam.notes[self._notes :]:
             entities.log_note(self.stream, note)
@@ -85,17 +85,17 @@ class RerunCallback(Callback):
             self._log_new_keyframe(slam)
 
     def _log_new_keyframe(self, slam: Slam) -> None:
-        numbers = slam.window if slam.solved is None else slam.solved[0].keyframes
+        numbers = slam.window.members if slam.window.solved is None else slam.window.solved[0].keyframes
         members = [slam.keyframes[number] for number in numbers]
         newest = members[-1].number
-        matched = [pair for pair in slam.pairs if pair.second == newest]
+        matched = [pair for pair in slam.map.pairs if pair.second == newest]
         entities.log_keyframe(self.stream, members[-1], max(matched, key=lambda pair: pair.first, default=None))
-        entities.log_window(self.stream, members, list(slam.pairs))
+        entities.log_window(self.stream, members, list(slam.map.pairs))
         self._log_path(slam)
         entities.log_points(self.stream, members, slam.intrinsics)
-        if slam.solved is None or not self._recorder.records:
+        if slam.window.solved is None or not self._recorder.records:
             return
-        adjustment, state = slam.solved
+        adjustment, state = slam.window.solved
         found = np.asarray(covariances(adjustment.problem, state).poses)[: len(members)]
         entities.log_covariance(self.stream, members, found)
         entities.log_residuals(self.stream, self._recorder.records[-1])
@@ -107,9 +107,9 @@ class RerunCallback(Callback):
         entities.log_lost(self.stream, slam)
 
     def _log_iterations(self, slam: Slam) -> None:
-        if slam.energies is None:
+        if slam.window.energies is None:
             return
-        for row, energy in enumerate(slam.energies):
+        for row, energy in enumerate(slam.window.energies):
             self.stream.set_time("iteration", sequence=self._iterations)
-            entities.log_iteration(self.stream, row, float(energy), slam.iterations, len(slam.window))
+            entities.log_iteration(self.stream, row, float(energy), slam.window.iterations, len(slam.window.members))
             self._iterations += 1

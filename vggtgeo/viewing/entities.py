@@ -12,11 +12,12 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.run import frame_trajectory
-from vggtgeo.slam.sparse_map.connected import loop_edges, lost_stretches, piece_of
+from vggtgeo.slam.sparse_map.connected import loop_edges, piece_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window.window_recorder import WindowRecord
+from vggtgeo.slam.submaps import lost_stretches
+from vggtgeo.slam.window_recorder import WindowRecord
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 ENTITIES = (
@@ -89,7 +90,7 @@ def log_loops(stream: Any, slam: Slam, apart: int) -> None:
     """Log lines between the keyframes of loop closures, see `loop_edges`."""
     import rerun as rr
 
-    ends = [[rigid.centre(slam.keyframes[number].pose) for number in edge] for edge in loop_edges(slam, apart)]
+    ends = [[rigid.centre(slam.keyframes[number].pose) for number in edge] for edge in loop_edges(slam.map, apart)]
     stream.log("world/loops", rr.LineStrips3D(ends, colors=[_PURPLE] * len(ends), radii=-1.5))
 
 
@@ -99,7 +100,7 @@ def log_lost(stream: Any, slam: Slam) -> None:
     """
     import rerun as rr
 
-    label = piece_of(slam) if slam.keyframes else np.zeros(0, int)
+    label = piece_of(slam.map) if slam.keyframes else np.zeros(0, int)
     losses, gaps = [], []
     for first, last in lost_stretches(slam):
         around = [slam.frames[row] for row in (first - 1, last + 1) if 0 <= row < len(slam.frames)]
@@ -257,7 +258,7 @@ def log_tracking(stream: Any, slam: Slam) -> None:
     import rerun as rr
 
     stream.log("plots/tracking/inliers", rr.Scalars(float(slam.frames[-1].inliers)))
-    stream.log("plots/tracking/lost", rr.Scalars(float(slam.lost)))
+    stream.log("plots/tracking/lost", rr.Scalars(float(slam.tracker.lost)))
 
 
 def log_note(stream: Any, text: str, level: str = "WARN") -> None:

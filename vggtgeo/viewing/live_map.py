@@ -87,7 +87,7 @@ def _is_stale(keyframe: Keyframe, before: _Logged | None, slam: Slam) -> bool:
     """
     if before is None or before.frame != keyframe.frame:  # a new map reuses keyframe numbers
         return True
-    return not slam.metric and keyframe.points is not before.points and keyframe.number not in slam.window
+    return not slam.metric and keyframe.points is not before.points and keyframe.number not in slam.window.members
 
 
 def own_cloud(keyframe: Keyframe, intrinsics: np.ndarray, *, dense: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -31,11 +31,12 @@ from scipy.stats import chi2 as chi_square
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.camera.camera_gain import CHANCE, gain
 from vggtgeo.slam.camera.camera_of_pairs import CameraOpinion, CameraPair, camera_of_pairs
-from vggtgeo.slam.camera.rolling_shutter import camera_motions, pair_at_once
+from vggtgeo.slam.camera.rolling_shutter import pair_at_once
 from vggtgeo.slam.sparse_map.covisibility import Directed
-from vggtgeo.slam.state import Slam
+from vggtgeo.slam.sparse_map.map import Map
 
 PRIOR = 0.01
 """Standard deviation of a given calibration, relative to the focal length: what makers and calibration tools reach."""
@@ -119,30 +120,34 @@ def camera_held_at(problem: Problem, intrinsics: np.ndarray) -> Problem:
     return problem.with_term(eqx.tree_at(lambda term: term.mean, prior, jnp.asarray(intrinsics)))
 
 
-def keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
+def keyframe_pairs(
+    known: Map, camera: CameraEstimate, edges: list[Directed], motions: np.ndarray | None = None
+) -> list[CameraPair]:
     """Matches of keyframes with a depth that is no result of the camera: the measured one, else the estimate.
 
     Where they would be if each image were read at once: as they are, two clips of one camera (10 ms a readout) want 484
     and 488 px, and without the readout 489 and 487.
+
+    motions: of the keyframes, float64 [n, 6], where a readout is known.
     """
-    by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
-    readout = slam.readout
-    motions = {} if readout is None else dict(zip(by_number, camera_motions(slam, len(by_number)), strict=True))
+    by_number = {keyframe.number: keyframe for keyframe in known.keyframes}
+    readout = camera.readout
+    moving_at = {} if motions is None else dict(zip(by_number, motions, strict=True))
     found = []
     chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MOST_PAIRS).astype(int))
     for edge in (edges[row] for row in chosen if row < len(edges)):
         host, target = by_number[edge.host], by_number[edge.target]
-        inverse = (host.points.prior if slam.metric else host.points.inverse_depth)[edge.slots]
-        known = np.isfinite(inverse) & (inverse > 0)
-        before, after = host.points.pixels[edge.slots[known]], edge.pixels[known]
+        inverse = (host.points.prior if known.metric else host.points.inverse_depth)[edge.slots]
+        seen = np.isfinite(inverse) & (inverse > 0)
+        before, after = host.points.pixels[edge.slots[seen]], edge.pixels[seen]
         if len(before) < LEAST_MATCHES or np.median(np.linalg.norm(after - before, axis=1)) < LEAST_FLOW:
             continue
         relative = target.pose @ rigid.invert(host.pose)
         block = min(edge.host, edge.target) // BLOCK
-        depth = 1.0 / inverse[known]
+        depth = 1.0 / inverse[seen]
         if readout is not None:
-            moving = motions[edge.host], motions[edge.target]
-            before, after = pair_at_once(before, after, depth, relative, moving, slam.intrinsics, host.size, readout)
+            moving = moving_at[edge.host], moving_at[edge.target]
+            before, after = pair_at_once(before, after, depth, relative, moving, camera.intrinsics, host.size, readout)
         found.append(CameraPair(before, after, depth, relative, block))
     return found
 

@@ -12,7 +12,7 @@ What every tracked frame was placed by hangs on keyframes, and moves with them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -30,7 +30,7 @@ from vggtgeo.slam.camera.camera_gain import gain
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.sparse_map.map import Map
 
 RADIAL = 0.3
 """Standard deviation of k1 and k2 before anything is seen: lenses of phones and action cameras are within."""
@@ -117,28 +117,18 @@ def largest_shift(camera: Camera) -> float:
     return float(fx * np.abs(drawn - radius)[before & (drawn <= corner)].max())
 
 
-def can_undistort(slam: Slam) -> bool:
+def can_undistort(keyframes: Iterable[Keyframe]) -> bool:
     """Whether descriptors stay true when pixels move; those that hold their image in a form of their own do not."""
     return all(
-        isinstance(keyframe.features.descriptors, PixelDescriptors | np.ndarray | None) for keyframe in slam.keyframes
+        isinstance(keyframe.features.descriptors, PixelDescriptors | np.ndarray | None) for keyframe in keyframes
     )
 
 
-def undistorted(slam: Slam, lens: Camera) -> Slam:
+def undistorted_map(known: Map, lens: Camera) -> Map:
     """The map as the ideal pinhole of `lens` sees it; its poses and depths stay."""
     undistorter = lens.undistorter()
-    keyframes = tuple(_keyframe(keyframe, lens, undistorter) for keyframe in slam.keyframes)
-    pairs = tuple(_pair(pair, lens) for pair in slam.pairs)
-    frames = tuple(_frame(record, lens) for record in slam.frames)
-    intrinsics = np.array(lens.intrinsics, np.float64)
-    moved = replace(slam, keyframes=keyframes, pairs=pairs, frames=frames, intrinsics=intrinsics, lens=lens)
-    return replace(moved, solved=None, prior=None)
-
-
-def _frame(record: FramePose, lens: Camera) -> FramePose:
-    if record.seen is None:
-        return record
-    return replace(record, seen=replace(record.seen, pixels=_like(record.seen.pixels, lens)))
+    keyframes = tuple(_keyframe(keyframe, lens, undistorter) for keyframe in known.keyframes)
+    return replace(known, keyframes=keyframes, pairs=tuple(_pair(pair, lens) for pair in known.pairs))
 
 
 def _keyframe(keyframe: Keyframe, lens: Camera, undistorter: Undistorter) -> Keyframe:
@@ -149,10 +139,12 @@ def _keyframe(keyframe: Keyframe, lens: Camera, undistorter: Undistorter) -> Key
     moved = replace(
         keyframe,
         images=_images(keyframe, undistorter),
-        features=replace(features, pixels=_like(features.pixels, lens), descriptors=descriptors),
-        lines=replace(keyframe.lines, segments=replace(segments, endpoints=_like(segments.endpoints, lens))),
-        points=replace(keyframe.points, pixels=_like(keyframe.points.pixels, lens)),
-        samples=replace(keyframe.samples, pixels=_like(keyframe.samples.pixels, lens)),
+        features=replace(features, pixels=undistorted_pixels(features.pixels, lens), descriptors=descriptors),
+        lines=replace(
+            keyframe.lines, segments=replace(segments, endpoints=undistorted_pixels(segments.endpoints, lens))
+        ),
+        points=replace(keyframe.points, pixels=undistorted_pixels(keyframe.points.pixels, lens)),
+        samples=replace(keyframe.samples, pixels=undistorted_pixels(keyframe.samples.pixels, lens)),
     )
     return moved.compressed() if keyframe.images.small else moved
 
@@ -166,10 +158,12 @@ def _images(keyframe: Keyframe, undistorter: Undistorter) -> KeyframeImages:
 
 def _pair(pair: Pair, lens: Camera) -> Pair:
     points = pair.points
-    moved: PointMatches = replace(points, pixels_i=_like(points.pixels_i, lens), pixels_j=_like(points.pixels_j, lens))
+    moved: PointMatches = replace(
+        points, pixels_i=undistorted_pixels(points.pixels_i, lens), pixels_j=undistorted_pixels(points.pixels_j, lens)
+    )
     return replace(pair, points=moved)
 
 
-def _like(pixels: Float[np.ndarray, "*m 2"], lens: Camera) -> Float[np.ndarray, "*m 2"]:
+def undistorted_pixels(pixels: Float[np.ndarray, "*m 2"], lens: Camera) -> Float[np.ndarray, "*m 2"]:
     """The undistorted pixels, of the type that they had."""
     return lens.undistorted(pixels).astype(pixels.dtype)

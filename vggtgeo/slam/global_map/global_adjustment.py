@@ -9,18 +9,22 @@ import numpy as np
 
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
 from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
-from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted
+from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
+from vggtgeo.slam.camera.camera_of_pairs import CameraPair
+from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
-from vggtgeo.slam.camera.rolling_shutter import camera_motions, find_readout, frame_interval, without_readout
+from vggtgeo.slam.camera.rolling_shutter import find_readout, without_readout
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
+from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.global_map.global_shape import GlobalShape, global_solver, shape_of
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
 from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose, factor_terms
-from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Slam
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
@@ -38,12 +42,12 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     The first round also asks for a rolling shutter, and for another camera than the given or guessed one; those after
     it take both as they are.
     """
-    if len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA or not slam.pairs:
+    if len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA or not slam.map.pairs:
         return slam
     whole, solved = _Whole.of(slam, settings), None
     for number in range(settings.refinement.global_rounds):
         is_first = number == 0
-        adjustment, notes = whole.adjustment(slam, settings, finds_camera=is_first and not slam.calibrated)
+        adjustment, notes = whole.adjustment(slam, settings, finds_camera=is_first and not slam.camera.calibrated)
         slam = replace(slam, notes=(*slam.notes, *notes)) if is_first else slam
         solution = solve_jit(adjustment.problem, adjustment.initial, global_solver(adjustment.problem, settings))
         if not np.isfinite(float(solution.energy)):
@@ -54,7 +58,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             slam, whole = whole.with_its_camera(slam, adjustment, state, settings)
             solved = adjustment.problem, state
     sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
-    return replace(slam, pose_sigma=sigma)
+    return replace(slam, map=replace(slam.map, pose_sigma=sigma))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +76,15 @@ class _Whole:
     def of(cls, slam: Slam, settings: SlamSettings) -> _Whole:
         edges = _edges(slam, settings)
         degrees = np.bincount([edge.host for edge in edges])
-        shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.factors, len(slam.pairs), settings)
-        camera = CameraPrior(slam.given_intrinsics, slam.intrinsics_sigma, camera_of(slam))
+        shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.map.factors, len(slam.map.pairs), settings)
+        camera = CameraPrior(slam.camera.given, slam.camera.sigma, camera_of(slam))
         return cls(edges, _surfaces(slam), camera, shape)
 
     def adjustment(self, slam: Slam, settings: SlamSettings, finds_camera: bool) -> tuple[Adjustment, tuple[str, ...]]:
         """A round's adjustment, and what its gauge is worth a word of. finds_camera: without what was measured with the
         camera of that moment, the tracked motions and the surfaces.
         """
-        factors = _of_any_camera(slam) if finds_camera else slam.factors
+        factors = _of_any_camera(slam) if finds_camera else slam.map.factors
         adjustment = build(
             slam.keyframes,
             self.edges,
@@ -88,7 +92,7 @@ class _Whole:
             settings,
             size=self.shape.size,
             camera=self.camera,
-            fixed_pose=np.isin(np.arange(len(slam.keyframes)), slam.origins),
+            fixed_pose=np.isin(np.arange(len(slam.keyframes)), slam.map.roots),
             terms=_terms(slam, factors, self.surfaces, self.shape, settings),
         )
         problem = without_surfaces(adjustment.problem) if finds_camera else adjustment.problem
@@ -105,10 +109,10 @@ class _Whole:
         before = slam.intrinsics
         if settings.camera.refine_intrinsics != "never":
             slam = _with_its_camera(slam, adjustment, state, self.edges, settings)
-        if settings.refinement.global_rounds == 1 or (slam.calibrated and slam.intrinsics is before):
+        if settings.refinement.global_rounds == 1 or (slam.camera.calibrated and slam.intrinsics is before):
             return slam, self
         camera = replace(self.camera, mean=slam.intrinsics)
-        if not slam.calibrated:
+        if not slam.camera.calibrated:
             held = settings.camera.known_intrinsics_sigma * slam.intrinsics[0]
             camera = replace(camera, sigma=np.full(4, held), kind=_of_pixels(slam.intrinsics))
         return slam, replace(self, edges=_edges(slam, settings), surfaces=_surfaces(slam), camera=camera)
@@ -121,18 +125,20 @@ def _solves(settings: SlamSettings) -> Solve:
 
 def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:
     """The adjustment with its matches where they would be if images were read at once, where a readout is known."""
-    if slam.readout is None:
+    if slam.camera.readout is None:
         return adjustment
     problem, initial = adjustment.problem, adjustment.initial
     motions = camera_motions(slam, problem.num_keyframes)
-    return replace(adjustment, problem=without_readout(problem, initial, motions, slam.keyframes[0].size, slam.readout))
+    return replace(
+        adjustment, problem=without_readout(problem, initial, motions, slam.keyframes[0].size, slam.camera.readout)
+    )
 
 
 def _with_its_readout(
     slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
 ) -> tuple[Slam, Adjustment, State]:
     """The state after a search for a rolling shutter; with what was adjusted last, and its solution."""
-    if slam.readout is not None or not settings.refinement.rolling_shutter:
+    if slam.camera.readout is not None or not settings.refinement.rolling_shutter:
         return slam, adjustment, state
     motions = camera_motions(slam, adjustment.problem.num_keyframes)
     size, longest = slam.keyframes[0].size, frame_interval(slam)
@@ -140,7 +146,8 @@ def _with_its_readout(
     if found is None or not found.pays:
         return slam, adjustment, state
     adjustment = replace(adjustment, problem=found.problem)
-    return replace(_taken(slam, adjustment, found.state), readout=found.readout), adjustment, found.state
+    slam = _taken(slam, adjustment, found.state)
+    return replace(slam, camera=replace(slam.camera, readout=found.readout)), adjustment, found.state
 
 
 def _with_its_camera(
@@ -148,13 +155,18 @@ def _with_its_camera(
 ) -> Slam:
     """The state after a trial whether a given camera is to be refined, or the lens of a guessed one taken out."""
     again = _solves(settings)
-    if slam.calibrated:
-        found = try_camera(keyframe_pairs(slam, edges), adjustment.problem, state, again)
+    if slam.camera.calibrated:
+        found = try_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, again)
         return _taken_camera(slam, adjustment, found, settings)
     slam, adjustment, state = _with_its_pixels(slam, adjustment, state, again)
-    if slam.lens is not None or not can_undistort(slam):
+    if slam.camera.lens is not None or not can_undistort(slam.keyframes):
         return slam
     return _taken_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, again))
+
+
+def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
+    motions = None if slam.camera.readout is None else camera_motions(slam, len(slam.keyframes))
+    return keyframe_pairs(slam.map, slam.camera, edges, motions)
 
 
 def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
@@ -177,7 +189,7 @@ def camera_of(slam: Slam) -> type[Pinhole | SquarePinhole]:
     """The model that the last adjustment has of the camera: a guessed one has square pixels, unless a first pass found
     that they are not.
     """
-    return Pinhole if slam.calibrated else _of_pixels(slam.given_intrinsics)
+    return Pinhole if slam.camera.calibrated else _of_pixels(slam.camera.given)
 
 
 def _of_pixels(intrinsics: np.ndarray) -> type[Pinhole | SquarePinhole]:
@@ -186,7 +198,7 @@ def _of_pixels(intrinsics: np.ndarray) -> type[Pinhole | SquarePinhole]:
 
 def _edges(slam: Slam, settings: SlamSettings) -> list[Directed]:
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
-    edges = [edge for pair in slam.pairs for edge in directions(pair, by_number)]
+    edges = [edge for pair in slam.map.pairs for edge in directions(pair, by_number)]
     return _thin(edges, len(slam.keyframes), settings)
 
 
@@ -198,7 +210,12 @@ def _surfaces(slam: Slam) -> list[Surface]:
 def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
     """The state of the run with what an adjustment found."""
     keyframes, intrinsics = write_back(slam.keyframes, adjustment, state)
-    return replace(slam, keyframes=keyframes, intrinsics=intrinsics, solved=None)
+    return replace(
+        slam,
+        map=replace(slam.map, keyframes=keyframes),
+        camera=replace(slam.camera, intrinsics=intrinsics),
+        window=replace(slam.window, solved=None),
+    )
 
 
 def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, settings: SlamSettings) -> Slam:
@@ -229,6 +246,23 @@ def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> 
     return replace(adjusted, notes=(*adjusted.notes, note))
 
 
+def undistorted(slam: Slam, lens: Camera) -> Slam:
+    """The state as the ideal pinhole of `lens` sees it; poses and depths stay."""
+    frames = tuple(
+        record
+        if record.seen is None
+        else replace(record, seen=replace(record.seen, pixels=undistorted_pixels(record.seen.pixels, lens)))
+        for record in slam.frames
+    )
+    return replace(
+        slam,
+        map=undistorted_map(slam.map, lens),
+        tracker=replace(slam.tracker, frames=frames),
+        camera=replace(slam.camera, intrinsics=np.array(lens.intrinsics, np.float64), lens=lens),
+        window=replace(slam.window, solved=None, prior=None),
+    )
+
+
 def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
     """A word on distortion that is sure and moves corners of the image by more than the noise of matches."""
     (k1, sigma), focal = found.distortion, float(found.given[0])
@@ -246,7 +280,7 @@ def _terms(
     terms = factor_terms(factors, places, shape.room, metric=slam.metric)
     if not surfaces or settings.depth_terms.surface_points <= 0:
         return terms
-    pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.pairs)]
+    pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.map.pairs)]
     return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth_terms.surface_points, shape.pairs))
 
 
@@ -257,9 +291,9 @@ def _of_any_camera(slam: Slam) -> tuple[Factor, ...]:
     found with 298 px in place of 266 (simulated), and without those motions with 268. The camera once estimated, they
     are what keeps a map without depth together where it is seen least: corridor-office 4.2 -> 3.1 cm.
     """
-    matched = {pair.key for pair in slam.pairs if len(pair.points)}
+    matched = {pair.key for pair in slam.map.pairs if len(pair.points)}
     tied = lambda factor: isinstance(factor, MeasuredRelativePose) and tuple(sorted(factor.keyframes)) in matched
-    return tuple(factor for factor in slam.factors if not tied(factor))
+    return tuple(factor for factor in slam.map.factors if not tied(factor))
 
 
 def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:

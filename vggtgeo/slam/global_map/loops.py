@@ -35,16 +35,18 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     Where what is found contradicts the map by more than its adjustment can mend, the map is straightened first, and
     searched once more.
     """
-    label, known = piece_of(slam), {pair.key for pair in slam.pairs}
+    label, known = piece_of(slam.map), {pair.key for pair in slam.map.pairs}
     proposed = list(dict.fromkeys([*_by_estimate(slam, settings, known), *_by_appearance(slam, settings, known)]))
     found = _verified(slam, proposed, label, roles, settings)
     before, (straight, believed) = slam, straightened(slam, found)
-    slam = replace(straight, pairs=(*slam.pairs, *(loop.pair for loop in believed)))
+    slam = replace(straight, map=replace(straight.map, pairs=(*slam.map.pairs, *(loop.pair for loop in believed))))
     if straight is before:
         return slam
     known |= {loop.pair.key for loop in found}
-    more = _verified(slam, _by_estimate(slam, settings, known), piece_of(slam), roles, settings)
-    return replace(slam, pairs=(*slam.pairs, *(loop.pair for loop in more if loop.agrees(slam))))
+    more = _verified(slam, _by_estimate(slam, settings, known), piece_of(slam.map), roles, settings)
+    return replace(
+        slam, map=replace(slam.map, pairs=(*slam.map.pairs, *(loop.pair for loop in more if loop.agrees(slam))))
+    )
 
 
 def _verified(

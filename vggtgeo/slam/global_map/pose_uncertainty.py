@@ -22,8 +22,8 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.io.kept_program import KeptProgram
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
 from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
@@ -76,11 +76,11 @@ class PoseUncertainty(NamedTuple):
 
 def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
     """Of every frame of `frame_trajectory(slam, piece)`; None before the last adjustment, or where there was none."""
-    if slam.pose_sigma is None or len(slam.pose_sigma) != len(slam.keyframes):
+    if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
         return None
     own = set(pieces_by_size(slam)[piece])
     records = [record for record in slam.frames if record.tracked and record.reference in own]
-    sigma = slam.pose_sigma[[record.reference for record in records]].reshape(-1, 2)
+    sigma = slam.map.pose_sigma[[record.reference for record in records]].reshape(-1, 2)
     tracked = [(r.evidence.sigma_translation, r.evidence.sigma_rotation) for r in records]
     # The pose of a keyframe's own frame is the keyframe's: only other frames add the error of their tracking.
     apart = [not np.array_equal(record.relative, np.eye(4)) for record in records]
@@ -110,7 +110,7 @@ def _unmeasured_turn(slam: Slam) -> float:
     """
     height, width = slam.keyframes[0].size
     # A given camera that was refined has moved by what its prior allows, which is no measurement of its middle either.
-    fx, fy, cx, cy = slam.given_intrinsics if slam.calibrated else slam.intrinsics
+    fx, fy, cx, cy = slam.camera.given if slam.camera.calibrated else slam.intrinsics
     aside = np.abs([cx - (width - 0.5) / 2, cy - (height - 0.5) / 2])
     return CENTRE * max(width / fx, height / fy) if np.all(aside <= MIDDLE) else 0.0
 

@@ -17,10 +17,10 @@ from vggtgeo.slam.global_map.unit_graph import UnitRatio, solve_units
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.units import longer, scaled_factor, scaled_keyframe, scaled_motion, scaled_record
-from vggtgeo.slam.start import NOMINAL_DEPTH
+from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.tracker import scaled_record
 
 MENDABLE = 20.0
 """Pixels of the median match beyond which the map is straightened before it is adjusted. An adjustment alone brings
@@ -84,8 +84,8 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
     """
     tree: dict[int, MeasuredRelativePose] = {}
     others = []
-    for tie in slam.ties:
-        if tie.first < tie.second and tie.second not in tree and tie.second not in slam.origins:
+    for tie in slam.map.odometry_factors:
+        if tie.first < tie.second and tie.second not in tree and tie.second not in slam.map.roots:
             tree[tie.second] = tie
         else:
             others.append(tie)
@@ -93,7 +93,7 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
     between = lambda first, second: rigid.orthonormal(poses[second] @ rigid.invert(poses[first]))
     loose = np.diag(1.0 / np.repeat(UNTRACKED, 3) ** 2)
     motions: list[MeasuredRelativePose] = []
-    matched = {pair.key for pair in slam.pairs if len(pair.points)}
+    matched = {pair.key for pair in slam.map.pairs if len(pair.points)}
     for number in range(1, len(slam.keyframes)):
         if number in tree:
             tie = tree[number]
@@ -119,8 +119,8 @@ def _graph(
     scaled_motions, scaled_loops = tuple(map(inside, motions)), tuple(map(inside, loops))
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])
-    whole = replace(slam, factors=(*slam.factors, *loops))
-    label = piece_of(whole)
+    whole = replace(slam, map=replace(slam.map, factors=(*slam.map.factors, *loops)))
+    label = piece_of(whole.map)
     held = np.zeros(len(poses), bool)
     held[np.unique(label, return_index=True)[1]] = True
     return PoseGraph(start, scaled_motions, scaled_loops, held)
@@ -137,23 +137,29 @@ def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[
 def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
     """The map without some of its tracked motions."""
     gone = {id(tie) for tie in ties}
-    return replace(slam, factors=tuple(factor for factor in slam.factors if id(factor) not in gone))
+    return replace(
+        slam, map=replace(slam.map, factors=tuple(factor for factor in slam.map.factors if id(factor) not in gone))
+    )
 
 
 def _taken(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
     """The map at other poses, its lengths multiplied keyframe by keyframe."""
     unit = lambda number: float(units[number])
-    factors = tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.factors)
+    factors = tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors)
     return replace(
         slam,
-        keyframes=tuple(
-            replace(scaled_keyframe(keyframe, unit(keyframe.number)), pose=rigid.orthonormal(pose))
-            for keyframe, pose in zip(slam.keyframes, poses, strict=True)
+        map=replace(
+            slam.map,
+            keyframes=tuple(
+                replace(scaled_keyframe(keyframe, unit(keyframe.number)), pose=rigid.orthonormal(pose))
+                for keyframe, pose in zip(slam.keyframes, poses, strict=True)
+            ),
+            factors=factors,
         ),
-        frames=tuple(scaled_record(record, unit(record.reference)) for record in slam.frames),
-        factors=factors,
-        prior=None,
-        solved=None,
+        tracker=replace(
+            slam.tracker, frames=tuple(scaled_record(record, unit(record.reference)) for record in slam.frames)
+        ),
+        window=replace(slam.window, prior=None, solved=None),
     )
 
 

@@ -190,7 +190,7 @@ class CameraSettings(CheckedSettings):
             while the run goes on.
         still_parts: Whether some frames are looked at first for parts of the picture that stay in their place while
             the rest moves (bars, a watermark, specks on the lens), so that nothing is looked for there, see
-            `slam/camera/still_parts.py`. Frames that come once (a live camera, a stream) and simulated ones are
+            `slam/perception/still_parts.py`. Frames that come once (a live camera, a stream) and simulated ones are
             not.
         refine_intrinsics: Whether the last adjustment may move known intrinsics: "auto", where the images ask for
             it and it pays (see `slam/camera/calibration.py`); "always", where the images ask for it; "never".
@@ -233,8 +233,8 @@ class WindowSettings(CheckedSettings):
         line_slots: Samples of segments a keyframe, at most.
         kernel: Robust kernel of points and lines, in the last adjustment too; widths in pixels.
         window_iterations: Iterations of an adjustment of the window, at most.
-        record_iterations: Keep what each iteration of the window's solver did in `Slam.iterations`, for a viewer;
-            changes no result.
+        record_iterations: Keep what each iteration of the window's solver did in `Slam.window.iterations`, for a
+            viewer; changes no result.
 
     Example:
         >>> import vggtgeo as vg

@@ -22,7 +22,8 @@ from vggtgeo.models.classical import (
     in_order,
 )
 from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector, LineMatcher, MetricDepth, PointMatcher
-from vggtgeo.slam.camera.still_parts import StillParts
+from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment
+from vggtgeo.slam.perception.still_parts import StillParts
 from vggtgeo.slam.settings.groups import (
     CameraSettings,
     DepthSettings,
@@ -34,7 +35,6 @@ from vggtgeo.slam.settings.groups import (
     WeightSettings,
     WindowSettings,
 )
-from vggtgeo.slam.tracking.rgbd_alignment import RgbdAlignment
 
 _ASKED = {
     "points": ("describe", "match"),

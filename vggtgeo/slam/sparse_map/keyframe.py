@@ -10,9 +10,9 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
+from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer, check_size
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages, array_of
-from vggtgeo.slam.tracking.description import Description
 
 
 @dataclass(frozen=True, eq=False)

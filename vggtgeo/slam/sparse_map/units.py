@@ -10,8 +10,9 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.state import FramePose, SecondMotion
 
+NOMINAL_DEPTH = 2.5
+"""Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
 LEAST_SHARED = 20
 """Key points with a depth in both keyframes that tell the ratio of their units."""
 MOST_SCALE_ERROR = 0.03
@@ -57,19 +58,6 @@ def scaled_keyframe(keyframe: Keyframe, ratio: float) -> Keyframe:
     return replace(keyframe, pose=longer(keyframe.pose, ratio), points=points, samples=samples, line_depths=line_depths)
 
 
-def scaled_record(record: FramePose, ratio: float) -> FramePose:
-    """The record of a frame that hangs on such a keyframe."""
-    arrival = None if record.arrival is None else (record.arrival[0], longer(record.arrival[1], ratio))
-    second = None if record.second is None else scaled_second(record.second, ratio)
-    return replace(record, relative=longer(record.relative, ratio), arrival=arrival, second=second)
-
-
-def scaled_second(second: SecondMotion, ratio: float) -> SecondMotion:
-    """What the second keyframe says of such a frame."""
-    information = _of_longer(second.information, ratio)
-    return replace(second, relative=longer(second.relative, ratio), information=information)
-
-
 def scaled_factor(factor: Factor, ratio: float) -> Factor:
     """What is known of such keyframes; a baseline stays what it is."""
     return scaled_motion(factor, ratio) if isinstance(factor, MeasuredRelativePose) else factor
@@ -77,10 +65,10 @@ def scaled_factor(factor: Factor, ratio: float) -> Factor:
 
 def scaled_motion(motion: MeasuredRelativePose, ratio: float) -> MeasuredRelativePose:
     """A measured motion whose translation is `ratio` times as long, and its information."""
-    return replace(motion, pose=longer(motion.pose, ratio), information=_of_longer(motion.information, ratio))
+    return replace(motion, pose=longer(motion.pose, ratio), information=scaled_information(motion.information, ratio))
 
 
-def _of_longer(information: np.ndarray, ratio: float) -> np.ndarray:
+def scaled_information(information: np.ndarray, ratio: float) -> np.ndarray:
     """The information [6, 6], translation first, of a motion that is `ratio` times as long."""
     by = np.repeat([1.0 / ratio, 1.0], 3)
     return np.asarray(information * np.outer(by, by))

@@ -16,7 +16,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import PatchFlow
 from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches, PoseGuess, PoseQuery
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state import SeenPoints
+from vggtgeo.slam.tracking.tracker import SeenPoints
 
 MOST_POINTS = 300
 """Key points that are followed, the best of each part of the image; a pose needs no more."""

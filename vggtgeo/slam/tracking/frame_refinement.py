@@ -9,6 +9,7 @@ one keyframe to the next, wherever adjustments move them. Keyframes stay.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,15 +17,17 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import SensorDepth
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.state import SecondMotion, Slam
+from vggtgeo.slam.perception.rgbd_alignment import Aligned, RgbdAlignment
+from vggtgeo.slam.perception.rgbd_view import RgbdView
+from vggtgeo.slam.settings.groups import RefinementSettings
+from vggtgeo.slam.settings.slam_settings import Roles
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.evidence import LEAST_CORRELATION, LEAST_OVERLAP, LEAST_SURFACE, Evidence
 from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE, with_systematic
 from vggtgeo.slam.tracking.map_points import in_view
 from vggtgeo.slam.tracking.relocalisation import view_of
-from vggtgeo.slam.tracking.rgbd_alignment import Aligned, RgbdAlignment
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
+from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, Tracker, frame_pose
 
 FINEST = (4, 0, 0)
 """Iterations by level, the finest first: a frame begins within millimetres of where it ends."""
@@ -35,62 +38,71 @@ NOTHING = 1e-9
 """Information, 1/m^2 and 1/rad^2, that is none: an inverse exists with it."""
 
 
-def with_view(slam: Slam, view: RgbdView | None, roles: Roles, settings: SlamSettings) -> Slam:
-    """The state with the view of its last frame, which waits for the next keyframe; not for long."""
-    measured = settings.refinement.frames and isinstance(roles.depth, SensorDepth) and roles.alignment is not None
-    if view is None or not (measured and slam.metric):
-        return slam
-    slam = replace(slam, between=(*slam.between, (len(slam.frames) - 1, view)))
-    return against_nearest(slam, roles) if len(slam.between) == MOST else slam
+def with_view(
+    known: Map,
+    tracker: Tracker,
+    view: RgbdView | None,
+    intrinsics: np.ndarray,
+    roles: Roles,
+    settings: RefinementSettings,
+) -> Tracker:
+    """The tracker with the view of its last frame, which waits for the next keyframe; not for long."""
+    measured = settings.frames and isinstance(roles.depth, SensorDepth) and roles.alignment is not None
+    if view is None or not (measured and known.metric):
+        return tracker
+    tracker = replace(tracker, between=(*tracker.between, (len(tracker.frames) - 1, view)))
+    return against_nearest(known, tracker, intrinsics, roles) if len(tracker.between) == MOST else tracker
 
 
-def against_reference(slam: Slam) -> Slam:
-    """The state after the keyframe that frames are tracked against has changed: frames that waited for it are aligned
-    to it.
-    """
-    return replace(slam, between=()) if slam.reference is None else _against(slam, *slam.reference)
+def against_reference(known: Map, tracker: Tracker) -> Tracker:
+    """The tracker after its reference keyframe has changed: frames that waited for it are aligned to it."""
+    if tracker.reference is None:
+        return replace(tracker, between=())
+    return _against(known, tracker, *tracker.reference)
 
 
-def against_nearest(slam: Slam, roles: Roles) -> Slam:
-    """The state after no other keyframe has come for long, or will: frames that wait are aligned to the nearest one
+def against_nearest(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> Tracker:
+    """The tracker after no other keyframe has come for long, or will: frames that wait are aligned to the nearest one
     that they were not tracked against.
     """
-    if not slam.between:
-        return slam
-    last = slam.frames[slam.between[-1][0]]
-    near = in_view(slam.keyframes[slam.origins[-1] :], slam.pose(last), last.reference)
-    return _against(slam, near[0].number, view_of(near[0], slam, roles)) if near else replace(slam, between=())
+    if not tracker.between:
+        return tracker
+    last = tracker.frames[tracker.between[-1][0]]
+    near = in_view(known.keyframes[known.roots[-1] :], frame_pose(known, last), last.reference)
+    if not near:
+        return replace(tracker, between=())
+    return _against(known, tracker, near[0].number, view_of(near[0], tracker, intrinsics, roles))
 
 
-def _against(slam: Slam, number: int, source: RgbdView | None) -> Slam:
-    """The state with the frames that waited placed by one keyframe, as far as they were tracked against another."""
-    keyframe = slam.keyframes[number]
+def _against(known: Map, tracker: Tracker, number: int, source: RgbdView | None) -> Tracker:
+    """The tracker with the frames that waited placed by one keyframe, as far as they were tracked against another."""
+    keyframe = known.keyframes[number]
 
     def second(item: tuple[int, RgbdView]) -> SecondMotion | None:
-        record, view = slam.frames[item[0]], item[1]
+        record, view = tracker.frames[item[0]], item[1]
         if source is None or record.reference == number:
             return None
-        found = RgbdAlignment(FINEST).align(source, view, slam.pose(record) @ rigid.invert(keyframe.pose))
+        found = RgbdAlignment(FINEST).align(source, view, frame_pose(known, record) @ rigid.invert(keyframe.pose))
         if found is None or not _shows(found):
             return None
         return SecondMotion(number, rigid.orthonormal(found.motion), with_systematic(found.information, found.motion))
 
-    frames = list(slam.frames)
-    for (row, _), motion in zip(slam.between, map_in_threads(second, slam.between), strict=True):
+    frames = list(tracker.frames)
+    for (row, _), motion in zip(tracker.between, map_in_threads(second, tracker.between), strict=True):
         frames[row] = replace(frames[row], second=motion)
-    return replace(slam, frames=tuple(frames), between=())
+    return replace(tracker, frames=tuple(frames), between=())
 
 
-def by_both(slam: Slam, poses: np.ndarray) -> np.ndarray:
+def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.ndarray:
     """World -> camera of all frames [n, 4, 4], given what each is by the keyframe that it was tracked against: the mean
     with what the second motion says, where they agree.
     """
-    rows = [row for row, record in enumerate(slam.frames) if record.second is not None]
+    rows = [row for row, record in enumerate(frames) if record.second is not None]
     if not rows:
         return poses
-    records = [slam.frames[row] for row in rows]
+    records = [frames[row] for row in rows]
     seconds = [record.second for record in records if record.second is not None]
-    placed = np.array([second.relative @ slam.keyframes[second.keyframe].pose for second in seconds])
+    placed = np.array([second.relative @ known.keyframes[second.keyframe].pose for second in seconds])
     own = np.array([tracked_information(record.evidence) for record in records])
     other = np.array([second.information for second in seconds])
     apart = placed @ rigid.invert(poses[rows])

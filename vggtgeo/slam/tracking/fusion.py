@@ -12,10 +12,10 @@ from scipy.stats import chi2 as chi_square
 from vggtgeo.geometry import rigid
 from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import LineFeatures, LineMatcher
+from vggtgeo.slam.perception.rgbd_alignment import Aligned
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import Evidence, tangent
 from vggtgeo.slam.tracking.line_alignment import align_lines
-from vggtgeo.slam.tracking.rgbd_alignment import Aligned
 
 SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
 """What no number of samples removes (calibration, rolling shutter, clocks): metres, radians, share of the motion.

@@ -11,14 +11,15 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import place_vector
 from vggtgeo.models.roles import Features
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state import FramePose, Slam, Waiting
-from vggtgeo.slam.tracking.description import Description
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.tracking.evidence import STEP_GATE
 from vggtgeo.slam.tracking.odometry import Odometry
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
-from vggtgeo.slam.tracking.track import Expectation, Sight, Track, tie_between, track
+from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_between, track
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker, Waiting, frame_pose
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
@@ -28,17 +29,17 @@ drifts by 1 to 2 %."""
 
 
 def relocalise(
-    sight: Sight, candidates: Iterable[Keyframe], slam: Slam, roles: Roles, most: int = CANDIDATES
+    given: TrackingInput, candidates: Iterable[Keyframe], tracker: Tracker, most: int = CANDIDATES
 ) -> Track | None:
     """The frame's pose by the most similar of `candidates`, where one of the first `most` is certain."""
-    for keyframe in most_similar(sight.features, tuple(candidates))[:most]:
-        found = track(sight, keyframe, view_of(keyframe, slam, roles), None, slam.intrinsics, roles)
+    for keyframe in most_similar(given.data.features, tuple(candidates))[:most]:
+        found = track(given, keyframe, view_of(keyframe, tracker, given.intrinsics, given.roles))
         if found.evidence.certain:
             return found
     return None
 
 
-def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | None:
+def revisit(given: TrackingInput, current: Track, known: Map, tracker: Tracker, members: Sequence[int]) -> Track | None:
     """The frame's pose by an old keyframe that shows the same place, wherever drift has put it: a loop that is closed
     while the run goes on. The camera goes on from there, and the last adjustment spreads what the loop was off.
 
@@ -46,27 +47,29 @@ def revisit(slam: Slam, sight: Sight, current: Track, roles: Roles) -> Track | N
     tracked frame: one that looks as much like the frame as those of the window do, and that drift may have put here. A
     place that odometry contradicts only looks the same. Without metric depth the unit drifts, too, and loops wait for
     the end.
+
+    members: of the window.
     """
-    recent = slam.window[0] if slam.window else 0
-    centres = np.array([rigid.centre(keyframe.pose) for keyframe in slam.keyframes])
+    recent = members[0] if members else 0
+    centres = np.array([rigid.centre(keyframe.pose) for keyframe in known.keyframes])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     way = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # from each keyframe to the newest
     within = np.linalg.norm(centres - rigid.centre(current.pose), axis=1) < MOST_DRIFT * way
-    old = [k for k in slam.keyframes[:recent] if k.place is not None and within[k.number]]
-    place = place_vector(sight.features) if slam.metric and old else None
+    old = [k for k in known.keyframes[:recent] if k.place is not None and within[k.number]]
+    place = place_vector(given.data.features) if known.metric and old else None
     if place is None:
         return None
-    near = [slam.keyframes[number].place for number in slam.window]
-    usual = np.median([known @ place for known in near if known is not None] or [1.0])
+    near = [known.keyframes[number].place for number in members]
+    usual = np.median([other @ place for other in near if other is not None] or [1.0])
     similarity = [float(k.place @ place) for k in old if k.place is not None]
     best = int(np.argmax(similarity))
     if similarity[best] < usual:
         return None
-    found = track(sight, old[best], view_of(old[best], slam, roles), None, slam.intrinsics, roles)
+    found = track(given, old[best], view_of(old[best], tracker, given.intrinsics, given.roles))
     if not (found.accepted and found.evidence.certain):
         return None
-    distance = Odometry.of(slam.ties, len(slam.keyframes)).distances([tie_between(current, found)])
-    return None if distance[0] >= STEP_GATE else found
+    odometry = Odometry.of(known.odometry_factors, len(known.keyframes))
+    return None if odometry.distances([tie_between(current, found)])[0] >= STEP_GATE else found
 
 
 def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Keyframe, ...]:
@@ -79,47 +82,48 @@ def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Key
     return tuple(known[i] for i in np.argsort(-similarity, kind="stable")[:CANDIDATES])
 
 
-def view_of(keyframe: Keyframe, slam: Slam, roles: Roles) -> RgbdView | None:
+def view_of(keyframe: Keyframe, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> RgbdView | None:
     """What the alignment needs of a keyframe; that of the reference is at hand, any other is made again."""
     if roles.alignment is None:
         return None
-    if slam.reference is not None and slam.reference[0] == keyframe.number:
-        return slam.reference[1]
+    if tracker.reference is not None and tracker.reference[0] == keyframe.number:
+        return tracker.reference[1]
     depth = keyframe.depth.astype(np.float32), keyframe.depth_sigma.astype(np.float32)
-    return RgbdView.of(keyframe.image, depth, slam.intrinsics)
+    return RgbdView.of(keyframe.image, depth, intrinsics)
 
 
-def wait(slam: Slam, frame: Frame, features: Features, most: int) -> tuple[Waiting, ...]:
+def wait(tracker: Tracker, frame: Frame, features: Features, most: int) -> tuple[Waiting, ...]:
     """The waiting frames with this one, the oldest forgotten beyond `most`."""
-    return (*slam.waiting, Waiting(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
+    return (*tracker.waiting, Waiting(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
 
 
-def place_waiting(slam: Slam, roles: Roles) -> Slam:
+def place_waiting(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> Tracker:
     """Give the frames that waited while tracking was lost their poses, from the newest back, each by the next one's."""
     placed: dict[int, FramePose] = {}
-    pose, step = slam.last_pose, np.eye(4)
-    keyframe = slam.keyframes[slam.frames[-1].reference]
-    source = view_of(keyframe, slam, roles)
-    for number, waiting in enumerate(reversed(slam.waiting)):
+    last = tracker.frames[-1]
+    pose, step = frame_pose(known, last), np.eye(4)
+    keyframe = known.keyframes[last.reference]
+    source = view_of(keyframe, tracker, intrinsics, roles)
+    for number, waiting in enumerate(reversed(tracker.waiting)):
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
-        sight = sight_of(frame, Description.of(waiting.features), slam, roles)
-        expected = Expectation(step @ pose, step, waited=min(number, 3))
-        found = track(sight, keyframe, source, expected, slam.intrinsics, roles)
+        data = frame_data(frame, Description.of(waiting.features), intrinsics, roles, known.metric)
+        prior = MotionPrior(step @ pose, step, waited=min(number, 3))
+        found = track(TrackingInput(data, intrinsics, roles, prior), keyframe, source)
         if not found.accepted:
             continue
         step, pose = found.pose @ rigid.invert(pose), found.pose
         placed[waiting.frame] = record_of(frame, found)
-    frames = tuple(placed.get(record.frame, record) for record in slam.frames)
-    return replace(slam, frames=frames, waiting=())
+    frames = tuple(placed.get(record.frame, record) for record in tracker.frames)
+    return replace(tracker, frames=frames, waiting=())
 
 
-def sight_of(frame: Frame, description: Description, slam: Slam, roles: Roles) -> Sight:
-    """The frame as it is tracked."""
+def frame_data(frame: Frame, description: Description, intrinsics: np.ndarray, roles: Roles, metric: bool) -> FrameData:
+    """The frame as it is tracked; metric: whether lengths of the map are metres."""
     view = None
-    if roles.alignment is not None and slam.metric:
-        view = description.view_by(slam.intrinsics)
-        view = view or RgbdView.of(frame.image, roles.tracking_depth(frame.depth), slam.intrinsics)
-    return Sight(frame, description, view)
+    if roles.alignment is not None and metric:
+        view = description.view_by(intrinsics)
+        view = view or RgbdView.of(frame.image, roles.tracking_depth(frame.depth), intrinsics)
+    return FrameData(frame, description, view)
 
 
 def record_of(frame: Frame, found: Track) -> FramePose:

@@ -19,17 +19,17 @@ from vggtgeo.models.roles import (
     PoseGuess,
     PoseQuery,
 )
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.perception.rgbd_alignment import Aligned
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state import SeenPoints
-from vggtgeo.slam.tracking.description import Description
 from vggtgeo.slam.tracking.evidence import Evidence, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.tracking.following import Located, located_by_flow
 from vggtgeo.slam.tracking.fusion import Motion, agreed, drawn_to, wanting, with_lines, with_systematic
 from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
-from vggtgeo.slam.tracking.rgbd_alignment import Aligned
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
+from vggtgeo.slam.tracking.tracker import SeenPoints
 
 PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
@@ -40,7 +40,7 @@ ROUGH_RADIUS = 60.0
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class FrameData:
     """A frame as it is tracked. view: None where its picture as a whole plays no part. find_lines: finds and describes
     its segments; None where they play no part.
     """
@@ -68,7 +68,7 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False)
-class Expectation:
+class MotionPrior:
     """Where motion so far leads. pose: float64 [4, 4], world -> camera. step: the last motion, camera -> camera.
     waited: frames since it was last confirmed.
     """
@@ -81,6 +81,25 @@ class Expectation:
         """The expected motion from a keyframe, and how well it is known."""
         information = step_information(self.step) / (self.waited + 1)
         return Motion(self.pose @ rigid.invert(keyframe.pose), information)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingInput:
+    """A frame to be placed, and what is known before.
+
+    prior: None where nothing is known of the motion. window: keyframes that a model which looks at images may place the
+    frame among.
+    """
+
+    data: FrameData
+    intrinsics: np.ndarray
+    roles: Roles
+    prior: MotionPrior | None = None
+    window: tuple[Keyframe, ...] = ()
+
+    def views(self, source: RgbdView | None) -> tuple[RgbdView, RgbdView] | None:
+        """The views of a keyframe and of the frame; None unless there are both."""
+        return None if source is None or self.data.view is None else (source, self.data.view)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,104 +134,79 @@ class Track:
         return with_systematic(self.measured, self.relative)
 
 
-def track(
-    sight: Sight,
-    keyframe: Keyframe,
-    source: RgbdView | None,
-    expected: Expectation | None,
-    intrinsics: np.ndarray,
-    roles: Roles,
-    window: Iterable[Keyframe] = (),
-) -> Track:
+def track(given: TrackingInput, keyframe: Keyframe, source: RgbdView | None) -> Track:
     """The pose of a frame from one keyframe: by its points, then by its picture and surface from there.
 
-    source: the keyframe's view, where there is one. expected: None where nothing is known of the motion.
-    window: keyframes that a model which looks at images may place the frame among.
+    source: the keyframe's view, where there is one.
     """
-    views = None if source is None or sight.view is None else (source, sight.view)
+    roles, views = given.roles, given.views(source)
     aligner = roles.alignment if views is not None else None
     located = None
-    if aligner is not None and expected is not None and roles.flow is not None and roles.follows:
-        located = located_by_flow(sight.frame.image, keyframe, expected.pose, intrinsics, roles.flow, roles.geometry)
+    if aligner is not None and given.prior is not None and roles.flow is not None and roles.follows:
+        image, predicted = given.data.frame.image, given.prior.pose
+        located = located_by_flow(image, keyframe, predicted, given.intrinsics, roles.flow, roles.geometry)
     if located is None:
         matcher = roles.points if aligner is None else roles.coarse_points
-        located = _by_descriptors(sight, keyframe, expected, intrinsics, matcher, roles, tuple(window))
-    return _placed(sight, keyframe, views, expected, located, intrinsics, roles)
+        located = _by_descriptors(given, keyframe, matcher)
+    return _placed(given, keyframe, views, located)
 
 
 def track_by_map(
-    sight: Sight,
-    keyframes: Iterable[Keyframe],
-    reference: Keyframe,
-    source: RgbdView | None,
-    expected: Expectation,
-    intrinsics: np.ndarray,
-    roles: Roles,
+    given: TrackingInput, keyframes: Iterable[Keyframe], reference: Keyframe, source: RgbdView | None
 ) -> Track:
     """The pose of a frame from the points of all keyframes in view together, where no keyframe alone has enough.
 
-    They are searched around where the motion so far leads. Picture and lines are those of `reference`.
+    They are searched around where the motion prior leads. Picture and lines are those of `reference`.
     """
+    assert given.prior is not None
+    data, predicted = given.data, given.prior.pose
     points, pixels, confidence = joint_matches(
-        sight.features, tuple(keyframes), expected.pose, intrinsics, ROUGH_RADIUS
+        data.features, tuple(keyframes), predicted, given.intrinsics, ROUGH_RADIUS
     )
-    query = PoseQuery(sight.frame.image, intrinsics, points, pixels, confidence, expected.pose)
-    located = Located(roles.geometry.locate(query), len(points), points, PIXEL_SIGMA)
-    views = None if source is None or sight.view is None else (source, sight.view)
-    return _placed(sight, reference, views, expected, located, intrinsics, roles)
+    query = PoseQuery(data.frame.image, given.intrinsics, points, pixels, confidence, predicted)
+    located = Located(given.roles.geometry.locate(query), len(points), points, PIXEL_SIGMA)
+    return _placed(given, reference, given.views(source), located)
 
 
 def _placed(
-    sight: Sight,
-    keyframe: Keyframe,
-    views: tuple[RgbdView, RgbdView] | None,
-    expected: Expectation | None,
-    located: Located,
-    intrinsics: np.ndarray,
-    roles: Roles,
+    given: TrackingInput, keyframe: Keyframe, views: tuple[RgbdView, RgbdView] | None, located: Located
 ) -> Track:
-    """The pose by key points, then by picture, surface and lines from there, or from where the motion so far leads."""
-    guess = located.guess
+    """The pose by key points, then by picture, surface and lines from there, or from where the motion prior leads."""
+    guess, lines = located.guess, given.roles.line_matches
     known = guess.result is GeometryResult.SUCCESS
-    aligner, dense = roles.alignment, None
-    if aligner is not None and views is not None and (known or expected):
+    aligner, dense = given.roles.alignment, None
+    if aligner is not None and views is not None and (known or given.prior):
         dense = aligner.align(*views, guess.pose @ rigid.invert(keyframe.pose))
     by_points = None
     if known:
-        information = pose_information(guess.pose, located.points[guess.inliers], intrinsics, located.sigma)
+        information = pose_information(guess.pose, located.points[guess.inliers], given.intrinsics, located.sigma)
         by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
     evidence = _seen(guess, located.matches, by_points, dense)
-    prior = None if expected is None else expected.motion_from(keyframe)
+    prior = None if given.prior is None else given.prior.motion_from(keyframe)
     found = agreed(by_points, dense, evidence)
     if found is not None and prior is not None:
         found = drawn_to(found, prior)
     needed = prior is not None if found is None else wanting(found)
-    if needed and sight.lines is not None:
-        found, evidence = with_lines(found, prior, evidence, keyframe, sight.lines, intrinsics, roles.line_matches)
+    if needed and given.data.lines is not None:
+        found, evidence = with_lines(found, prior, evidence, keyframe, given.data.lines, given.intrinsics, lines)
     if found is None:
         return Track(keyframe, guess.pose, np.zeros((6, 6)), evidence, guess.result)
     pose = rigid.orthonormal(found.motion @ keyframe.pose)
-    track = _judged(pose, found.information, evidence, keyframe, expected)
+    track = _judged(pose, found.information, evidence, keyframe, given.prior)
     return replace(track, seen=located.seen) if known and dense is None else track
 
 
-def refined_by_map(
-    found: Track,
-    sight: Sight,
-    keyframes: Iterable[Keyframe],
-    expected: Expectation | None,
-    intrinsics: np.ndarray,
-) -> Track:
-    """The same with what the points of all other keyframes in view know of the pose, where something is wanting."""
+def refined_by_map(found: Track, given: TrackingInput, keyframes: Iterable[Keyframe]) -> Track:
+    """The same with what the points of all other keyframes in view know of the pose, where it is weakly constrained."""
     if not wanting(Motion(found.relative, found.measured)):
         return found
     refined = refine_by_map(
-        sight.features,
+        given.data.features,
         tuple(keyframes),
         found.keyframe,
         found.pose,
         found.information,
-        intrinsics,
+        given.intrinsics,
         with_systematic,
         radius=SEARCH_RADIUS,
         sigma=PIXEL_SIGMA,
@@ -222,7 +216,7 @@ def refined_by_map(
     # What no sample removes is common to all keyframes, and counted once.
     measured = found.measured + refined.information
     evidence = replace(found.evidence, map_points=refined.points)
-    better = _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, expected)
+    better = _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, given.prior)
     return replace(better, alone=found, seen=found.seen)
 
 
@@ -253,47 +247,39 @@ def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
     )
 
 
-def _by_descriptors(
-    sight: Sight,
-    keyframe: Keyframe,
-    expected: Expectation | None,
-    intrinsics: np.ndarray,
-    matcher: PointMatcher,
-    roles: Roles,
-    window: tuple[Keyframe, ...],
-) -> Located:
+def _by_descriptors(given: TrackingInput, keyframe: Keyframe, matcher: PointMatcher) -> Located:
     """The pose by key points that match in their descriptors, as far as their depth is known."""
-    matches = matcher.match(keyframe.features, sight.features)
+    matches = matcher.match(keyframe.features, given.data.features)
     inverse_depth = keyframe.points.inverse_depth[matches.index_i]
     known = np.isfinite(inverse_depth)
     matches = matches.select(known)
-    points = rigid.unproject(matches.pixels_i, inverse_depth[known], keyframe.pose, intrinsics)
+    points = rigid.unproject(matches.pixels_i, inverse_depth[known], keyframe.pose, given.intrinsics)
     query = PoseQuery(
-        sight.frame.image,
-        intrinsics,
+        given.data.frame.image,
+        given.intrinsics,
         points,
         matches.pixels_j,
         matches.confidence,
-        None if expected is None else expected.pose,
-        window_images=tuple(member.image for member in window),
-        window_poses=tuple(member.pose for member in window),
-        window_depths=tuple(member.depth for member in window) if roles.metric else (),
+        None if given.prior is None else given.prior.pose,
+        window_images=tuple(member.image for member in given.window),
+        window_poses=tuple(member.pose for member in given.window),
+        window_depths=tuple(member.depth for member in given.window) if given.roles.metric else (),
     )
-    guess = roles.geometry.locate(query)
+    guess = given.roles.geometry.locate(query)
     return Located(guess, len(matches), points, PIXEL_SIGMA, matches.index_i, matches.pixels_j)
 
 
 def _judged(
-    pose: np.ndarray, measured: np.ndarray, evidence: Evidence, keyframe: Keyframe, expected: Expectation | None
+    pose: np.ndarray, measured: np.ndarray, evidence: Evidence, keyframe: Keyframe, prior: MotionPrior | None
 ) -> Track:
-    """A pose with how well it is known in its worst direction, and how far it is from what was expected."""
+    """A pose with how well it is known in its worst direction, and how far it is from what was prior."""
     track = Track(keyframe, pose, measured, evidence, GeometryResult.SUCCESS)
     sigma_translation, sigma_rotation = worst_sigma(track.information)
     evidence = replace(
         evidence,
         sigma_translation=sigma_translation,
         sigma_rotation=sigma_rotation,
-        chi2=float("nan") if expected is None else step_chi2(pose, expected.pose, expected.step, expected.waited),
+        chi2=float("nan") if prior is None else step_chi2(pose, prior.pose, prior.step, prior.waited),
     )
     return replace(track, evidence=evidence)
 

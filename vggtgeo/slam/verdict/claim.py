@@ -8,9 +8,10 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.sparse_map.connected import pieces_by_size
-from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Readout, Slam
-from vggtgeo.slam.tracking.frame_poses import frame_poses
+from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA, Readout
+from vggtgeo.slam.global_map.frame_poses import frame_poses
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,9 @@ class Claim:
             pieces=max(len(pieces_by_size(slam)), 1),
             started=any(np.isfinite(keyframe.points.inverse_depth).any() for keyframe in slam.keyframes),
             in_known_map=any(keyframe.frame < 0 for keyframe in slam.keyframes),
-            guessed=not (slam.calibrated or slam.camera_found) and len(slam.keyframes) < LEAST_TO_FIND_A_CAMERA,
-            readout=slam.readout,
+            guessed=not (slam.camera.calibrated or slam.camera.self_calibrated)
+            and len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA,
+            readout=slam.camera.readout,
         )
 
     def __len__(self) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.slam.camera.still_parts import StillParts
+from vggtgeo.slam.perception.still_parts import StillParts
 from vggtgeo.slam.verdict.finding import Finding
 from vggtgeo.slam.verdict.record import MAX_LOST
 

@@ -106,7 +106,9 @@ def unlinked(slam: Slam, claim: Claim, stretches: Sequence[np.ndarray]) -> list[
     row_of = {int(frame): row for row, frame in enumerate(claim.frames)}
     place = {key.number: stretch_of[row_of[key.frame]] for key in slam.keyframes if key.frame in row_of}
     known = [
-        pair for pair in slam.pairs if len(pair.points) >= STRONG_INLIERS and {pair.first, pair.second} <= place.keys()
+        pair
+        for pair in slam.map.pairs
+        if len(pair.points) >= STRONG_INLIERS and {pair.first, pair.second} <= place.keys()
     ]
     ends = [(place[pair.first], place[pair.second]) for pair in known]
     for record in slam.frames:
@@ -145,4 +147,4 @@ def aligned(slam: Slam, claim: Claim, evidence: Evidence) -> Sequence[FrameEvide
     if any(frame not in by_frame for frame in claim.frames):
         return None
     found = [by_frame[frame] for frame in claim.frames]
-    return found if slam.lens is None else [noted.through(slam.lens) for noted in found]
+    return found if slam.camera.lens is None else [noted.through(slam.camera.lens) for noted in found]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,11 +25,12 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions, match_keyframes
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Slam
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.window.gauge import Gauge, gauge_notes, with_one_gauge
 from vggtgeo.slam.window.line_triangulation import with_segment_depths
+from vggtgeo.slam.window.window import Window
 from vggtgeo.slam.window.window_prior import WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
@@ -109,107 +110,120 @@ def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
     )
 
 
-def make_room(slam: Slam, settings: SlamSettings, needed: int | None = None) -> Slam:
+@dataclass(frozen=True, eq=False)
+class AdjustedWindow:
+    """The result of an adjustment; notes: what the user should know."""
+
+    map: Map
+    window: Window
+    intrinsics: np.ndarray
+    notes: tuple[str, ...]
+
+
+def make_room(window: Window, settings: SlamSettings, needed: int | None = None) -> Window:
     """Marginalise the oldest keyframe of a full window, by the last window that was solved with it.
 
     needed: a keyframe that stays, because the next one is tied to it.
     """
-    if len(slam.window) < settings.window.size:
-        return slam
-    leaving = next(number for number in slam.window if number != needed)
-    staying = tuple(number for number in slam.window if number != leaving)
-    if slam.solved is None or leaving not in slam.solved[0].keyframes:
-        return replace(slam, window=staying)
-    adjustment, state = slam.solved
+    if len(window.members) < settings.window.size:
+        return window
+    leaving = next(number for number in window.members if number != needed)
+    staying = tuple(number for number in window.members if number != leaving)
+    if window.solved is None or leaving not in window.solved[0].keyframes:
+        return replace(window, members=staying)
+    adjustment, state = window.solved
     prior = marginalise_jit(adjustment.problem, state, jnp.asarray(adjustment.keyframes.index(leaving)))
-    return replace(slam, window=staying, prior=WindowPrior(adjustment.keyframes, prior))
+    return replace(window, members=staying, prior=WindowPrior(adjustment.keyframes, prior))
 
 
-def enter(slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, tied_to: int | None = None) -> Slam:
+def enter(
+    known: Map,
+    window: Window,
+    keyframe: Keyframe,
+    intrinsics: np.ndarray,
+    roles: Roles,
+    settings: SlamSettings,
+    tied_to: int | None = None,
+) -> tuple[Map, Window]:
     """Add a keyframe, which was tracked against `tied_to`, to the window and match it to the others.
 
     The images of those outside the window are compressed.
     """
-    slam = make_room(slam, settings, tied_to)
-    match = lambda number: match_keyframes(slam.keyframes[number], keyframe, roles, settings, slam.intrinsics)
-    matched = map_in_threads(match, slam.window, alone=not can_search(keyframe.features))
+    window = make_room(window, settings, tied_to)
+    match = lambda number: match_keyframes(known.keyframes[number], keyframe, roles, settings, intrinsics)
+    matched = map_in_threads(match, window.members, alone=not can_search(keyframe.features))
     pairs = tuple(pair for pair in matched if pair is not None)
-    inside = (*slam.window, keyframe.number)
-    kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in slam.keyframes)
-    return replace(slam, keyframes=(*kept, keyframe), window=inside, pairs=(*slam.pairs, *pairs))
+    inside = (*window.members, keyframe.number)
+    kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in known.keyframes)
+    known = replace(known, keyframes=(*kept, keyframe), pairs=(*known.pairs, *pairs))
+    return known, replace(window, members=inside)
 
 
-def adjust(slam: Slam, settings: SlamSettings) -> Slam:
+def adjust(
+    known: Map, window: Window, intrinsics: np.ndarray, camera: CameraPrior, settings: SlamSettings
+) -> AdjustedWindow:
     """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
-    slam = slam if slam.metric else _with_line_depths(slam)
-    members = [slam.keyframes[number] for number in slam.window]
-    adjustment, gauge = window_problem(slam, members, settings)
-    told = (note for note in gauge_notes(gauge, adjustment.keyframes, "window") if note not in slam.notes)
-    slam = replace(slam, notes=(*slam.notes, *told))
+    known = known if known.metric else _with_line_depths(known, window, intrinsics)
+    members = [known.keyframes[number] for number in window.members]
+    adjustment, gauge = window_problem(known, window, intrinsics, camera, settings)
+    notes = gauge_notes(gauge, adjustment.keyframes, "window")
     solution = solve_jit(adjustment.problem, adjustment.initial, window_solver(settings))
     if not np.isfinite(float(solution.energy)):
-        return replace(slam, notes=(*slam.notes, f"window at keyframe {members[-1].number}: {solution.message}"))
+        failure = f"window at keyframe {members[-1].number}: {solution.message}"
+        return AdjustedWindow(known, window, intrinsics, (*notes, failure))
     updated, intrinsics = write_back(members, adjustment, solution.state)
-    keyframes = list(slam.keyframes)
+    keyframes = list(known.keyframes)
     for keyframe in updated:
         keyframes[keyframe.number] = keyframe
     history = np.asarray(solution.history, np.float64)
-    return replace(
-        slam,
-        keyframes=tuple(keyframes),
-        intrinsics=intrinsics,
+    window = replace(
+        window,
         solved=(adjustment, solution.state),
         energies=history[np.isfinite(history)],
         iterations=solution.record,
     )
+    return AdjustedWindow(replace(known, keyframes=tuple(keyframes)), window, intrinsics, notes)
 
 
-def _with_line_depths(slam: Slam) -> Slam:
-    """The state with the depths of segments that the window's views tell.
+def _with_line_depths(known: Map, window: Window, intrinsics: np.ndarray) -> Map:
+    """The map with the depths of segments that the window's views tell.
 
     Not beside measured depth: what that leaves out is glass, mirrors and what is far away.
     """
-    inside = {number: slam.keyframes[number] for number in slam.window}
-    keyframes = list(slam.keyframes)
-    for number, keyframe in with_segment_depths(inside, window_edges(slam), slam.intrinsics).items():
+    inside = {number: known.keyframes[number] for number in window.members}
+    keyframes = list(known.keyframes)
+    for number, keyframe in with_segment_depths(inside, window_edges(known, window.members), intrinsics).items():
         keyframes[number] = keyframe
-    return replace(slam, keyframes=tuple(keyframes))
+    return replace(known, keyframes=tuple(keyframes))
 
 
-def window_problem(slam: Slam, members: list[Keyframe], settings: SlamSettings) -> tuple[Adjustment, Gauge]:
+def window_problem(
+    known: Map, window: Window, intrinsics: np.ndarray, camera: CameraPrior, settings: SlamSettings
+) -> tuple[Adjustment, Gauge]:
     """The problem of the current window, each of its connected pieces held."""
-    numbers = tuple(keyframe.number for keyframe in members)
+    numbers, size = window.members, settings.window.size
     places = {number: row for row, number in enumerate(numbers)}
-    prior = no_prior(settings.window.size) if slam.prior is None else slam.prior.aligned(numbers, settings.window.size)
+    prior = no_prior(size) if window.prior is None else window.prior.aligned(numbers, size)
     adjustment = build(
-        members,
-        window_edges(slam),
-        slam.intrinsics,
+        [known.keyframes[number] for number in numbers],
+        window_edges(known, numbers),
+        intrinsics,
         settings,
         size=window_size(settings),
-        camera=CameraPrior(slam.given_intrinsics, _camera_sigma(slam, settings)),
-        fixed_pose=_held(numbers, slam),
-        terms=(prior, *factor_terms(slam.factors, places, factor_room(settings, slam.metric), metric=slam.metric)),
+        camera=camera,
+        fixed_pose=_held(window, known.roots),
+        terms=(prior, *factor_terms(known.factors, places, factor_room(settings, known.metric), metric=known.metric)),
     )
-    problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(members), slam.metric)
+    problem, gauge = with_one_gauge(adjustment.problem, adjustment.initial, len(numbers), known.metric)
     return replace(adjustment, problem=problem), gauge
 
 
-def _camera_sigma(slam: Slam, settings: SlamSettings) -> np.ndarray:
-    """Of the camera's prior in a window, float64 [4], pixels: what a first pass found is held, as a given one is, and
-    so is a guess while there are two keyframes. 521 px, both, became 524 and 580 by such two and their depth.
+def _held(window: Window, roots: tuple[int, ...]) -> np.ndarray:
+    """Which members hold the window: those that it hangs on, where the camera came back to an old part of the map, else
+    the roots of submaps.
     """
-    if not slam.camera_found and (slam.calibrated or len(slam.keyframes) >= LEAST_TO_FIND_A_CAMERA):
-        return slam.intrinsics_sigma
-    return np.full(4, settings.camera.known_intrinsics_sigma * slam.given_intrinsics[0])
-
-
-def _held(numbers: tuple[int, ...], slam: Slam) -> np.ndarray:
-    """Which members hold the window: what it hangs on, where the camera came back to an old part of the map, else the
-    origins of the map.
-    """
-    hung = np.isin(numbers, slam.held)
-    return hung if hung.any() else np.isin(numbers, slam.origins)
+    hung = np.isin(window.members, window.held)
+    return hung if hung.any() else np.isin(window.members, roots)
 
 
 def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
@@ -219,16 +233,16 @@ def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
     return room | ({MeasuredRotation: settings.window.size} if settings.line.manhattan else {})
 
 
-def window_edges(slam: Slam) -> list[Directed]:
+def window_edges(known: Map, members: Iterable[int]) -> list[Directed]:
     """Both directions of every pair inside the window."""
-    inside = set(slam.window)
-    pairs = [pair for pair in slam.pairs if pair.first in inside and pair.second in inside]
-    by_number = {number: slam.keyframes[number] for number in inside}
+    inside = set(members)
+    pairs = [pair for pair in known.pairs if pair.first in inside and pair.second in inside]
+    by_number = {number: known.keyframes[number] for number in inside}
     return [edge for pair in pairs for edge in directions(pair, by_number)]
 
 
-def scale_anchor(slam: Slam) -> MeasuredBaseline:
-    """What holds the distance between the first two keyframes: the unit of a map without metric depth."""
-    first, second = slam.window[:2]
-    centres = [rigid.centre(slam.keyframes[number].pose) for number in (first, second)]
+def scale_anchor(known: Map, members: Sequence[int]) -> MeasuredBaseline:
+    """What holds the distance between the first two keyframes: the scale of a map without metric depth."""
+    first, second = members[:2]
+    centres = [rigid.centre(known.keyframes[number].pose) for number in (first, second)]
     return MeasuredBaseline(first, second, float(np.linalg.norm(centres[1] - centres[0])), 1e-3)

@@ -21,12 +21,13 @@ from vggtgeo.io.record_file import Layout
 from vggtgeo.io.records import by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
+from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.state_file import STATE_CLASSES, UPGRADES, VERSION, checked_state
-from vggtgeo.slam.window.pending_window import settled
+from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 
-MAP = Layout("map", VERSION, by_name(STATE_CLASSES), UPGRADES)
+MAP = Layout("map", VERSION, by_name(STATE_CLASSES))
 LEAST_KNOWN = 0.2
 """Share of a keyframe's key points that its own picture, described once more as it is kept, must match: 0.71 and more
 of SIFT's, 0.92 of ORB's (13 keyframes of redkitchen and building-walk); descriptors of another kind hardly any."""
@@ -50,16 +51,10 @@ def as_map(slam: Slam) -> Slam:
         )
         for keyframe in slam.keyframes
     )
-    first = Slam(slam.intrinsics, slam.given_intrinsics, slam.intrinsics_sigma, slam.metric)
-    return replace(
-        first,
-        keyframes=keyframes,
-        pairs=slam.pairs,
-        factors=slam.factors,
-        origins=slam.origins,
-        pose_sigma=slam.pose_sigma,
-        lens=slam.lens,
-    )
+    known = replace(slam.map, keyframes=keyframes, axes=())
+    estimate = slam.camera
+    camera = CameraEstimate(estimate.intrinsics, estimate.given, estimate.sigma, lens=estimate.lens)
+    return Slam(known, camera)
 
 
 def save_map(path: str | os.PathLike[str], slam: Slam) -> None:
@@ -93,7 +88,7 @@ def load_map(path: str | os.PathLike[str]) -> Slam:
     """
     found, _ = MAP.read(path_of("path", path))
     known = checked_state(Path(path), found)
-    if not known.keyframes or known.frames or known.window or any(one.frame >= 0 for one in known.keyframes):
+    if not known.keyframes or known.frames or known.window.members or any(one.frame >= 0 for one in known.keyframes):
         raise InputError(f"`{path}` holds no map; expected keyframes alone: save one with `vggtgeo run --save-map`")
     return known
 
@@ -116,7 +111,7 @@ def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
             f"{camera.height}: a map is used with the camera that it was made with"
         )
     given = np.array(camera.intrinsics, np.float64)
-    own = known.given_intrinsics if known.calibrated else known.intrinsics
+    own = known.camera.given if known.camera.calibrated else known.intrinsics
     if camera.known and np.abs(given - own).max() > SAME_CAMERA * own[0]:
         cameras = [", ".join(f"{value:.1f}" for value in values) for values in (own, given)]
         raise InputError(
@@ -124,10 +119,14 @@ def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
             "a map is used with the camera that it was made with"
         )
     _check_matcher(known, points)
-    if known.calibrated:
-        return replace(known, lost=1)
+    if known.camera.calibrated:
+        return replace(known, tracker=replace(known.tracker, lost=1))
     # Its own run found it, and its keyframes stand as that camera sees them.
-    return replace(known, lost=1, given_intrinsics=known.intrinsics, camera_found=True)
+    return replace(
+        known,
+        tracker=replace(known.tracker, lost=1),
+        camera=replace(known.camera, given=known.intrinsics, self_calibrated=True),
+    )
 
 
 def _check_matcher(known: Slam, points: PointMatcher) -> None:

@@ -47,7 +47,7 @@ class WindowRecorder(Callback):
     def on_resume(self, so_far: tuple[WindowRecord, ...], slam: Slam) -> None:
         """The last window of `slam` is among the records."""
         self.records = list(so_far)
-        self._last = slam.solved
+        self._last = slam.window.solved
 
     @in_double_precision
     def on_warm_up(self, problem: Problem, state: State) -> None:
@@ -61,15 +61,15 @@ class WindowRecorder(Callback):
 
     @in_double_precision
     def _note(self, slam: Slam) -> None:
-        if slam.solved is None or slam.solved is self._last:
+        if slam.window.solved is None or slam.window.solved is self._last:
             return
-        self._last = slam.solved
-        adjustment, state = slam.solved
+        self._last = slam.window.solved
+        adjustment, state = slam.window.solved
         sizes = residual_sizes(adjustment.problem, state)
         shown = [term for term in adjustment.problem.terms if not isinstance(term, CameraTerm | DenseTerm)]
         counts = {term.name: int(sizes.count[term.name]) for term in shown}
         newest = slam.keyframes[adjustment.keyframes[-1]]
-        energies = slam.energies if slam.energies is not None else np.full(2, np.nan)
+        energies = slam.window.energies if slam.window.energies is not None else np.full(2, np.nan)
         self.records.append(
             WindowRecord(
                 newest.frame,

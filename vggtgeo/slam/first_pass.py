@@ -18,12 +18,13 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
+from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.camera.pixel_aspect import are_square
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import finish, run_frames
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.state import LEAST_TO_FIND_A_CAMERA, Slam
+from vggtgeo.slam.state import Slam
 
 LEAST_KEYFRAMES = 10
 """Without depth; as many as a window has: the camera of fewer is estimated from all of them while the run goes on, too.
@@ -57,29 +58,33 @@ def begin_with_found_camera(
         found = finish(last[0], roles, once)
         if not _is_plausible(found, camera):
             return None
+        before = begin(camera, roles, settings)
         before = replace(
-            begin(camera, roles, settings),
-            intrinsics=found.intrinsics,
-            given_intrinsics=found.intrinsics,
-            camera_found=True,
-            lens=found.lens,
+            before,
+            camera=replace(
+                before.camera,
+                intrinsics=found.intrinsics,
+                given=found.intrinsics,
+                self_calibrated=True,
+                lens=found.camera.lens,
+            ),
             notes=(_note(found, passes, camera),),
         )
         moved = np.abs(found.intrinsics[:2] / last[0].intrinsics[:2] - 1).max()
-        if moved < SETTLED and (found.lens is None) == (last[0].lens is None):
+        if moved < SETTLED and (found.camera.lens is None) == (last[0].camera.lens is None):
             break
     return before
 
 
 def _tells_a_camera(slam: Slam) -> bool:
     tracked = np.mean([record.tracked for record in slam.frames])
-    least = LEAST_TO_FIND_A_CAMERA if slam.metric else LEAST_KEYFRAMES
+    least = MIN_KEYFRAMES_FOR_CAMERA if slam.metric else LEAST_KEYFRAMES
     return bool(len(slam.keyframes) >= least and tracked >= LEAST_TRACKED)
 
 
 def _is_plausible(found: Slam, camera: Camera) -> bool:
     fx, fy, cx, cy = map(float, found.intrinsics)
-    lens = () if found.lens is None else found.lens.distortion
+    lens = () if found.camera.lens is None else found.camera.lens.distortion
     try:
         check_plausible("the camera of a first pass", replace(camera, intrinsics=(fx, fy, cx, cy), distortion=lens))
     except InputError:
@@ -95,7 +100,7 @@ def _note(found: Slam, passes: int, camera: Camera) -> str:
         f"({'images' if are_square(found.intrinsics) else 'pixels that are not square, images'} of "
         f"{camera.width} x {camera.height})"
     )
-    if found.lens is None:
+    if found.camera.lens is None:
         return text
-    k1, k2, *_ = found.lens.distortion
+    k1, k2, *_ = found.camera.lens.distortion
     return f"{text} and a lens that distorts, k1 {k1:.3f}, k2 {k2:.3f}; the images are undistorted by that"

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.models.roles import Features
-from vggtgeo.slam.tracking.rgbd_view import RgbdView
+from vggtgeo.slam.perception.rgbd_view import RgbdView
 
 SAME_CAMERA = 1e-3
 """Pixels: intrinsics that differ by less make the same view. Those of a known camera, held, move by a part of it."""

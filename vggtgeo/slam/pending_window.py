@@ -42,14 +42,11 @@ def settled(slam: Slam) -> Slam:
     if slam.pending is None:
         return slam
     begun, found = slam.pending.begun, slam.pending.result.result()
+    since = slam.tracker.frames[len(found.frames) :]
+    factors = slam.map.factors[len(begun.map.factors) :]
     return replace(
         found,
-        frames=(*found.frames, *slam.frames[len(found.frames) :]),
-        velocity=slam.velocity,
-        reference=slam.reference,
-        waiting=slam.waiting,
-        between=slam.between,
-        lost=slam.lost,
-        factors=(*found.factors, *slam.factors[len(begun.factors) :]),
+        map=replace(found.map, factors=(*found.map.factors, *factors)),
+        tracker=replace(slam.tracker, frames=(*found.frames, *since)),
         notes=(*found.notes, *slam.notes[len(begun.notes) :]),
     )

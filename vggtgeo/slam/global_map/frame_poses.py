@@ -15,13 +15,15 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models import pinhole
-from vggtgeo.slam.camera.rolling_shutter import at_once, camera_motions, frame_motions
+from vggtgeo.slam.camera.rolling_shutter import at_once
+from vggtgeo.slam.global_map.carried_poses import carried_poses
+from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.carried_poses import carried_poses
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.frame_refinement import tracked_information
+from vggtgeo.slam.tracking.tracker import FramePose
 
 LEAST_POINTS = 20
 """Fewer leave a pose as it was."""
@@ -40,7 +42,7 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     While the run goes on, before the last adjustment, all are carried along: it moves the map once more.
     """
     times, poses = carried_poses(slam)
-    if slam.pose_sigma is None or len(slam.pose_sigma) != len(slam.keyframes):
+    if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
         return times, poses
     rows = _placed_by_points(slam)
     if not rows:
@@ -63,7 +65,7 @@ def off_landmarks(slam: Slam, poses: np.ndarray) -> dict[int, np.ndarray]:
     [m], infinite of a landmark behind the camera. Frames that keep too few are left out, and all before the end. poses:
     of `frame_poses`.
     """
-    if slam.pose_sigma is None or len(slam.pose_sigma) != len(slam.keyframes):
+    if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
         return {}
     found, motions = {}, _motions(slam)
     for row in _placed_by_points(slam):
@@ -80,7 +82,7 @@ def _placed_by_points(slam: Slam) -> list[int]:
 
 def _motions(slam: Slam) -> tuple[np.ndarray, np.ndarray] | None:
     """Of all keyframes and of all frames, where a readout is known."""
-    return None if slam.readout is None else (camera_motions(slam, len(slam.keyframes)), frame_motions(slam))
+    return None if slam.camera.readout is None else (camera_motions(slam, len(slam.keyframes)), frame_motions(slam))
 
 
 def _sight(
@@ -91,10 +93,10 @@ def _sight(
     """
     record = slam.frames[row]
     points, pixels = _landmarks(slam, record, None if motions is None else motions[0][record.reference])
-    if slam.readout is not None and motions is not None:
+    if slam.camera.readout is not None and motions is not None:
         inverse = 1.0 / (points @ pose[2, :3] + pose[2, 3])
         size = slam.keyframes[record.reference].size
-        pixels = at_once(pixels, inverse, motions[1][row], slam.intrinsics, size, slam.readout)
+        pixels = at_once(pixels, inverse, motions[1][row], slam.intrinsics, size, slam.camera.readout)
     return points, pixels
 
 
@@ -109,8 +111,8 @@ def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tupl
     inverse = keyframe.points.inverse_depth[slots]
     known = np.isfinite(inverse) & (inverse > 1 / FARTHEST)
     inverse, pixels = inverse[known], keyframe.points.pixels[slots[known]]
-    if motion is not None and slam.readout is not None:
-        pixels = at_once(pixels, inverse, motion, slam.intrinsics, keyframe.size, slam.readout)
+    if motion is not None and slam.camera.readout is not None:
+        pixels = at_once(pixels, inverse, motion, slam.intrinsics, keyframe.size, slam.camera.readout)
     points = rigid.unproject(pixels, inverse, keyframe.pose, slam.intrinsics)
     return points, record.seen.pixels[known].astype(np.float64)
 

@@ -7,9 +7,10 @@ import numpy as np
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.state import FramePose, Slam
+from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import by_both
 from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
+from vggtgeo.slam.tracking.tracker import FramePose
 
 GROSS = SHARED_ERRORS * AGREEMENT_GATE
 """Of the squared Mahalanobis distance between a keyframe's pose as it was tracked and as it was adjusted: above, that
@@ -28,7 +29,7 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     """
     poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
     times = np.array([record.timestamp for record in slam.frames])
-    ties = {(tie.first, tie.second): tie for tie in slam.ties}
+    ties = {(tie.first, tie.second): tie for tie in slam.map.odometry_factors}
     last = 0
     for row, record in enumerate(slam.frames):
         if not _made_its_keyframe(record):
@@ -44,7 +45,7 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             for k in between:
                 poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
         last = row
-    return times, by_both(slam, poses)
+    return times, by_both(slam.map, slam.frames, poses)
 
 
 def _is_gross(arrived: np.ndarray, adjusted: np.ndarray, tie: MeasuredRelativePose) -> bool:

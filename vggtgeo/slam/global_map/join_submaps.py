@@ -13,34 +13,35 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
-from vggtgeo.slam.sparse_map.units import longer, ratio_of_units, scaled_factor, scaled_keyframe, scaled_record
+from vggtgeo.slam.sparse_map.units import longer, ratio_of_units, scaled_factor, scaled_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import relocalise
-from vggtgeo.slam.tracking.track import Sight, Track
+from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput
+from vggtgeo.slam.tracking.tracker import scaled_record
 from vggtgeo.slam.window.window_prior import WindowPrior
 
 TRIED = 2
 """Keyframes of the other pieces that are verified for each new keyframe."""
 
 
-def join_pieces(slam: Slam, sight: Sight, roles: Roles, settings: SlamSettings) -> Slam:
-    """Where the newest keyframe, seen as `sight`, shows a place of an earlier piece, move its piece there.
+def join_pieces(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Slam:
+    """Where the newest keyframe, seen as `data`, shows a place of an earlier piece, move its piece there.
 
     By a rigid motion where lengths are metres, else by a similarity: each piece of free scale has a unit of its own.
     """
-    if len(slam.origins) < 2:
+    if len(slam.map.roots) < 2:
         return slam
-    label = piece_of(slam)
+    label = piece_of(slam.map)
     others = [keyframe for keyframe in slam.keyframes if label[keyframe.number] != label[-1]]
     if not others:
         return slam
-    place = relocalise(sight, others, slam, roles, TRIED)
+    place = relocalise(TrackingInput(data, slam.intrinsics, roles), others, slam.tracker, TRIED)
     if place is None:
         return slam
     if slam.metric:
-        return _joined(slam, place, slam.window[:1])
+        return _joined(slam, place, slam.window.members[:1])
     ratio = unit_ratio(slam, place, roles)
-    return slam if ratio is None else _joined(scaled_piece(slam, ratio), place, slam.window[:2])
+    return slam if ratio is None else _joined(scaled_piece(slam, ratio), place, slam.window.members[:2])
 
 
 def unit_ratio(slam: Slam, place: Track, roles: Roles) -> float | None:
@@ -56,15 +57,20 @@ def scaled_piece(slam: Slam, ratio: float) -> Slam:
     keyframes = tuple(scaled_keyframe(k, ratio) if inside(k.number) else k for k in slam.keyframes)
     frames = tuple(scaled_record(record, ratio) if inside(record.reference) else record for record in slam.frames)
     own = lambda factor: all(inside(number) for number in factor.keyframes)
-    factors = tuple(scaled_factor(factor, ratio) if own(factor) else factor for factor in slam.factors)
+    factors = tuple(scaled_factor(factor, ratio) if own(factor) else factor for factor in slam.map.factors)
     kept = tuple(f for f in factors if not (isinstance(f, MeasuredBaseline) and own(f)))
-    velocity = longer(slam.velocity, ratio)
-    return replace(slam, keyframes=keyframes, frames=frames, factors=kept, velocity=velocity, prior=None, solved=None)
+    velocity = longer(slam.tracker.velocity, ratio)
+    return replace(
+        slam,
+        map=replace(slam.map, keyframes=keyframes, factors=kept),
+        tracker=replace(slam.tracker, frames=frames, velocity=velocity),
+        window=replace(slam.window, prior=None, solved=None),
+    )
 
 
 def newest_piece(slam: Slam) -> Callable[[int], bool]:
     """Whether a keyframe, by its number, hangs together with the newest one."""
-    label = piece_of(slam)
+    label = piece_of(slam.map)
     return lambda number: bool(label[number] == label[-1])
 
 
@@ -84,12 +90,18 @@ def _joined(slam: Slam, place: Track, held: tuple[int, ...]) -> Slam:
     tie = MeasuredRelativePose(place.keyframe.number, newest.number, place.relative, place.information)
     return replace(
         slam,
-        keyframes=keyframes,
-        origins=tuple(origin for origin in slam.origins if not inside(origin)),
-        factors=(*slam.factors, tie),
-        held=held,
-        prior=None if slam.prior is None else _carried_prior(slam.prior, carried),
-        solved=None,
+        map=replace(
+            slam.map,
+            keyframes=keyframes,
+            roots=tuple(origin for origin in slam.map.roots if not inside(origin)),
+            factors=(*slam.map.factors, tie),
+        ),
+        window=replace(
+            slam.window,
+            held=held,
+            prior=None if slam.window.prior is None else _carried_prior(slam.window.prior, carried),
+            solved=None,
+        ),
         notes=(*slam.notes, note),
     )
 

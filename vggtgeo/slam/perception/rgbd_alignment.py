@@ -26,8 +26,8 @@ from jax import lax
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.kept_program import KeptProgram
+from vggtgeo.slam.perception.rgbd_view import LEVELS, Points, RgbdView
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.tracking.rgbd_view import LEVELS, Points, RgbdView
 
 FARTHEST = 0.15
 """Metres between a point and the surface it may belong to."""

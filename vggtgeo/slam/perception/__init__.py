@@ -1,0 +1,1 @@
+"""What is seen in one image, or by comparing two, before anything is known of a map."""

@@ -1,0 +1,25 @@
+"""The submaps of a run by size, and the stretches of frames without a pose."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.state import Slam
+
+
+def pieces_by_size(slam: Slam) -> tuple[tuple[int, ...], ...]:
+    """Numbers of the keyframes of each piece: first the piece that most frames with a pose hang on."""
+    if not slam.keyframes:
+        return ()
+    label = piece_of(slam.map)
+    hanging = np.bincount(label[[r.reference for r in slam.frames if r.tracked]], minlength=label.max(initial=-1) + 1)
+    order = np.argsort(-hanging, kind="stable")
+    return tuple(tuple(int(number) for number in np.nonzero(label == piece)[0]) for piece in order)
+
+
+def lost_stretches(slam: Slam) -> tuple[tuple[int, int], ...]:
+    """First and last row of `slam.frames` of each stretch of frames that have no pose."""
+    lost = np.array([False, *(not record.tracked for record in slam.frames), False])
+    first, past = np.flatnonzero(np.diff(lost)).reshape(-1, 2).T
+    return tuple((int(i), int(j) - 1) for i, j in zip(first, past, strict=True))

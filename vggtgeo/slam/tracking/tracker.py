@@ -1,0 +1,110 @@
+"""What tracking knows: the pose of every frame by a keyframe, and where the camera is going."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vggtgeo.models.roles import Features
+from vggtgeo.slam.perception.rgbd_view import RgbdView
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.sparse_map.units import longer, scaled_information
+from vggtgeo.slam.tracking.evidence import Evidence
+
+
+@dataclass(frozen=True, eq=False)
+class SecondMotion:
+    """From a second keyframe to a frame, see `frame_refinement.py`. relative: float64 [4, 4], camera -> camera.
+    information: float64 [6, 6] over its left tangent, translation first, systematic errors included.
+    """
+
+    keyframe: int
+    relative: np.ndarray
+    information: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """Key points of a keyframe that a frame shows, see `frame_poses.py`. slots: int32 [m], in `Keyframe.points`.
+    pixels: float32 [m, 2], where the frame shows them.
+    """
+
+    slots: np.ndarray
+    pixels: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FramePose:
+    """Pose of one frame relative to a keyframe, so that it follows when the keyframe is adjusted.
+
+    relative: float64 [4, 4], reference camera -> this camera. tracked: False where tracking failed; `relative` is then
+    that of the last frame. evidence: quality and uncertainty of the pose.
+    """
+
+    frame: int
+    timestamp: float
+    reference: int
+    relative: np.ndarray
+    tracked: bool
+    inliers: int
+    evidence: Evidence = field(default_factory=Evidence)
+    arrival: tuple[int, np.ndarray] | None = None
+    """Of a frame that became a keyframe: the earlier keyframe it was tracked against, and its pose relative to that
+    one as tracked, before any adjustment."""
+    second: SecondMotion | None = None
+    seen: SeenPoints | None = None
+    """Points of its keyframe, where its pose came from points alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Waiting:
+    """A frame without a pose so far: seen before there was a map, or while tracking was lost. It is placed as soon as
+    there is a map that it fits into.
+    """
+
+    frame: int
+    timestamp: float
+    image: np.ndarray
+    features: Features
+    depth: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Tracker:
+    """The state of tracking.
+
+    Fields:
+        frames: Every frame's pose relative to its keyframe.
+        velocity: Last motion from frame to frame, float64 [4, 4], camera -> camera.
+        reference: Number of the keyframe that frames are tracked against, and its view for the alignment.
+        lost: Frames since tracking was lost, 0 while it goes well.
+        waiting: Frames without a pose so far.
+        between: Rows of the last frames, and their views, that wait for the next keyframe (`frame_refinement.py`).
+
+    """
+
+    frames: tuple[FramePose, ...] = ()
+    velocity: np.ndarray = field(default_factory=lambda: np.eye(4))
+    reference: tuple[int, RgbdView | None] | None = None
+    lost: int = 0
+    waiting: tuple[Waiting, ...] = ()
+    between: tuple[tuple[int, RgbdView], ...] = ()
+
+
+def frame_pose(known: Map, record: FramePose) -> np.ndarray:
+    """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
+    return record.relative @ known.keyframes[record.reference].pose
+
+
+def scaled_record(record: FramePose, ratio: float) -> FramePose:
+    """The record of a frame whose keyframe was scaled, see `units.scaled_keyframe`."""
+    arrival = None if record.arrival is None else (record.arrival[0], longer(record.arrival[1], ratio))
+    second = None if record.second is None else scaled_second(record.second, ratio)
+    return replace(record, relative=longer(record.relative, ratio), arrival=arrival, second=second)
+
+
+def scaled_second(second: SecondMotion, ratio: float) -> SecondMotion:
+    """The motion from a second keyframe that was scaled."""
+    information = scaled_information(second.information, ratio)
+    return replace(second, relative=longer(second.relative, ratio), information=information)

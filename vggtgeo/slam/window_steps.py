@@ -1,0 +1,37 @@
+"""The window's insertion and adjustment as steps of the whole state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.window import sliding_window
+from vggtgeo.slam.window.adjustment import CameraPrior
+
+
+def insert_keyframe(
+    slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, tied_to: int | None = None
+) -> Slam:
+    """The state with a keyframe, which was tracked against `tied_to`, in the window and matched to the others."""
+    known, window = sliding_window.enter(slam.map, slam.window, keyframe, slam.intrinsics, roles, settings, tied_to)
+    return replace(slam, map=known, window=window)
+
+
+def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
+    """The state after its window was bundle-adjusted."""
+    found = sliding_window.adjust(slam.map, slam.window, slam.intrinsics, camera_prior(slam, settings), settings)
+    return replace(
+        slam,
+        map=found.map,
+        window=found.window,
+        camera=replace(slam.camera, intrinsics=found.intrinsics),
+        notes=(*slam.notes, *(note for note in found.notes if note not in slam.notes)),
+    )
+
+
+def camera_prior(slam: Slam, settings: SlamSettings) -> CameraPrior:
+    """The prior of the intrinsics in the window."""
+    sigma = slam.camera.window_sigma(len(slam.keyframes), settings.camera.known_intrinsics_sigma)
+    return CameraPrior(slam.camera.given, sigma)
