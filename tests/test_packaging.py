@@ -144,7 +144,7 @@ def test_wheel_holds_every_source_file_and_nothing_else(source: Path, wheel: Pat
     found = {".".join(file.with_suffix("").parts).removesuffix(".__init__") for file in files if file.suffix == ".py"}
     assert found == _source_modules(source)
     data = {file for file in files if file.suffix != ".py"}
-    kinds = ("*.toml", "*.j2", "*.css", "py.typed")
+    kinds = ("*.toml", "*.j2", "*.css", "*.pyi", "py.typed")
     assert data == {file.relative_to(source) for kind in kinds for file in (source / "vggtgeo").rglob(kind)}
     assert Path("vggtgeo/benchmark/suites/quick.toml") in data
 
