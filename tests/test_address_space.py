@@ -27,8 +27,8 @@ def test_a_command_that_would_be_aborted_does_not_begin(tmp_path: Path) -> None:
         "the limit\n"
     )
     assert list(tmp_path.iterdir()) == []
-    assert limited(500, "run", "--help").returncode == 0
-    assert limited(500, "data", "list").returncode == 0
+    assert limited(700, "run", "--help").returncode == 0
+    assert limited(700, "data", "list").returncode == 0
 
 
 @pytest.mark.long

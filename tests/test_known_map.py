@@ -30,6 +30,7 @@ from vggtgeo.slam.known_map import as_map, entered, save_map
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.judge import judge
 

@@ -137,7 +137,7 @@ def test_what_is_not_fit_ends_with_a_reason(check: Callable, tmp_path: Path) -> 
         ((bad, "--network", "vggt"), "is not a file of `vggt`"),
         ((other,), "matches no known network"),
         ((tmp_path / "none.onnx",), "is not there"),
-        ((bad, "--image", bad), "not an image"),
+        ((bad, "--image", bad), "bad.onnx"),
     ):
         result = check(*arguments)
         assert result.exit_code == 2, result.output

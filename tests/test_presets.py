@@ -228,7 +228,7 @@ def test_missing_and_wrong_files_end_the_run_before_any_frame(
     assert "vggt.onnx` takes 1 image at a time, expected at least 2" in result.output
     (folder / "mast3r_decoder.onnx").write_bytes(b"version https://git-lfs.github.com/spec/v1")
     result = _run(tmp_path, "--preset", "paper", "--models", folder, "--memory-limit-gb", "0")
-    assert "`--memory-limit-gb` is 0; it must be a positive number" in result.output
+    assert "`--memory-limit-gb` must be positive, got 0" in result.output
     result = _run(tmp_path, "--preset", "paper", "--models", folder)
     assert result.exit_code == 2
     assert "mast3r_decoder.onnx` is no ONNX file but a Git LFS pointer" in result.output

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.benchmark.page import write_page
-from vggtgeo.benchmark.worker import recorded
+from vggtgeo.benchmark.worker import recording as recorded
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.point_cloud import PointCloud

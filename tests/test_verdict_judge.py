@@ -36,7 +36,7 @@ def test_a_run_is_judged_as_a_whole() -> None:
     assert judge(run.slam, recorder.frames).level == "good"
     assert Result.of(run.slam, recorder.frames).verdict.level == "good"
     keyframes = [replace(k, pose=k.pose @ _turn(30.0 * k.number)) for k in run.slam.keyframes]
-    stirred = judge(replace(run.slam, keyframes=tuple(keyframes)), recorder.frames)
+    stirred = judge(replace(run.slam, map=replace(run.slam.map, keyframes=tuple(keyframes))), recorder.frames)
     assert stirred.level != "good"
     again = Verdict.from_dict(json.loads(json.dumps(stirred.to_dict())), stirred.metric)
     assert again == stirred
