@@ -29,6 +29,7 @@ from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import SeenPoints
+from vggtgeo.slam.verdict.judge import aligned
 from vggtgeo.slam.verdict.witness import FrameEvidence
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
