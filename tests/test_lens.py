@@ -29,6 +29,7 @@ from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import SeenPoints
+from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.judge import aligned
 from vggtgeo.slam.verdict.witness import FrameEvidence
 
