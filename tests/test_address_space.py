@@ -36,7 +36,7 @@ def test_memory_that_runs_out_is_told(tmp_path: Path) -> None:
     """The check lets through what NumPy or a thread is then refused: one line, the code of what is given wrongly."""
     done = limited(2000, "simulate", "room", "--size", "8000x8000", "--frames", "2", "-o", tmp_path / "new")
     assert done.returncode == 2, done.stderr
-    assert done.stderr.splitlines()[-1].startswith("error: there is not enough memory"), done.stderr
+    assert done.stderr.splitlines()[-1].startswith("error: not enough memory"), done.stderr
 
 
 def test_a_folder_that_is_gone_is_told(tmp_path: Path) -> None:
