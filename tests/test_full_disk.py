@@ -32,7 +32,7 @@ main()
     ("room", "said"),
     [
         (20_000, "which cannot be written: File too large"),
-        pytest.param(2_000_000, "is cut short: ", marks=pytest.mark.long),
+        pytest.param(2_000_000, "is incomplete: ", marks=pytest.mark.long),
     ],
 )
 def test_view_ends_where_the_disk_is_full(room: int, said: str, tmp_path: Path) -> None:
