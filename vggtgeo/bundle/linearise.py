@@ -137,8 +137,8 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
         for term, seen in of_edge(problem, view_of(cameras, hosts, place, motion), data):
             found = term.gradient(seen)
             local += found.shared
-            parts = [found.depth] if found.pixel is None else [*found.pixel, found.depth]
-            for start, part in _places(term, seen, jnp.concatenate(parts)[None], sizes):
+            by_unknown = [part[None] for part in (*([] if found.pixel is None else found.pixel), found.depth)]
+            for start, part in _places(term, seen, by_unknown, sizes):
                 own = own.at[start : start + part.shape[1]].add(part[0])
         return local, own
 
@@ -220,36 +220,33 @@ def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[in
     # The barrier keeps XLA from forming the columns again in each product.
     columns, by_pixel = jax.lax.optimization_barrier((jnp.concatenate(shared, 1), by_pixel))
     starts = np.cumsum([0, *(part.shape[1] for part in parts)])
-    coupled: list[Array] = []
+    coupled: list[list[Array]] = []
     blocks: list[Array | None] = []
     for pixels, start, end, (_, view) in zip(by_pixel, starts, starts[1:], seen, strict=False):
         own, slots = columns[:, start:end], len(view.inverse_depth)
-        if not view.free_pixels:
-            coupled.append(products(own, own[-1], slots))
-            blocks.append(None)
-            continue
-        unknowns = jnp.concatenate([pixels, own[-1:]])
-        coupled.append(products(own[:, None], unknowns, slots).reshape(len(own), -1))
-        blocks.append(products(pixels[np.array([0, 1, 0])], pixels[np.array([0, 1, 1])], slots))
+        # One unknown after the other: XLA does not vectorise a loop over all of them at once.
+        coupled.append([products(own, by_one, slots) for by_one in (*pixels, own[-1])])
+        pairs = [(pixels[a], pixels[b]) for a, b in ((0, 0), (1, 1), (0, 1))] if view.free_pixels else []
+        blocks.append(jnp.stack([products(a, b, slots) for a, b in pairs]) if pairs else None)
     return (columns @ columns.T)[:-1, :-1], *_placed(seen, coupled, blocks, sizes)
 
 
 def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
     models: list[LocalModel] = [term.model(view) for term, view in seen]
     gram = models[0].gram
-    coupled: list[Array] = []
+    coupled: list[list[Array]] = []
     blocks: list[Array | None] = []
     for model in models[1:]:
         gram = gram + model.gram
     for model in models:
         own = [] if model.pixels is None else [model.pixels.coupled[:, 0], model.pixels.coupled[:, 1]]
-        coupled.append(jnp.concatenate([*own, model.coupled], 1))
+        coupled.append([*own, model.coupled])
         blocks.append(None if model.pixels is None else model.pixels.blocks)
     return gram, *_placed(seen, coupled, blocks, sizes)
 
 
 def _placed(
-    seen: Seen, coupled: list[Array], blocks: list[Array | None], sizes: tuple[int, int]
+    seen: Seen, coupled: list[list[Array]], blocks: list[Array | None], sizes: tuple[int, int]
 ) -> tuple[Columns, Array | None]:
     """The terms' cross terms and blocks at their landmarks, added up."""
     parts = [part for (term, view), own in zip(seen, coupled, strict=True) for part in _places(term, view, own, sizes)]
@@ -263,15 +260,14 @@ def _placed(
     return _joined(parts, 2 * free + slots), joint
 
 
-def _places(term: EdgeTerm, view: EdgeView, own: Array, sizes: tuple[int, int]) -> Columns:
-    """Where the columns of a term (those by `u`, `v`, inverse depth of its slots) are among the landmarks."""
-    first, slots, free, points = term.first_slot, len(view.inverse_depth), view.free_pixels, sizes[0]
-    if not free:
-        return [(2 * points + first, own)]
-    if free == slots == points:
-        return [(0, own)]
-    pixels = [(first + axis * points, own[:, axis * slots : axis * slots + free]) for axis in range(2)]
-    return [*pixels, (2 * points + first, own[:, 2 * slots :])]
+def _places(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tuple[int, int]) -> Columns:
+    """Where the columns of a term (those by `u`, `v` of its slots, if any, and by inverse depth) are among the
+    landmarks.
+    """
+    free, points = view.free_pixels, sizes[0]
+    *pixels, depth = by_unknown
+    by_pixel = [(axis * points + term.first_slot, own[:, :free]) for axis, own in enumerate(pixels)]
+    return [*by_pixel, (2 * points + term.first_slot, depth)]
 
 
 def _joined(parts: Columns, size: int) -> Columns:
@@ -301,8 +297,8 @@ def _landmark_terms(
     blocks = jnp.zeros((rows, 3, first // 2), cross.dtype)
     for pixel, offset in pixel_observations(problem, state):
         hessian, force = pixel.model(offset, correction, exact)
-        cross = cross.at[:, -2, :first].add(_as_landmarks(force))
-        blocks += jnp.stack([hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1]], 1)
+        cross = cross.at[:, -2, :first].add(force.reshape(rows, first))
+        blocks += hessian
     return cross, blocks
 
 
