@@ -36,8 +36,7 @@ from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors, add_shared
-from vggtgeo.solvers.segments import join_segments
-from vggtgeo.solvers.triples import depth_gradient, join_triples
+from vggtgeo.solvers.landmark_basis import join_landmarks
 
 
 def linearise(
@@ -79,12 +78,15 @@ def linearise(
             cross = jax.lax.dynamic_update_slice(cross, shared + tail, start)
         return (cross, blocks if blocks is None or own is None else blocks.at[row].add(own)), gram
 
-    cross, blocks = _landmark_terms(problem, state, common + cameras.size, correction, exact)
+    own_terms, blocks = _landmark_terms(problem, state, correction, exact)
+    cross = jnp.zeros((len(own_terms), common + cameras.size + 2, own_terms.shape[2]), own_terms.dtype)
     if problem.edge_terms:
         edges = (places(problem), problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
+    # After the edges, in place: XLA would copy cross terms that do not begin as zeros.
+    cross = cross.at[:, -2:].add(own_terms)
     force = gram[:, : lie.TANGENT, size]
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     system = ArrowSystem(
@@ -104,10 +106,8 @@ def linearise(
     )
     if not joined:
         return system
-    # In this order: what reads the cross terms as they were before would make XLA copy them.
-    system = join_triples(system)
-    system = replace(system, held=_held(problem, state, depth_gradient(system)))
-    return system if problem.fraction is None else join_segments(system, jax.lax.stop_gradient(problem.fraction))
+    system = replace(system, held=_held(problem, state, system.cross[:, -2, num_offsets(state) :]))
+    return join_landmarks(system, None if problem.fraction is None else jax.lax.stop_gradient(problem.fraction))
 
 
 def energy_gradient(problem: Problem, state: State) -> ArrowVector:
@@ -282,24 +282,20 @@ def _joined(parts: Columns, size: int) -> Columns:
 
 
 def _landmark_terms(
-    problem: Problem, state: State, height: int, correction: Float[Array, ""] | None, exact: bool
-) -> tuple[Float[Array, "h r s"], Float[Array, "h 3 p"] | None]:
-    """Cross terms before any edge: gradient and curvature of the terms on landmarks in the last two rows; and the
-    blocks of landmarks with free pixels.
-    """
+    problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
+) -> tuple[Float[Array, "h 2 s"], Float[Array, "h 3 p"] | None]:
+    """Gradient and curvature of the terms on landmarks, and the blocks of landmarks with free pixels."""
     (rows, slots), first = state.inverse_depth.shape, num_offsets(state)
-    cross = jnp.zeros((rows, height + 2, first + slots), state.inverse_depth.dtype)
+    gradient = jnp.zeros((rows, first + slots), state.inverse_depth.dtype)
+    curvature = jnp.zeros_like(gradient)
     for term in problem.slot_terms:
-        gradient, curvature = term.derivatives(state.inverse_depth, correction, exact)
-        cross = cross.at[:, -2, first:].add(gradient).at[:, -1, first:].add(curvature)
-    if state.pixel_offset is None:
-        return cross, None
-    blocks = jnp.zeros((rows, 3, first // 2), cross.dtype)
+        force, own = term.derivatives(state.inverse_depth, correction, exact)
+        gradient, curvature = gradient.at[:, first:].add(force), curvature.at[:, first:].add(own)
+    blocks = None if state.pixel_offset is None else jnp.zeros((rows, 3, first // 2), gradient.dtype)
     for pixel, offset in pixel_observations(problem, state):
         hessian, force = pixel.model(offset, correction, exact)
-        cross = cross.at[:, -2, :first].add(force.reshape(rows, first))
-        blocks += hessian
-    return cross, blocks
+        gradient, blocks = gradient.at[:, :first].add(force.reshape(rows, first)), blocks + hessian
+    return jnp.stack([gradient, curvature], 1), blocks
 
 
 def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool[Array, "h t"] | None:
