@@ -16,7 +16,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.objective import (
@@ -214,21 +213,21 @@ def _as_landmarks(offsets: Float[Array, "n p 2"]) -> Float[Array, "n t"]:
 
 
 def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
-    parts = [term.columns(view, correction) for term, view in seen]
-    shared = [part[: view.size + 2] for part, (_, view) in zip(parts, seen, strict=True)]
-    by_pixel = [part[view.size + 2 :] for part, (_, view) in zip(parts, seen, strict=True)]
     # The barrier keeps XLA from forming the columns again in each product.
-    columns, by_pixel = jax.lax.optimization_barrier((jnp.concatenate(shared, 1), by_pixel))
-    starts = np.cumsum([0, *(part.shape[1] for part in parts)])
+    parts = jax.lax.optimization_barrier([term.columns(view, correction) for term, view in seen])
     coupled: list[list[Array]] = []
     blocks: list[Array | None] = []
-    for pixels, start, end, (_, view) in zip(by_pixel, starts, starts[1:], seen, strict=False):
-        own, slots = columns[:, start:end], len(view.inverse_depth)
+    for columns, (_, view) in zip(parts, seen, strict=True):
+        slots, depth = len(view.inverse_depth), view.size + 1
+        own, pixels = columns[: depth + 1], columns[depth + 1 :]
         # One unknown after the other: XLA does not vectorise a loop over all of them at once.
         coupled.append([products(own, by_one, slots) for by_one in (*pixels, own[-1])])
         pairs = [(pixels[a], pixels[b]) for a, b in ((0, 0), (1, 1), (0, 1))] if view.free_pixels else []
         blocks.append(jnp.stack([products(a, b, slots) for a, b in pairs]) if pairs else None)
-    return (columns @ columns.T)[:-1, :-1], *_placed(seen, coupled, blocks, sizes)
+    size = seen[0][1].size
+    # Of all columns: those of the shared coordinates alone would be copied first.
+    gram = sum((columns @ columns.T)[: size + 1, : size + 1] for columns in parts)
+    return gram, *_placed(seen, coupled, blocks, sizes)
 
 
 def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
