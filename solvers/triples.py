@@ -89,7 +89,7 @@ def split_triples(values: Float[Array, "*n s"], count: int) -> tuple[Array, Arra
     return u, v, d, others
 
 
-def _as_wide(ratio: Float[Array, "*n p"], values: Float[Array, "*n s"]) -> Array:
+def _as_wide(ratio: Array, values: Array) -> Array:
     """With the axes between, those of rows."""
     return ratio.reshape(*ratio.shape[:-1], *(1,) * (values.ndim - ratio.ndim), ratio.shape[-1])
 
