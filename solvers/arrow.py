@@ -262,8 +262,8 @@ def _product_of_parts(host: tuple[tuple[Array, ...], Array, TripleLandmarks]) ->
     """`C V^-1 C'` of one row whose cross terms are by the unknowns of triples."""
     cross, inverse, triples = host
     count = triples.ratio_u.shape[-1]
-    own = tuple(split_triples(whole, count)[k] for k, whole in enumerate(cross))
-    parts = jax.lax.optimization_barrier(restricted_parts(triples, own))
+    u, v, d, others = (split_triples(whole, count)[k] for k, whole in enumerate(cross))
+    parts = jax.lax.optimization_barrier(restricted_parts(triples, (u, v, d, others)))
     scaled = [part * factor for part, factor in zip(parts, split_triples(inverse, count), strict=True)]
     return sum(left @ right.T for left, right in zip(scaled, parts, strict=True))
 

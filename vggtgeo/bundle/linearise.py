@@ -290,7 +290,9 @@ def _landmark_terms(
     for term in problem.slot_terms:
         force, own = term.derivatives(state.inverse_depth, correction, exact)
         gradient, curvature = gradient.at[:, first:].add(force), curvature.at[:, first:].add(own)
-    blocks = None if state.pixel_offset is None else jnp.zeros((rows, 3, first // 2), gradient.dtype)
+    if state.pixel_offset is None:
+        return jnp.stack([gradient, curvature], 1), None
+    blocks = jnp.zeros((rows, 3, first // 2), gradient.dtype)
     for pixel, offset in pixel_observations(problem, state):
         hessian, force = pixel.model(offset, correction, exact)
         gradient, blocks = gradient.at[:, :first].add(force.reshape(rows, first)), blocks + hessian
