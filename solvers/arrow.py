@@ -34,6 +34,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
+from vggtgeo.solvers.triples import TripleLandmarks, expand_triples, restrict_triples, restricted_parts, split_triples
 
 Assembled = tuple[Float[Array, "c c"], Float[Array, " c"]]
 """A matrix and a vector in node coordinates."""
@@ -95,17 +96,6 @@ class SegmentLandmarks(eqx.Module):
         return jnp.stack([first, jnp.where(self.determined[..., None], second, 0.0)], -1)
 
 
-class TripleLandmarks(eqx.Module):
-    """The factors of `L` of landmarks of three unknowns, see `triples.py`."""
-
-    ratio_u: Float[Array, "h p"]
-    """`a`, of `u` and `d`."""
-    ratio_v: Float[Array, "h p"]
-    """`b`, of `v` and `d`."""
-    ratio_uv: Float[Array, "h p"]
-    """`c`, of `u` and `v`."""
-
-
 class LandmarkBasis(NamedTuple):
     """The coordinates in which a system holds landmarks that depend on each other, see `landmark_basis.py`."""
 
@@ -157,10 +147,10 @@ class ArrowSystem(eqx.Module):
     """Where the last `2 g` landmarks are coordinates of segments of `q` samples."""
     blocks: Float[Array, "h 3 t"] | None = None
     """Where the first `3 t` landmarks are `t` of three unknowns, all `u`, all `v`, all `d`: second derivatives
-    `uu, vv, uv`. The last row of `cross` then holds `ud, vd` for `u` and `v`. None once `join_triples` has made the
-    blocks diagonal."""
+    `uu, vv, uv`. The last row of `cross` then holds `ud, vd` for `u` and `v`. None once `join_triples` has factored
+    them."""
     triples: TripleLandmarks | None = None
-    """The coordinates that `join_triples` chose."""
+    """The factors of those blocks. `cross` stays by `u, v, d`; all else is in the coordinates of the factors."""
 
     @property
     def basis(self) -> LandmarkBasis:
@@ -180,11 +170,15 @@ class ArrowSystem(eqx.Module):
 
     @property
     def landmark_gradient(self) -> Float[Array, "h s"]:
-        return self.cross[:, -2]
+        return restricted(self.triples, self.cross[:, -2])
 
     @property
     def landmark_hessian(self) -> Float[Array, "h s"]:
-        return self.cross[:, -1]
+        own = self.cross[:, -1]
+        if self.triples is None:
+            return own
+        pivots = self.triples.pivots.reshape(len(own), -1)
+        return jnp.concatenate([pivots, own[:, pivots.shape[1] :]], 1)
 
     @property
     def num_nodes(self) -> int:
@@ -211,6 +205,11 @@ class Reduced(eqx.Module):
     """`W V^-1 W'`."""
     schur_gradient: Float[Array, " c"]
     """`W V^-1 h`."""
+
+
+def restricted(triples: TripleLandmarks | None, values: Float[Array, "h *rows s"]) -> Float[Array, "h *rows s"]:
+    """Values by the landmarks of the cross terms as those by the coordinates of the system."""
+    return values if triples is None else restrict_triples(triples, values)
 
 
 def moving_landmarks(system: ArrowSystem) -> Bool[Array, "h s"]:
@@ -243,9 +242,30 @@ def reduce(system: ArrowSystem) -> Reduced:
 
 def host_products(system: ArrowSystem) -> Float[Array, "h t t"]:
     """`C V^-1 C'` of each row in relative coordinates; `t = b k + p + 1`, the gradient comes last."""
+    inverse = inverse_landmark_hessian(system)
     # A loop over rows: twice as fast on a CPU as one batched product (the scaled rows stay in the cache).
-    product = lambda host: (host[0] * host[1]) @ host[0].T
-    return jax.lax.map(product, (system.cross, inverse_landmark_hessian(system)))[:, :-1, :-1]
+    if system.triples is None:
+        product = lambda host: (host[0] * host[1]) @ host[0].T
+        products = jax.lax.map(product, (system.cross, inverse))
+    else:
+        products = jax.lax.map(_product_of_parts, (_each_part(system.cross), inverse, system.triples))
+    return products[:, :-1, :-1]
+
+
+def _each_part(cross: Float[Array, "h r s"]) -> tuple[Array, Array, Array, Array]:
+    """The same array four times: read as one, XLA copies a row of it as a whole before it takes the parts out."""
+    four: tuple[Array, Array, Array, Array] = jax.lax.optimization_barrier((cross, cross, cross, cross))
+    return four
+
+
+def _product_of_parts(host: tuple[tuple[Array, ...], Array, TripleLandmarks]) -> Float[Array, "r r"]:
+    """`C V^-1 C'` of one row whose cross terms are by the unknowns of triples."""
+    cross, inverse, triples = host
+    count = triples.ratio_u.shape[-1]
+    u, v, d, others = (split_triples(whole, count)[k] for k, whole in enumerate(cross))
+    parts = jax.lax.optimization_barrier(restricted_parts(triples, (u, v, d, others)))
+    scaled = [part * factor for part, factor in zip(parts, split_triples(inverse, count), strict=True)]
+    return sum(left @ right.T for left, right in zip(scaled, parts, strict=True))
 
 
 def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "h relative"]:
@@ -277,7 +297,8 @@ def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> F
     """`W' dense + gradient * h`, in one pass over the cross terms."""
     relative = to_relative(system, dense)
     tail = jnp.broadcast_to(jnp.asarray([gradient, 0.0], dense.dtype), (len(relative), 2))
-    return jnp.einsum("nrs,nr->ns", system.cross, jnp.concatenate([relative, tail], 1))
+    coupled = jnp.einsum("nrs,nr->ns", system.cross, jnp.concatenate([relative, tail], 1))
+    return restricted(system.triples, coupled)
 
 
 def back_substitute(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "h s"]:
@@ -338,6 +359,8 @@ def _seen_by_factors(system: ArrowSystem, factors: NodeFactors) -> Int[Array, "m
 
 def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "h s"]) -> Float[Array, " c"]:
     """`W z`: landmark values carried to the dense coordinates."""
+    if system.triples is not None:
+        landmarks = expand_triples(system.triples, landmarks)
     return from_relative(system, jnp.einsum("nrs,ns->nr", system.cross, landmarks)[:, :-2])
 
 

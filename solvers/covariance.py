@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
-from vggtgeo.solvers.arrow import ArrowSystem, inverse_landmark_hessian, moving_landmarks
+from vggtgeo.solvers.arrow import ArrowSystem, inverse_landmark_hessian, moving_landmarks, restricted
 from vggtgeo.solvers.landmark_basis import expand, expand_variance
 from vggtgeo.solvers.local_inverse import LocalInverse, to_relative, visible
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
@@ -67,8 +67,8 @@ def covariance(
 
 def _landmarks(system: ArrowSystem, found: LocalInverse, rows: Int[Array, " h"]) -> Float[Array, "h s"]:
     """`V^-1 + V^-1 W' S^-1 W V^-1`, its diagonal."""
-    hessian_inverse, cross = inverse_landmark_hessian(system)[rows], system.cross[rows, :-2]
-    basis = jax.tree.map(lambda leaf: leaf[rows], system.basis)
+    hessian_inverse, basis = inverse_landmark_hessian(system)[rows], jax.tree.map(lambda leaf: leaf[rows], system.basis)
+    cross = restricted(basis.triples, system.cross[rows, :-2])
     # In this order: the square of a large inverse overflows, its product with the coupling does not.
     pulled = expand(basis, hessian_inverse[:, None] * cross)
     spread = lambda local, side: jnp.einsum("nrs,nrt,nts->ns", side, to_relative(system, rows, local), side)

@@ -6,6 +6,7 @@ those on straight segments (`segments.py`), the last.
 
 from __future__ import annotations
 
+import equinox as eqx
 from jaxtyping import Array, Float
 from vggtgeo.solvers import segments, triples
 from vggtgeo.solvers.arrow import ArrowSystem, LandmarkBasis
@@ -13,8 +14,16 @@ from vggtgeo.solvers.arrow import ArrowSystem, LandmarkBasis
 
 def join_landmarks(system: ArrowSystem, fraction: Float[Array, "n m q"] | None) -> ArrowSystem:
     """The system with scalar landmarks alone: triples and, where there is a `fraction`, segments in their basis."""
-    system = triples.join_triples(system)
+    system = join_triples(system)
     return system if fraction is None else segments.join_segments(system, fraction)
+
+
+def join_triples(system: ArrowSystem) -> ArrowSystem:
+    """The system in coordinates in which the blocks of its triples are diagonal."""
+    if system.blocks is None:
+        return system
+    factors = triples.factor_triples(system.blocks, system.cross[:, -1])
+    return eqx.tree_at(lambda s: (s.triples, s.blocks), system, (factors, None), is_leaf=lambda leaf: leaf is None)
 
 
 def expand(basis: LandmarkBasis, landmarks: Float[Array, "n *rows s"]) -> Float[Array, "n *rows z"]:

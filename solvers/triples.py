@@ -8,70 +8,67 @@ landmarks of a host are then all `z_u`, all `z_v`, all `z_d`, and last the other
     D_u = V_uu,        D_v = V_vv - c V_uv,        D_d = V_dd - a V_ud - b (V_vd - c V_ud).
 
 In the coordinates `y = L' z` it is `D`, so that all that is written for scalar landmarks (Schur complement, damping,
-covariance) holds for triples, too. Only what enters and leaves the system passes through this basis:
+covariance) holds for triples, too. A system keeps its cross terms by `z`; what is read from them passes through this
+basis:
 
-    rows of the cross terms and gradients   w_y = L^-1 w_z:   w_v -= c w_u,    w_d -= a w_u + b w_v     (`restrict`)
-    steps                                   z = L'^-1 y:      z_d = y_d,  z_v = y_v - b y_d,  z_u = y_u - c z_v - a z_d
+    cross terms and gradients   w_y = L^-1 w_z:   w_v -= c w_u,    w_d -= a w_u + b w_v     (`restrict_triples`)
+    steps                       z = L'^-1 y:      z_d = y_d,  z_v = y_v - b y_d,  z_u = y_u - c z_v - a z_d
 
 `z_d` is eliminated last, so it is `y_d`: a landmark that is held stays where it is in both. Cost: three more products a
-cross term, and a Schur product of `s + 2 p` columns in place of `s`.
+cross term in the Schur product, which has `s + 2 p` columns in place of `s`; elsewhere, vectors of landmarks alone.
 """
 
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from vggtgeo.solvers.arrow import ArrowSystem, TripleLandmarks
 
 
-def join_triples(system: ArrowSystem) -> ArrowSystem:
-    """The system in coordinates in which the blocks of its triples are diagonal."""
-    if system.blocks is None:
-        return system
-    hessian_u, hessian_v, mixed_uv = (system.blocks[:, k] for k in range(3))
-    count = hessian_u.shape[-1]
-    mixed_u, mixed_v, hessian_d, _ = _split(system.cross[:, -1], count)
+class TripleLandmarks(eqx.Module):
+    """The factors of the blocks of landmarks of three unknowns."""
+
+    ratio_u: Float[Array, "h p"]
+    """`a`, of `u` and `d`."""
+    ratio_v: Float[Array, "h p"]
+    """`b`, of `v` and `d`."""
+    ratio_uv: Float[Array, "h p"]
+    """`c`, of `u` and `v`."""
+    pivots: Float[Array, "h 3 p"]
+    """`D`."""
+
+
+def factor_triples(blocks: Float[Array, "h 3 p"], by_depth: Float[Array, "h s"]) -> TripleLandmarks:
+    """`L` and `D` of blocks with the entries `uu, vv, uv`, and `ud, vd, dd` at the landmarks `u, v, d`."""
+    hessian_u, hessian_v, mixed_uv = (blocks[:, k] for k in range(3))
+    mixed_u, mixed_v, hessian_d, _ = split_triples(by_depth, blocks.shape[-1])
     ratio_u, ratio_uv = _divided(mixed_u, hessian_u), _divided(mixed_uv, hessian_u)
     rest_v = mixed_v - ratio_uv * mixed_u
     # Where one match alone sees a landmark that its host does not, a pivot is rounding error.
     own_v = _pivot(hessian_v - ratio_uv * mixed_uv, hessian_v)
     ratio_v = _divided(rest_v, own_v)
     own_d = _pivot(hessian_d - ratio_u * mixed_u - ratio_v * rest_v, hessian_d)
-    triples = TripleLandmarks(ratio_u, ratio_v, ratio_uv)
-    by_u, by_v, by_d, _ = _split(system.cross, count)
-    by_v = by_v - ratio_uv[:, None] * by_u
-    by_d = by_d - ratio_u[:, None] * by_u - ratio_v[:, None] * by_v
-    # Stacked, not concatenated: XLA does not vectorise a concatenation that it fuses on a CPU.
-    rows = jnp.stack([by_u, by_v, by_d], 2).at[:, -1].set(jnp.stack([hessian_u, own_v, own_d], 1))
-    cross = jax.lax.dynamic_update_slice(system.cross, rows.reshape(*rows.shape[:2], 3 * count), (0, 0, 0))
-    return eqx.tree_at(
-        lambda s: (s.cross, s.triples, s.blocks), system, (cross, triples, None), is_leaf=lambda leaf: leaf is None
-    )
+    return TripleLandmarks(ratio_u, ratio_v, ratio_uv, jnp.stack([hessian_u, own_v, own_d], 1))
 
 
-def restrict_triples(triples: TripleLandmarks, gradient: Float[Array, "n s"]) -> Float[Array, "n s"]:
+def restricted_parts(triples: TripleLandmarks, parts: tuple[Array, Array, Array, Array]) -> list[Array]:
+    """`L^-1 w` of values by `u`, by `v`, by `d` of the triples and by the other landmarks."""
+    by_u, by_v, by_d, others = parts
+    wide = lambda ratio: _as_wide(ratio, by_u)
+    by_v = by_v - wide(triples.ratio_uv) * by_u
+    by_d = by_d - wide(triples.ratio_u) * by_u - wide(triples.ratio_v) * by_v
+    return [by_u, by_v, by_d, others]
+
+
+def restrict_triples(triples: TripleLandmarks, values: Float[Array, "n *rows s"]) -> Float[Array, "n *rows s"]:
     """`L^-1 w`: a gradient by the unknowns of the landmarks as one by the system's coordinates."""
-    by_u, by_v, by_d, others = _split(gradient, triples.ratio_u.shape[-1])
-    by_v = by_v - triples.ratio_uv * by_u
-    by_d = by_d - triples.ratio_u * by_u - triples.ratio_v * by_v
-    return jnp.concatenate([by_u, by_v, by_d, others], -1)
-
-
-def depth_gradient(system: ArrowSystem) -> Float[Array, "n s"]:
-    """The gradient by `z_d` and the other landmarks, before triples were made scalars: `h_d + a h_u + b h_v`."""
-    if system.triples is None:
-        return system.landmark_gradient
-    by_u, by_v, by_d, others = _split(system.landmark_gradient, system.triples.ratio_u.shape[-1])
-    by_d = by_d + system.triples.ratio_u * by_u + system.triples.ratio_v * by_v
-    return jnp.concatenate([by_d, others], -1)
+    return jnp.concatenate(restricted_parts(triples, split_triples(values, triples.ratio_u.shape[-1])), -1)
 
 
 def expand_triples(triples: TripleLandmarks, landmarks: Float[Array, "n *rows s"]) -> Float[Array, "n *rows s"]:
     """`L'^-1 y`: a step of the system's landmarks as one of the problem's."""
-    wide = lambda leaf: leaf.reshape(leaf.shape[0], *(1,) * (landmarks.ndim - 2), leaf.shape[1])
-    y_u, y_v, z_d, others = _split(landmarks, triples.ratio_u.shape[-1])
+    wide = lambda ratio: _as_wide(ratio, landmarks)
+    y_u, y_v, z_d, others = split_triples(landmarks, triples.ratio_u.shape[-1])
     z_v = y_v - wide(triples.ratio_v) * z_d
     z_u = y_u - wide(triples.ratio_uv) * z_v - wide(triples.ratio_u) * z_d
     return jnp.concatenate([z_u, z_v, z_d, others], -1)
@@ -79,17 +76,22 @@ def expand_triples(triples: TripleLandmarks, landmarks: Float[Array, "n *rows s"
 
 def expand_triples_variance(triples: TripleLandmarks, variance: Float[Array, "n s"]) -> Float[Array, "n s"]:
     """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
-    of_u, of_v, of_d, others = _split(variance, triples.ratio_u.shape[-1])
+    of_u, of_v, of_d, others = split_triples(variance, triples.ratio_u.shape[-1])
     z_v = of_v + triples.ratio_v**2 * of_d
     z_u = of_u + triples.ratio_uv**2 * of_v + (triples.ratio_uv * triples.ratio_v - triples.ratio_u) ** 2 * of_d
     return jnp.concatenate([z_u, z_v, of_d, others], -1)
 
 
-def _split(values: Array, count: int) -> tuple[Array, Array, Array, Array]:
+def split_triples(values: Float[Array, "*n s"], count: int) -> tuple[Array, Array, Array, Array]:
     """`u, v, d` of the triples and the other landmarks, out of the last axis."""
     parts = (slice(0, count), slice(count, 2 * count), slice(2 * count, 3 * count), slice(3 * count, None))
     u, v, d, others = (values[..., part] for part in parts)
     return u, v, d, others
+
+
+def _as_wide(ratio: Array, values: Array) -> Array:
+    """With the axes between, those of rows."""
+    return ratio.reshape(*ratio.shape[:-1], *(1,) * (values.ndim - ratio.ndim), ratio.shape[-1])
 
 
 def _divided(value: Array, by: Array) -> Array:

@@ -14,6 +14,8 @@ import vggtgeo as vg
 from vggtgeo.bundle.linearise import energy_gradient, linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.term import local_model
 from vggtgeo.io.errors import InputError
 
 POINTS, LINES, KEYFRAMES = 6, 2, 3
@@ -68,6 +70,25 @@ def test_hand_written_columns_are_the_derived_ones(window):
     for name in ("hessian", "gradient", "schur", "schur_gradient"):
         first, second = (np.asarray(getattr(found, name)) for found in both)
         np.testing.assert_allclose(second, first, rtol=1e-9, atol=1e-9 * np.abs(first).max(), err_msg=name)
+
+
+@pytest.mark.parametrize("kernel", [vg.kernels.Square(), vg.kernels.Huber(1.5), vg.kernels.Cauchy(1.5)])
+@pytest.mark.parametrize(("exact", "correction"), [(True, None), (False, None), (False, 0.7)])
+def test_the_written_model_is_the_derived_one(kernel, exact, correction):
+    """Hessian and gradient of `HostPixel`, written out, against those that `local_model` derives from its residual."""
+    random = np.random.default_rng(3)
+    offset = jnp.asarray(random.normal(0, 2.0, (2, POINTS, 2))).at[0, 0].set(0.0)
+    term = HostPixel(weight=jnp.asarray(random.uniform(0.5, 2.0, (2, POINTS))).at[1, 1].set(0.0), kernel=kernel)
+    part = None if correction is None else jnp.asarray(correction)
+
+    def derived(weight, at):
+        return local_model(term, weight, lambda step: term.residual(at + step), 2, part, exact)
+
+    hessian, gradient = jax.vmap(jax.vmap(derived))(term.weight, offset)
+    found_hessian, found_gradient = term.model(offset, part, exact)
+    expected = jnp.stack([hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1]], 1)
+    np.testing.assert_allclose(found_hessian, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(found_gradient, jnp.swapaxes(gradient, 1, 2), rtol=1e-12, atol=1e-12)
 
 
 def test_segments_and_triples_stand_beside_each_other():

@@ -16,7 +16,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.objective import (
@@ -36,8 +35,7 @@ from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors, add_shared
-from vggtgeo.solvers.segments import join_segments
-from vggtgeo.solvers.triples import depth_gradient, join_triples
+from vggtgeo.solvers.landmark_basis import join_landmarks
 
 
 def linearise(
@@ -79,12 +77,15 @@ def linearise(
             cross = jax.lax.dynamic_update_slice(cross, shared + tail, start)
         return (cross, blocks if blocks is None or own is None else blocks.at[row].add(own)), gram
 
-    cross, blocks = _landmark_terms(problem, state, common + cameras.size, correction, exact)
+    own_terms, blocks = _landmark_terms(problem, state, correction, exact)
+    cross = jnp.zeros((len(own_terms), common + cameras.size + 2, own_terms.shape[2]), own_terms.dtype)
     if problem.edge_terms:
         edges = (places(problem), problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
+    # After the edges, in place: XLA would copy cross terms that do not begin as zeros.
+    cross = cross.at[:, -2:].add(own_terms)
     force = gram[:, : lie.TANGENT, size]
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     system = ArrowSystem(
@@ -104,10 +105,8 @@ def linearise(
     )
     if not joined:
         return system
-    # In this order: what reads the cross terms as they were before would make XLA copy them.
-    system = join_triples(system)
-    system = replace(system, held=_held(problem, state, depth_gradient(system)))
-    return system if problem.fraction is None else join_segments(system, jax.lax.stop_gradient(problem.fraction))
+    system = replace(system, held=_held(problem, state, system.cross[:, -2, num_offsets(state) :]))
+    return join_landmarks(system, None if problem.fraction is None else jax.lax.stop_gradient(problem.fraction))
 
 
 def energy_gradient(problem: Problem, state: State) -> ArrowVector:
@@ -137,8 +136,8 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
         for term, seen in of_edge(problem, view_of(cameras, hosts, place, motion), data):
             found = term.gradient(seen)
             local += found.shared
-            parts = [found.depth] if found.pixel is None else [*found.pixel, found.depth]
-            for start, part in _places(term, seen, jnp.concatenate(parts)[None], sizes):
+            by_unknown = [part[None] for part in (*([] if found.pixel is None else found.pixel), found.depth)]
+            for start, part in _places(term, seen, by_unknown, sizes):
                 own = own.at[start : start + part.shape[1]].add(part[0])
         return local, own
 
@@ -214,42 +213,39 @@ def _as_landmarks(offsets: Float[Array, "n p 2"]) -> Float[Array, "n t"]:
 
 
 def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
-    parts = [term.columns(view, correction) for term, view in seen]
-    shared = [part[: view.size + 2] for part, (_, view) in zip(parts, seen, strict=True)]
-    by_pixel = [part[view.size + 2 :] for part, (_, view) in zip(parts, seen, strict=True)]
     # The barrier keeps XLA from forming the columns again in each product.
-    columns, by_pixel = jax.lax.optimization_barrier((jnp.concatenate(shared, 1), by_pixel))
-    starts = np.cumsum([0, *(part.shape[1] for part in parts)])
-    coupled: list[Array] = []
+    parts = jax.lax.optimization_barrier([term.columns(view, correction) for term, view in seen])
+    coupled: list[list[Array]] = []
     blocks: list[Array | None] = []
-    for pixels, start, end, (_, view) in zip(by_pixel, starts, starts[1:], seen, strict=False):
-        own, slots = columns[:, start:end], len(view.inverse_depth)
-        if not view.free_pixels:
-            coupled.append(products(own, own[-1], slots))
-            blocks.append(None)
-            continue
-        unknowns = jnp.concatenate([pixels, own[-1:]])
-        coupled.append(products(own[:, None], unknowns, slots).reshape(len(own), -1))
-        blocks.append(products(pixels[np.array([0, 1, 0])], pixels[np.array([0, 1, 1])], slots))
-    return (columns @ columns.T)[:-1, :-1], *_placed(seen, coupled, blocks, sizes)
+    for columns, (_, view) in zip(parts, seen, strict=True):
+        slots, depth = len(view.inverse_depth), view.size + 1
+        own, pixels = columns[: depth + 1], columns[depth + 1 :]
+        # One unknown after the other: XLA does not vectorise a loop over all of them at once.
+        coupled.append([products(own, by_one, slots) for by_one in (*pixels, own[-1])])
+        pairs = [(pixels[a], pixels[b]) for a, b in ((0, 0), (1, 1), (0, 1))] if view.free_pixels else []
+        blocks.append(jnp.stack([products(a, b, slots) for a, b in pairs]) if pairs else None)
+    size = seen[0][1].size
+    # Of all columns: those of the shared coordinates alone would be copied first.
+    gram = sum((columns @ columns.T)[: size + 1, : size + 1] for columns in parts)
+    return gram, *_placed(seen, coupled, blocks, sizes)
 
 
 def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
     models: list[LocalModel] = [term.model(view) for term, view in seen]
     gram = models[0].gram
-    coupled: list[Array] = []
+    coupled: list[list[Array]] = []
     blocks: list[Array | None] = []
     for model in models[1:]:
         gram = gram + model.gram
     for model in models:
         own = [] if model.pixels is None else [model.pixels.coupled[:, 0], model.pixels.coupled[:, 1]]
-        coupled.append(jnp.concatenate([*own, model.coupled], 1))
+        coupled.append([*own, model.coupled])
         blocks.append(None if model.pixels is None else model.pixels.blocks)
     return gram, *_placed(seen, coupled, blocks, sizes)
 
 
 def _placed(
-    seen: Seen, coupled: list[Array], blocks: list[Array | None], sizes: tuple[int, int]
+    seen: Seen, coupled: list[list[Array]], blocks: list[Array | None], sizes: tuple[int, int]
 ) -> tuple[Columns, Array | None]:
     """The terms' cross terms and blocks at their landmarks, added up."""
     parts = [part for (term, view), own in zip(seen, coupled, strict=True) for part in _places(term, view, own, sizes)]
@@ -263,15 +259,14 @@ def _placed(
     return _joined(parts, 2 * free + slots), joint
 
 
-def _places(term: EdgeTerm, view: EdgeView, own: Array, sizes: tuple[int, int]) -> Columns:
-    """Where the columns of a term (those by `u`, `v`, inverse depth of its slots) are among the landmarks."""
-    first, slots, free, points = term.first_slot, len(view.inverse_depth), view.free_pixels, sizes[0]
-    if not free:
-        return [(2 * points + first, own)]
-    if free == slots == points:
-        return [(0, own)]
-    pixels = [(first + axis * points, own[:, axis * slots : axis * slots + free]) for axis in range(2)]
-    return [*pixels, (2 * points + first, own[:, 2 * slots :])]
+def _places(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tuple[int, int]) -> Columns:
+    """Where the columns of a term (those by `u`, `v` of its slots, if any, and by inverse depth) are among the
+    landmarks.
+    """
+    free, points = view.free_pixels, sizes[0]
+    *pixels, depth = by_unknown
+    by_pixel = [(axis * points + term.first_slot, own[:, :free]) for axis, own in enumerate(pixels)]
+    return [*by_pixel, (2 * points + term.first_slot, depth)]
 
 
 def _joined(parts: Columns, size: int) -> Columns:
@@ -286,24 +281,22 @@ def _joined(parts: Columns, size: int) -> Columns:
 
 
 def _landmark_terms(
-    problem: Problem, state: State, height: int, correction: Float[Array, ""] | None, exact: bool
-) -> tuple[Float[Array, "h r s"], Float[Array, "h 3 p"] | None]:
-    """Cross terms before any edge: gradient and curvature of the terms on landmarks in the last two rows; and the
-    blocks of landmarks with free pixels.
-    """
+    problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
+) -> tuple[Float[Array, "h 2 s"], Float[Array, "h 3 p"] | None]:
+    """Gradient and curvature of the terms on landmarks, and the blocks of landmarks with free pixels."""
     (rows, slots), first = state.inverse_depth.shape, num_offsets(state)
-    cross = jnp.zeros((rows, height + 2, first + slots), state.inverse_depth.dtype)
+    gradient = jnp.zeros((rows, first + slots), state.inverse_depth.dtype)
+    curvature = jnp.zeros_like(gradient)
     for term in problem.slot_terms:
-        gradient, curvature = term.derivatives(state.inverse_depth, correction, exact)
-        cross = cross.at[:, -2, first:].add(gradient).at[:, -1, first:].add(curvature)
+        force, own = term.derivatives(state.inverse_depth, correction, exact)
+        gradient, curvature = gradient.at[:, first:].add(force), curvature.at[:, first:].add(own)
     if state.pixel_offset is None:
-        return cross, None
-    blocks = jnp.zeros((rows, 3, first // 2), cross.dtype)
+        return jnp.stack([gradient, curvature], 1), None
+    blocks = jnp.zeros((rows, 3, first // 2), gradient.dtype)
     for pixel, offset in pixel_observations(problem, state):
         hessian, force = pixel.model(offset, correction, exact)
-        cross = cross.at[:, -2, :first].add(_as_landmarks(force))
-        blocks += jnp.stack([hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1]], 1)
-    return cross, blocks
+        gradient, blocks = gradient.at[:, :first].add(force.reshape(rows, first)), blocks + hessian
+    return jnp.stack([gradient, curvature], 1), blocks
 
 
 def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool[Array, "h t"] | None:

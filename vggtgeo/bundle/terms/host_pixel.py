@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, local_model
+from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighting
 
 
 class HostPixel(AbstractTerm):
@@ -41,14 +41,22 @@ class HostPixel(AbstractTerm):
 
     def model(
         self, offset: Float[Array, "h p 2"], correction: Float[Array, ""] | None, exact: bool
-    ) -> tuple[Float[Array, "h p 2 2"], Float[Array, "h p 2"]]:
-        """Hessian and gradient of the energy of each landmark; of a prepared term."""
+    ) -> tuple[Float[Array, "h 3 p"], Float[Array, "h 2 p"]]:
+        """Hessian, `uu, vv, uv`, and gradient of the energy of each landmark; of a prepared term.
 
-        def one(data: dict, weight: Array, at: Array) -> tuple[Array, Array]:
-            residual = lambda step: check_residual(self, self.holding(data).residual(at + step))
-            return local_model(self, weight, residual, 2, correction, exact)
-
-        return jax.vmap(jax.vmap(one))(self.data(), self.weights, offset)
+        The derivative of the residual is the unit matrix, so the Hessian is `pull I + bend r r'`, written out: products
+        of 2 x 2 matrices, landmark by landmark, take ten times as long on a CPU.
+        """
+        u, v = offset[..., 0], offset[..., 1]
+        squared = u * u + v * v
+        pull = self.weights * self.kernel.weight(self.weights * squared)
+        if exact:
+            bend = 2 * self.weights**2 * self.kernel.curvature(self.weights * squared)
+        else:
+            soft = reweighting(self.kernel, self.weights, squared, correction).soft
+            bend = -pull * (1 - soft * soft) / jnp.where(squared > 0, squared, 1.0)
+        hessian = jnp.stack([pull + bend * u * u, pull + bend * v * v, bend * u * v], 1)
+        return hessian, jnp.stack([pull * u, pull * v], 1)
 
     def gradient(self, offset: Float[Array, "h p 2"]) -> Float[Array, "h p 2"]:
         """First derivative of the energy, differentiable once more."""
