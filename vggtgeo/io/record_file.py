@@ -2,15 +2,15 @@
 
 The header names what the file is and the number of its layout; it is read and checked before any data. Members are
 stored, not compressed, so that nothing unpacks to more than the file holds, and zip's checksums tell damage. Where the
-layout changes, its number grows, and `Layout.upgrades` holds what makes the header of each number one of the next.
+layout changes, its number grows, and files of other numbers are refused: no release wrote any.
 """
 
 from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +31,11 @@ _NO_HEADER = (ValueError, KeyError, TypeError, IndexError, AttributeError, Recur
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """kind: what files are ("map", say). version: of the layout that is written. classes: by the names that files call
-    them. upgrades: of each number that can still be read, what makes a header of the next of it.
-    """
+    """kind: what files are ("map", say). version: of the layout. classes: by the names that files call them."""
 
     kind: str
     version: int
     classes: Mapping[str, type]
-    upgrades: Mapping[int, Callable[[Header], Header]] = field(default_factory=dict)
 
     def write(self, path: Path, value: Any, facts: Mapping[str, Any] | None = None) -> None:
         """Writes a value and plain facts about it, atomically.
@@ -104,7 +101,7 @@ class Layout:
         return found[0], data
 
     def _header(self, archive: Archive) -> Header:
-        """The header, checked and of the present version."""
+        """The header, checked."""
         self._check_members(archive)
         check = lambda headers: _check_bytes(archive.path, headers)
         text = archive.read([HEADER], check, most=MOST_HEADER)[HEADER].tobytes()
@@ -115,23 +112,15 @@ class Layout:
             header["facts"] = dict(header["facts"])
             if type(version) is not int:
                 raise TypeError(f"its version is {version!r:.20}")
-            known = version == self.version or version in self.upgrades
         except _NO_HEADER as error:
             raise InputError(f"`{archive.path}` is no {self.kind} that vggtgeo wrote: {error}") from None
         if kind != self.kind:
             raise InputError(f"`{archive.path}` is a {kind}; expected a {self.kind}")
-        if not known:
+        if version != self.version:
             raise InputError(
                 f"`{archive.path}` is a {self.kind} of version {version}; this program reads version "
                 f"{self.version}: use the program that wrote it"
             )
-        try:
-            for number in range(version, self.version):
-                header = {**self.upgrades[number](header), "version": number + 1}
-        except _NO_HEADER as error:
-            raise InputError(
-                f"`{archive.path}` is no {self.kind} that vggtgeo wrote, or was changed since: {error}; {AGAIN}"
-            ) from None
         return header
 
     def _check_members(self, archive: Archive) -> None:

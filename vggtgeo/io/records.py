@@ -79,24 +79,6 @@ def unpack_value(
     return _Unpacker(classes, arrays, block, known).value(tree)
 
 
-def with_field(
-    tree: Tree, classes: Sequence[Any], name: str, field: str, value: Tree = None
-) -> tuple[Tree, list[list[Any]]]:
-    """Tree and classes of an older file, in which the class `name` had one field less: its last one, here `value`."""
-    found = [number for number, (kind, _) in enumerate(classes) if kind == name]
-
-    def filled(part: Tree) -> Tree:
-        if isinstance(part, list):
-            return [filled(item) for item in part]
-        if not isinstance(part, dict):
-            return part
-        inside = {key: filled(item) for key, item in part.items()}
-        own = part.keys() == {"c", "v"} and part["c"] in found
-        return {**inside, "v": [*inside["v"], value]} if own else inside
-
-    return filled(tree), [[kind, [*fields, field] if kind == name else fields] for kind, fields in classes]
-
-
 class _Packer:
     def __init__(self, known: Mapping[str, type]) -> None:
         self._names = {kind: name for name, kind in known.items()}

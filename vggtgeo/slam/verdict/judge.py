@@ -14,7 +14,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import STRONG_INLIERS
 from vggtgeo.slam.verdict.alternatives import Explanation, explain
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.decision import findings
+from vggtgeo.slam.verdict.decision import extent, findings
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
 from vggtgeo.slam.verdict.record import MAX_LOST, check_record
 from vggtgeo.slam.verdict.windows import linked, thinned, tracks_of, windows
@@ -68,9 +68,7 @@ def check_extent(claim: Claim, sigma: np.ndarray | None) -> list[Finding]:
     """
     if claim.metric or sigma is None or not np.isfinite(sigma).any():
         return []
-    centres = claim.centres[claim.tracked]
-    spread = float(np.sqrt(np.mean(np.sum((centres - centres.mean(0)) ** 2, 1))))
-    share = float(np.nanmedian(sigma)) / max(spread, 1e-12)
+    share = float(np.nanmedian(sigma)) / max(extent(claim.poses[claim.tracked]), 1e-12)
     if share < MAX_UNKNOWN:
         return []
     text = (
