@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,9 +17,12 @@ def small_disk(size: int) -> Iterator[None]:
         pytest.skip("a limit that this system has not")
     import resource
 
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before, byte_code = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
+    # Python 3.11 keeps a compiled module that the limit cut short, and every later process fails on it.
+    sys.dont_write_bytecode = True
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        sys.dont_write_bytecode = byte_code

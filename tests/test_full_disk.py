@@ -18,8 +18,10 @@ from vggtgeo.io.errors import InputWarning
 from vggtgeo.viewing import target
 from vggtgeo.viewing.callback import RerunCallback
 
+# No byte code: Python 3.11 keeps a compiled module that the limit cut short, and every later process fails on it.
 VIEW = """
 import resource, sys
+sys.dont_write_bytecode = True
 from vggtgeo.cli.main import main
 from vggtgeo.viewing import target
 target._STALL_TIMEOUT = 0.5

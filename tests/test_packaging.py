@@ -87,8 +87,10 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the repository's root (a build writes beside its sources), with a file in `tests/`."""
     root = tmp_path_factory.mktemp("repository")
     for name in SOURCES:
-        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-        copy(ROOT / name, root / name)
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, root / name)
     (root / "tests").mkdir()
     (root / "tests" / "__init__.py").touch()
     return root
