@@ -9,6 +9,7 @@ import numpy as np
 import plane_views as views
 import pytest
 import tiny_networks as tiny
+from reported import warns
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.bounds import BoundedPoints
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
@@ -342,11 +343,11 @@ def test_a_full_disk_costs_the_answer_s_place_only(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("vggtgeo.models.onnx.cache.os.fsync", full)
+    monkeypatch.setattr("vggtgeo.io.files.os.fsync", full)
     cache = FolderCache(tmp_path / "cache")
     compute, calls = _counted({"a": np.arange(5.0)})
     ask = lambda: cache.get((session,), (), (), compute)["a"]
-    with pytest.warns(UserWarning, match=r"cannot be kept in `.*cache` \(No space left on device\)"):
+    with warns(tmp_path / "cache", "No space left on device", warning=UserWarning):
         np.testing.assert_array_equal(ask(), np.arange(5.0))
     np.testing.assert_array_equal(ask(), np.arange(5.0))  # of which no other warning tells: that would be an error
     assert len(calls) == 2
