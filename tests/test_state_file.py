@@ -277,56 +277,54 @@ def _cut(slots: Slots) -> Slots:
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("change", "named"),
     [
-        (lambda slam: replace(slam, window=replace(slam.window, members=(7,))), "names keyframes that are not there"),
-        (lambda slam: replace(slam, map=replace(slam.map, keyframes=())), "names keyframes that are not there"),
-        (lambda slam: _camera(slam, intrinsics=np.ones(3)), "`intrinsics` has shape [3], expected [4]"),
-        (lambda slam: _camera(slam, given=-slam.intrinsics), "expected positive pixels"),
-        (lambda slam: _first(slam, number=1), "not numbered one after the other"),
-        (lambda slam: _first(slam, pose=2.0 * np.eye(4)), "`pose` is not a rigid motion"),
-        (lambda slam: _first(slam, pose=np.full((4, 4), np.nan)), "`pose` has 16 values that are not finite"),
-        (lambda slam: _first(slam, points=_cut(slam.keyframes[0].points)), "`pixels of points` has shape"),
-        (lambda slam: _first(slam, samples=_cut(slam.keyframes[0].samples)), "`pixels of samples` has shape"),
-        (lambda slam: _first(slam, sample_segment=slam.keyframes[0].sample_segment + 10_000), "`sample_segment` has"),
-        (lambda slam: _first(slam, line_depths=np.zeros((0, 2))), "`line_depths` has shape"),
+        (lambda slam: replace(slam, window=replace(slam.window, members=(7,))), "keyframes"),
+        (lambda slam: replace(slam, map=replace(slam.map, keyframes=())), "keyframes"),
+        (lambda slam: _camera(slam, intrinsics=np.ones(3)), "intrinsics"),
+        (lambda slam: _camera(slam, given=-slam.intrinsics), "given"),
+        (lambda slam: _first(slam, number=1), "number"),
+        (lambda slam: _first(slam, pose=2.0 * np.eye(4)), "pose"),
+        (lambda slam: _first(slam, pose=np.full((4, 4), np.nan)), "pose"),
+        (lambda slam: _first(slam, points=_cut(slam.keyframes[0].points)), "pixels of points"),
+        (lambda slam: _first(slam, samples=_cut(slam.keyframes[0].samples)), "pixels of samples"),
+        (lambda slam: _first(slam, sample_segment=slam.keyframes[0].sample_segment + 10_000), "sample_segment"),
+        (lambda slam: _first(slam, line_depths=np.zeros((0, 2))), "line_depths"),
         (
             lambda slam: _first(slam, images=replace(slam.keyframes[0].images, depth=np.zeros((2, 2), np.float16))),
-            "expected four of one size",
+            "depth",
         ),
         (
             lambda slam: replace(
                 slam, map=replace(slam.map, pairs=(replace(slam.map.pairs[0], second=9), *slam.map.pairs[1:]))
             ),
-            "names keyframes that are not there",
+            "keyframes",
         ),
-        (lambda slam: _last(slam, seen=SeenPoints(np.array([99_999], np.int32), np.ones((1, 2)))), "`slots` has the"),
-        (lambda slam: _last(slam, seen=SeenPoints(np.zeros(2, np.int32), np.ones((1, 2)))), "`pixels` has shape"),
-        (lambda slam: _last(slam, arrival=(9, np.eye(4))), "names keyframes that are not there"),
-        (lambda slam: Evidence(), "holds a Evidence; expected the state of a run"),
+        (lambda slam: _last(slam, seen=SeenPoints(np.array([99_999], np.int32), np.ones((1, 2)))), "slots"),
+        (lambda slam: _last(slam, seen=SeenPoints(np.zeros(2, np.int32), np.ones((1, 2)))), "pixels"),
+        (lambda slam: _last(slam, arrival=(9, np.eye(4))), "keyframes"),
+        (lambda slam: Evidence(), "Evidence"),
     ],
 )
-def test_states_whose_parts_do_not_belong_together(
-    tmp_path: Path, change: Callable[[Slam], Any], sentence: str
-) -> None:
-    """A file of parts that do not fit is refused, not found at the end of a run; oracle: the sentence."""
+def test_states_whose_parts_do_not_belong_together(tmp_path: Path, change: Callable[[Slam], Any], named: str) -> None:
+    """A state with inconsistent parts is refused when it is read; oracle: what the error names."""
     STATE.write(tmp_path / "state.npz", change(recorded_run().slam))
-    with raises("state.npz", sentence):
+    with raises("state.npz", named):
         load_state(tmp_path / "state.npz")
 
 
 def test_matches_of_key_points_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    """Rows of matches are looked at, those of points and those of lines; oracle: the sentence."""
+    """Matches of points and of lines with rows that do not exist are refused; oracle: what the error names."""
     slam = recorded_run().slam
     pair = slam.map.pairs[0]
     points = replace(pair.points, index_j=pair.points.index_j + 10_000)
     lines = LineMatches(np.array([0]), np.array([10_000]), np.array([1.0]))
-    for wrong, sentence in (
+    for wrong, named in (
         (replace(pair, points=points), "index_j of points"),
         (replace(pair, lines=lines), "of lines"),
     ):
         STATE.write(tmp_path / "state.npz", replace(slam, map=replace(slam.map, pairs=(wrong, *slam.map.pairs[1:]))))
-        with raises("state.npz", sentence):
+        with raises("state.npz", named):
             load_state(tmp_path / "state.npz")
 
 
