@@ -14,8 +14,9 @@ from itertools import permutations, product
 
 import cv2
 import numpy as np
-from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_array
+
+from vggtgeo.geometry import pinhole
 
 
 @dataclass(frozen=True, eq=False)

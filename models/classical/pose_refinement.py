@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from vggtgeo.models import pinhole
-from vggtgeo.models.rigid_motion import exponential
+
+from vggtgeo.geometry import pinhole
+from vggtgeo.geometry.rigid import exponential
 
 
 def refine_pose(
