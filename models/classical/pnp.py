@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.pose_refinement import refine_pose, residuals
 from vggtgeo.models.classical.sample_order import SampleOrder
 from vggtgeo.models.classical.two_view import TwoViewStart
 from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery, StartGuess
+
+from vggtgeo.geometry import pinhole
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.sample_order import SampleOrder
+
+from vggtgeo.geometry import pinhole
 
 
 @dataclass(frozen=True)

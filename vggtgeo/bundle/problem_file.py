@@ -32,7 +32,7 @@ from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
 from vggtgeo.bundle.terms.rotation import RotationPrior
-from vggtgeo.geometry import cameras
+from vggtgeo.geometry import camera_models as cameras
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open

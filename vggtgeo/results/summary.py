@@ -14,7 +14,7 @@ import numpy as np
 
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.cameras import RadialTangential
+from vggtgeo.geometry.camera_models import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.results.files import submap_file

@@ -24,7 +24,7 @@ from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
 from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.cameras import Pinhole
+from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import AGAIN, Format, by_name
