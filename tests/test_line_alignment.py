@@ -13,8 +13,7 @@ from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, RelativeView, Segments
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.settings.table import updated
+from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.covisibility import Directed, match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
@@ -187,11 +186,8 @@ def test_points_and_lines_make_an_edge_together(points: int, lines: int, joined:
         points=Slots(pixels, third, third, 0.02 * third, np.ones(20), np.ones(20)),
     )
     roles = Roles(points=_FirstPoints(points), line_matches=_FirstLines(lines))
-    pair = match_keyframes(keyframe, replace(keyframe, number=1), roles, SlamSettings(), INTRINSICS)
+    pair = match_keyframes(keyframe, replace(keyframe, number=1), roles, INTRINSICS)
     assert (pair is not None) is joined
-    without = updated(SlamSettings(), {"line": {"in_edges": False}})
-    alone = match_keyframes(keyframe, replace(keyframe, number=1), roles, without, INTRINSICS)
-    assert (alone is not None) is (points >= 12)
 
 
 class _FirstPoints:
