@@ -181,7 +181,7 @@ class _Passes:
 def settings(frames: int = 150) -> vg.SlamSettings:
     """Those of the recorded run with a last adjustment, which no test of this file comes to."""
     base = vg.SlamSettings()
-    return replace(SETTINGS, camera=replace(base.camera, first_pass=frames), refinement=base.refinement)
+    return replace(SETTINGS, camera=replace(base.camera, calibration_frames=frames), refinement=base.refinement)
 
 
 def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **options: Any) -> vg.Result:
