@@ -76,7 +76,7 @@ def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
     wide = replace(slam, camera=replace(slam.camera, sigma=np.full(4, 100.0), self_calibrated=False))
     for count, held in ((2, True), (3, False)):
         slam = replace(wide, map=replace(wide.map, keyframes=wide.keyframes[:count]))
-        assert bool(camera_prior(slam, SETTINGS).sigma[0] < 1.0) == held
+        assert bool(camera_prior(slam).sigma[0] < 1.0) == held
         numbers = frozenset(range(count))
         pairs = tuple(pair for pair in wide.map.pairs if numbers.issuperset(pair.key))
         frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
@@ -142,7 +142,7 @@ def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_how_free_a_guess_is() -> None:
     # Proves that the focal length of a guess is free, and that its principal point stays near the middle. Oracle: the
     # settings' words.
-    sigma = begin(GUESS, ROLES, SETTINGS).camera.sigma
+    sigma = begin(GUESS, ROLES).camera.sigma
     assert sigma == pytest.approx([0.3 * GUESS.intrinsics[0]] * 2 + [0.02 * 320, 0.02 * 240])
 
 
@@ -153,7 +153,7 @@ def test_windows_hold_a_found_camera() -> None:
     guess = replace(walk().camera, intrinsics=tuple(wrong.tolist()), known=False)
     ends = []
     for camera_found in (True, False):
-        first = begin(guess, ROLES, SETTINGS)
+        first = begin(guess, ROLES)
         first = replace(first, camera=replace(first.camera, self_calibrated=camera_found))
         *_, slam = run_frames(iter(recorded_run().frames), guess, ROLES, SETTINGS, Clock(), first)
         ends.append(settled(slam).intrinsics)
@@ -174,14 +174,14 @@ class _Passes:
         if self._camera is None:
             return None
         own = np.array(self._camera.intrinsics)
-        slam = begin(camera, roles, settings)
+        slam = begin(camera, roles)
         return replace(slam, camera=replace(slam.camera, intrinsics=own, given=own, self_calibrated=True))
 
 
 def settings(frames: int = 150) -> vg.SlamSettings:
     """Those of the recorded run with a last adjustment, which no test of this file comes to."""
     base = vg.SlamSettings()
-    return replace(SETTINGS, camera=replace(base.camera, first_pass=frames), refinement=base.refinement)
+    return replace(SETTINGS, camera=replace(base.camera, calibration_frames=frames), refinement=base.refinement)
 
 
 def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **options: Any) -> vg.Result:

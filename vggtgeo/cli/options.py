@@ -35,7 +35,7 @@ AssignmentsOption = Annotated[
     typer.Option(
         "--set",
         metavar="GROUP.FIELD=VALUE",
-        help="A setting of the pipeline, such as tracking.least_inliers=20; may be given several times.",
+        help="A setting of the pipeline, such as keyframes.min_inliers=20; may be given several times.",
     ),
 ]
 RerunOption = Annotated[

@@ -151,7 +151,7 @@ def _reopen(sequence: Sequence, roles: Roles | Perception, settings: SlamSetting
         return None
     own = roles.roles if isinstance(roles, Perception) else roles
     seen = sequence if sequence.has_depth and isinstance(own.depth, SensorDepth) else without_depth(sequence)
-    return reduced(seen, settings.camera.most_pixels)
+    return reduced(seen, settings.camera.max_pixels)
 
 
 class _EarlyFiles(Callback):

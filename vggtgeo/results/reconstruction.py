@@ -133,7 +133,7 @@ def reconstruct(
         hooks = RunCallbacks((windows, evidence, overlay, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles, source.camera)
-        if settings.camera.still_parts and source.repeatable(selection):
+        if settings.camera.static_overlay and source.repeatable(selection):
             with stop.at_once():
                 perception = _without_overlay(perception, source, selection, hooks, overlay, evidence)
         if first is None and before is None:
@@ -278,7 +278,7 @@ def _calibrate(
     Warnings and refusals are restored: the run itself reports them.
     """
     start, _, stride = selection
-    count = min(source.count(*selection) or 0, settings.camera.first_pass)
+    count = min(source.count(*selection) or 0, settings.camera.calibration_frames)
     if source.camera.known or not count or not settings.refinement.global_adjustment:
         return None
     end = start + count * stride

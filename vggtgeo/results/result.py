@@ -108,7 +108,7 @@ class Result:
 
     @property
     def intrinsics_as_read(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy, pixels of the original images, if the run reduced them (`camera.most_pixels`)."""
+        """fx, fy, cx, cy, pixels of the original images, if the run reduced them (`camera.max_pixels`)."""
         reduced = self.summary.get("images_reduced")
         if reduced is None:
             return self.intrinsics

@@ -58,7 +58,7 @@ def begin_with_found_camera(
         found = finish(last[0], roles, once)
         if not _is_plausible(found, camera):
             return None
-        before = begin(camera, roles, settings)
+        before = begin(camera, roles)
         before = replace(
             before,
             camera=replace(

@@ -84,7 +84,7 @@ def run(
     source: Sequence | FrameStream = frames if isinstance(frames, Sequence) else frame_stream(frames, camera)
     roles = roles or default_roles(source.has_depth)
     settings, clock = settings or SlamSettings(), clock or Clock()
-    source = reduced(source, settings.camera.most_pixels)
+    source = reduced(source, settings.camera.max_pixels)
     selected = source.frames(start, end, stride)
     known = None if known_map is None else entered(known_map, source.camera, roles.points)
     yield from run_frames(selected, source.camera, roles, settings, clock, known)
@@ -120,7 +120,7 @@ def run_frames(
     before: the last frames of that state, of which the run that goes on asks whether the next depth image is new.
     waiting: entered while a frame is waited for.
     """
-    slam = begin(camera, roles, settings) if known is None else known
+    slam = begin(camera, roles) if known is None else known
     # Frames of a map whose camera's lens was found are as that lens drew them.
     seen_by = slam.camera.lens or camera
     if roles.still_parts is not None:

@@ -37,7 +37,7 @@ def begin_again_with_depth(
 ) -> Slam | None:
     """The map begins at this frame in place of the first keyframe, whose depth is not known.
 
-    None where this frame's depth is known at fewer than `least_inliers` key points.
+    None where this frame's depth is known at fewer than `min_inliers` key points.
     """
     depth = roles.depth.estimate(frame.image, frame.depth, tuple(slam.intrinsics))
     if not np.any(np.isfinite(depth.depth)):
@@ -46,7 +46,7 @@ def begin_again_with_depth(
     keyframe = make_keyframe(
         blind.number, frame, blind.pose, Description.of(features), roles, settings, slam.intrinsics
     )
-    if np.count_nonzero(np.isfinite(keyframe.points.inverse_depth)) < settings.tracking.least_inliers:
+    if np.count_nonzero(np.isfinite(keyframe.points.inverse_depth)) < settings.keyframes.min_inliers:
         return None
     note = f"the depth of frame {blind.frame} is not known; the map begins at frame {frame.index} ({frame.name})"
     before = tuple(

@@ -1,4 +1,4 @@
-"""Settings as text and back: tables of a TOML file (`[tracking]`), assignments (`tracking.least_inliers=20`).
+"""Settings as text and back: tables of a TOML file (`[keyframes]`), assignments (`keyframes.min_inliers=20`).
 
 A kernel is its name and its numbers, in the order of its fields: `huber 1.5`, `cauchy 2.0`, `square`.
 """
@@ -61,7 +61,7 @@ def parsed(assignment: str) -> Tables:
     """
     name, equals, text = (part.strip() for part in assignment.partition("="))
     if not equals:
-        raise InputError(f"`{assignment}` sets nothing; write `group.field=value`, such as `tracking.least_inliers=20`")
+        raise InputError(f"`{assignment}` sets nothing; write `group.field=value`, such as `keyframes.min_inliers=20`")
     _check_name(name)
     group, field = name.split(".")
     try:
