@@ -16,8 +16,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.extras import install_hint
 from vggtgeo.io.files import write_text
+from vggtgeo.models.extras import install_hint
 from vggtgeo.report.map_scene import MapScene
 from vggtgeo.report.templates import style, template
 
@@ -34,7 +34,7 @@ def has_viewer() -> bool:
 def check_viewer() -> None:
     """Raise InputError if K3D-jupyter is not installed."""
     if not has_viewer():
-        raise InputError(f"the 3D view needs the package `k3d`, which is not installed: {INSTALL}")
+        raise InputError(f"the 3D view needs the package `k3d`, which is missing; {INSTALL}")
 
 
 def view_html(scene: MapScene) -> str:
