@@ -139,7 +139,7 @@ def test_decimation_takes_points_from_everywhere() -> None:
 def test_without_k3d_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that a missing package is an error with a remedy. Oracle: the message names package and extra.
     monkeypatch.setattr(viewer, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="`k3d`.*viewer"):
+    with pytest.raises(InputError, match=r"`k3d`.*viewer"):
         viewer.view_html(_scene(_room(100)))
 
 

@@ -34,7 +34,7 @@ def has_viewer() -> bool:
 def check_viewer() -> None:
     """Raise InputError if K3D-jupyter is not installed."""
     if not has_viewer():
-        raise InputError(f"the 3D view needs the package `k3d`, which is not installed: {INSTALL}")
+        raise InputError(f"the 3D view needs the package `k3d`, which is missing; {INSTALL}")
 
 
 def view_html(scene: MapScene) -> str:
