@@ -223,7 +223,7 @@ def test_a_listed_name_that_no_file_system_takes_costs_its_frame(tmp_path: Path)
     for frame in content["frames"]:
         frame["depth_file_path"] = LONG
     (scene / "transforms.json").write_text(json.dumps(content))
-    with warns("transforms.json", "3"):
+    with warns("xxx.png", 3):
         assert not open_sequence(scene).has_depth
     with raises("xxx.exr"):
         exr_depth(tmp_path / f"{LONG[:-4]}.exr")

@@ -25,7 +25,7 @@ _BORDER_STEPS = 64
 class DepthRegistration:
     """Brings depth of the camera `source` into the images of the camera `target`.
 
-    Fields: rays float64 [h, w, 2], x / z and y / z of each pixel of `source`, its lens undone; target; motion float64
+    Fields: rays float64 [h, w, 3], of each pixel of `source`, undistorted, z = 1; target; motion float64
     [4, 4], source -> target camera coordinates, metres; reach, half of the square that a pixel covers, pixels of
     `target`, along x and y.
     """

@@ -113,7 +113,7 @@ def _check_slots(name: str, slots: Slots, count: int) -> None:
     for field in ("inverse_depth", "prior", "sigma"):
         _check_lengths(f"{field} of {name}", getattr(slots, field), (count,))
     if ((slots.sigma == 0) & (slots.prior > 0)).any():
-        raise ValueError(f"`sigma of {name}` must be positive where there is a prior")
+        raise ValueError(f"`sigma of {name}` must be positive where there is a prior, got 0")
     for field in ("prior_confidence", "confidence"):
         check_confidence(f"{field} of {name}", getattr(slots, field), (count,))
 
