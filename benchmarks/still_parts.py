@@ -3,8 +3,8 @@
     D=../shared/data
     .venv/bin/python benchmarks/still_parts.py $D/building-walk $D/corridor-office $D/redkitchen $D/icl-office
 
-The first 40 frames of each clip, with depth and without, as they are and painted over; `camera.static_overlay` off and
-on.
+The first 40 frames of each clip, with depth and without, as they are and painted over; `camera.static_overlay`
+off and on.
 ATE after SE(3) with depth, after Sim(3) without.
 """
 

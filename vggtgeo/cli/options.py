@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -47,3 +48,11 @@ RerunOption = Annotated[
         help="Log to Rerun: spawn, serve, or a file ending with .rrd.",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What the command prints."""
+
+    quiet: QuietOption = False
+    as_json: JsonOption = False
