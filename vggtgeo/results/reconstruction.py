@@ -28,11 +28,11 @@ from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.first_pass import begin_with_found_camera
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
+from vggtgeo.slam.self_calibration import self_calibrate
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
@@ -148,7 +148,7 @@ def reconstruct(
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
             **reduction_summary(source, slam),
-            **({} if overlay.found is None else {"still_parts": round(overlay.found.share, 4)}),
+            **({} if overlay.found is None else {"static_overlay": round(overlay.found.share, 4)}),
         }
         finished = _FinishedRun(
             slam=slam,
@@ -284,10 +284,10 @@ def _calibrate(
     end = start + count * stride
     hooks.each("on_stage", f"calibrating the camera on the first {count} frames")
     refused = {role: replace(counts) for role, counts in perception.refusals.items()}
-    with hooks.clock.measure("first pass"), stop.at_once(), warnings.catch_warnings():
+    with hooks.clock.measure("self-calibration"), stop.at_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         frames = lambda: source.frames.frames(start, end, stride)
-        found = begin_with_found_camera(frames, source.camera, perception.roles, settings)
+        found = self_calibrate(frames, source.camera, perception.roles, settings)
     for role, counts in refused.items():
         vars(perception.refusals[role]).update(vars(counts))
     return found
@@ -303,12 +303,12 @@ def _without_overlay(
 ) -> Perception:
     """Search for a static overlay; mask it in perception and in the verdict's evidence."""
     hooks.each("on_stage", "searching for a static overlay in the images")
-    with hooks.clock.measure("still parts"):
+    with hooks.clock.measure("static overlay"):
         overlay.search(source, selection)
     if overlay.found is None:
         return perception
     evidence.leave_out(overlay.found.mask)
-    return replace(perception, roles=replace(perception.roles, still_parts=overlay.found))
+    return replace(perception, roles=replace(perception.roles, static_overlay=overlay.found))
 
 
 def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:
