@@ -20,12 +20,12 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features, LineFeatures
 
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings

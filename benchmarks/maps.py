@@ -18,12 +18,11 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from vggtgeo.models import pinhole
 
 import vggtgeo as vg
 from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.evaluation import cloud_error, evaluate_trajectory, surface_points
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.simulation import SyntheticSequence
 
 CELL = 0.02

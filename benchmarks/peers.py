@@ -175,7 +175,7 @@ def _work(path: Path, flags: dict[str, Any]) -> None:
 
     from vggtgeo.bundle.problem_file import load_problem
     from vggtgeo.bundle.solution import solve
-    from vggtgeo.geometry.cameras import Pinhole
+    from vggtgeo.geometry.camera_models import Pinhole
 
     problem, state, _ = load_problem(path, flags.get("dtype", "float64"))
     problem = dataclasses.replace(problem, positive_depth=flags.get("positive_depth", False))

@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.models.checks import check_array
 from vggtgeo.models.roles import WindowGuess
 
+from vggtgeo.geometry import rigid
+
 _ENOUGH_PIXELS = 5000
 """Of one view, for its scale."""
 
@@ -38,7 +40,7 @@ def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndar
     rotation = Rotation.from_matrix(between).mean().as_matrix()
     to_window = np.eye(4)
     to_window[:3, :3] = rotation
-    to_window[:3, 3] = (_centres(placed[use]) - _centres(poses[use]) @ rotation.T).mean(axis=0)
+    to_window[:3, 3] = (rigid.centres(placed[use]) - rigid.centres(poses[use]) @ rotation.T).mean(axis=0)
     depth = (guess.depth * np.float32(scale)).astype(np.float32)
     return replace(guess, poses=placed @ to_window, depth=depth, metric=True)
 
@@ -55,7 +57,7 @@ def _scale(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray], 
 
 
 def _two_centres(first: np.ndarray, second: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return (_centres(first[use]), _centres(second[use])) if len(use) else (np.zeros((1, 3)), np.zeros((1, 3)))
+    return (rigid.centres(first[use]), rigid.centres(second[use])) if len(use) else (np.zeros((1, 3)), np.zeros((1, 3)))
 
 
 def _depth_scale(guess: WindowGuess, depths: Sequence[np.ndarray], use: np.ndarray) -> float | None:
@@ -80,7 +82,3 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     order = np.argsort(values)
     total = np.cumsum(weights[order], dtype=np.float64)
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
-def _centres(poses: np.ndarray) -> np.ndarray:
-    return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])

@@ -10,6 +10,8 @@ from vggtgeo.models.classical.two_view import median_parallax
 from vggtgeo.models.roles import GeometryResult, InitialGeometry, PoseGuess, PoseQuery, StartGuess, WindowGeometry
 from vggtgeo.models.window_alignment import align_window
 
+from vggtgeo.geometry import pinhole, rigid
+
 
 @dataclass(frozen=True)
 class WindowLocator:
@@ -73,7 +75,7 @@ class WindowLocator:
                 points=points[known],
                 pixels=pixels_j[known],
                 confidence=np.ones(np.count_nonzero(known)),
-                predicted=guess.poses[1] @ np.linalg.inv(guess.poses[0]),
+                predicted=guess.poses[1] @ rigid.invert(guess.poses[0]),
             )
         )
         if judged.result is not GeometryResult.SUCCESS or judged.inlier_count < self.least:
@@ -106,5 +108,4 @@ def _unproject(pixels: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray) ->
     columns, rows = np.rint(pixels).astype(int).T
     z = depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
     known = z > 0
-    rays = np.concatenate([(pixels - intrinsics[2:]) / intrinsics[:2], np.ones((len(pixels), 1))], axis=1)
-    return known, rays * np.where(known, z, np.nan)[:, None]
+    return known, pinhole.rays(np.asarray(pixels, np.float64), intrinsics) * np.where(known, z, np.nan)[:, None]

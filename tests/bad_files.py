@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import struct
 import zipfile
@@ -15,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import tiny_sequences as tiny
+from changed_file import with_arrays, with_header
 from picture_bytes import TURN
 from test_problem_file import SCENE, arrays_of
 
@@ -206,29 +206,24 @@ def member(name: str, header: dict[str, Any] | None, data: bytes = b"", **change
     return make
 
 
-def saved(change: Callable[[dict[str, np.ndarray]], Any]) -> Callable[[Path], Path]:
-    """A problem that `save_problem` wrote, in which `change` has changed the arrays."""
+def saved(
+    arrays: Callable[[dict[str, np.ndarray]], Any] = lambda old: None,
+    header: Callable[[dict[str, Any]], Any] = lambda old: None,
+) -> Callable[[Path], Path]:
+    """A problem that `save_problem` wrote, with other arrays or another header."""
 
     def make(folder: Path) -> Path:
         save_problem(folder / "saved.npz", *SCENE.pack())
-        with np.load(folder / "saved.npz") as file:
-            arrays = {name: np.array(file[name]) for name in file.files}
-        change(arrays)
-        np.savez(folder / "saved.npz", **arrays)
-        return folder / "saved.npz"
+        return with_header(with_arrays(folder / "saved.npz", arrays), header)
 
     return make
 
 
-def described(change: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, np.ndarray]], None]:
-    """Changes the description of a saved problem."""
-
-    def apply(arrays: dict[str, np.ndarray]) -> None:
-        description = json.loads(str(arrays["description"]))
-        change(description)
-        arrays["description"] = np.array(json.dumps(description))
-
-    return apply
+def nested(header: dict[str, Any]) -> None:
+    """A header whose tree is nested 900 times."""
+    header["tree"] = []
+    for _ in range(900):
+        header["tree"] = [header["tree"]]
 
 
 def file(name: str, content: str | bytes) -> Callable[[Path], Path]:

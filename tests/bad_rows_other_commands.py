@@ -80,7 +80,7 @@ def export_beside(made: Path) -> None:
     """An export while another puts its files into the same folder, and does not come to an end."""
     (made / "out").mkdir()
     with (
-        patch.object(formats, "_TRIES", 1),
+        patch.object(formats, "_TIMEOUT", 0.1),
         patch.dict(FORMATS, tum=lambda source, target: {}),
         locked(made / "out/.vggtgeo-export.lock"),
     ):

@@ -14,7 +14,9 @@ from bad_row import good, line, nothing, rows
 
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.mapping.tracks import Tracks
 from vggtgeo.results.result import Result
+from vggtgeo.results.scene import SCENE, Scene
 
 
 def evaluated(estimate: Any, reference: Any, *words: Any) -> dict[str, Any]:
@@ -87,21 +89,22 @@ def run_with_views(change: Callable[[Path], Any]) -> Any:
         path = Trajectory(np.arange(2.0), np.stack([tiny.pose(0), tiny.pose(1)]))
         for name in ("trajectory.txt", "keyframes.txt"):
             path.save_tum(folder / name)
-        np.savez(
-            folder / "scene.npz",
-            version=1,
-            frames=np.arange(2),
-            timestamps=path.timestamps,
-            poses=np.linalg.inv(path.poses),
-            intrinsics=np.array(tiny.INTRINSICS),
-            size=np.array([tiny.WIDTH, tiny.HEIGHT]),
+        scene = Scene(
+            np.arange(2),
+            path.timestamps,
+            np.linalg.inv(path.poses),
+            np.array(tiny.INTRINSICS),
+            (tiny.WIDTH, tiny.HEIGHT),
+            Tracks(
+                points=np.array([[0.0, 0.0, 2.0]]),
+                colours=np.zeros((1, 3), np.uint8),
+                point=np.zeros(2, int),
+                view=np.arange(2),
+                pixel=np.full((2, 2), 15.0),
+            ),
             metric=True,
-            track_points=np.array([[0.0, 0.0, 2.0]]),
-            track_colours=np.zeros((1, 3), np.uint8),
-            track_point=np.zeros(2, int),
-            track_view=np.arange(2),
-            track_pixel=np.full((2, 2), 15.0),
         )
+        SCENE.write(folder / "scene.npz", scene)
         for number in range(2):
             tiny.write_image(folder / f"images/{number:06d}.jpg", tiny.image(number))
             tiny.write_image(folder / f"depth/{number:06d}.depth.png", tiny.depth_codes(number))

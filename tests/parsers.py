@@ -35,9 +35,10 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.learning import WindowDataset
+from vggtgeo.mapping.tracks import Tracks
 from vggtgeo.results.files import read_uncertainty
 from vggtgeo.results.result import Result
-from vggtgeo.results.scene import Scene
+from vggtgeo.results.scene import SCENE, Scene
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
@@ -83,7 +84,7 @@ def _all_frames(file: Path) -> None:
 
 
 def _saved(folder: Path) -> bytes:
-    return bad.saved(lambda old: None)(folder).read_bytes()
+    return bad.saved()(folder).read_bytes()
 
 
 def _camera(file: Path) -> Any:
@@ -121,11 +122,11 @@ def layout(name: str, make: Callable[[Path], Path], file: str, opens: str = "dat
 
 
 def _scene(folder: Path) -> bytes:
-    arrays = {"version": 1, "frames": np.arange(2), "timestamps": np.arange(2.0), "metric": np.array(True)}
-    tracks = {"points": np.zeros((1, 3)), "colours": np.zeros((1, 3), np.uint8), "point": np.zeros(1, int)}
-    tracks |= {"view": np.ones(1, int), "pixel": np.zeros((1, 2))}
-    arrays |= {"intrinsics": np.ones(4), "size": np.array([64, 48]), "poses": np.tile(np.eye(4), (2, 1, 1))}
-    np.savez(folder / "scene.npz", **arrays, **{f"track_{name}": value for name, value in tracks.items()})
+    tracks = Tracks(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1, int), np.ones(1, int), np.zeros((1, 2)))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    SCENE.write(
+        folder / "scene.npz", Scene(np.arange(2), np.arange(2.0), poses, np.ones(4), (64, 48), tracks, metric=True)
+    )
     return (folder / "scene.npz").read_bytes()
 
 
@@ -156,7 +157,7 @@ def _state(folder: Path) -> bytes:
 def _windows(folder: Path) -> bytes:
     for row in range(3):
         (folder / f"{row:07d}.npz").touch()
-    return b'{"windows": 3, "version": 1}'
+    return b'{"windows": 3, "version": 2}'
 
 
 def _distances(path: Path) -> None:

@@ -24,7 +24,7 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from vggtgeo.bundle.terms.node import PoseTerm
-from vggtgeo.geometry.cameras import AbstractCamera
+from vggtgeo.geometry.camera_models import AbstractCamera
 
 
 class CameraHeight(PoseTerm):

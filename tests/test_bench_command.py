@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import tiny_suites as tiny
+from reported import raises
 from typer.testing import CliRunner
 
 from vggtgeo.benchmark import runner
@@ -67,10 +68,7 @@ def test_two_batches_keep_off_each_other(tmp_path: Path) -> None:
     suite = tiny.suite(tiny.TEXT.replace('simulate = { scene = "room", frames = 4 }', 'path = "gone"'))
     part = {"sequences": ["walk"], "data": [tmp_path]}
     (tmp_path / "out").mkdir()
-    with (
-        locked(tmp_path / "out" / ".bench.lock"),
-        pytest.raises(InputError, match=r"in use by another batch \(process"),
-    ):
+    with locked(tmp_path / "out" / ".bench.lock"), raises(tmp_path / "out"):
         runner.bench(suite, tmp_path / "out", **part)
     assert not (tmp_path / "out" / "runs.csv").exists()
     report = runner.bench(suite, tmp_path / "out", **part)

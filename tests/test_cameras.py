@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vggtgeo.geometry.cameras import (
+from vggtgeo.geometry.camera_models import (
     AbstractCamera,
     KannalaBrandt,
     Pinhole,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import lie, rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.sparse_map.factors import FREE_LENGTH, MeasuredRelativePose
 
 

@@ -114,7 +114,7 @@ def test_depth_that_is_listed_and_not_there_is_told(tmp_path: Path) -> None:
     # Proves that a folder whose depth was not copied is no folder without depth.
     folder = tiny.nerfstudio(tmp_path / "scene")
     shutil.rmtree(folder / "depth")
-    with warns("transforms.json", "3"):
+    with warns(folder / "depth", 3):
         assert not open_sequence(folder).has_depth
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_keyframe_depth import INTRINSICS, SIZE, keyframe
-from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import GeometryResult, PoseGuess
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.camera.rolling_shutter import image_shift
 from vggtgeo.slam.global_map.carried_poses import carried_poses

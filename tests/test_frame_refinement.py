@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded_run import RecordedRun, recorded_run
-from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles

@@ -13,10 +13,9 @@ from campaign import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from vggtgeo.models import pinhole
 
-from vggtgeo.geometry import lie, rigid
-from vggtgeo.geometry.cameras import AbstractCamera, KannalaBrandt, Pinhole, RadialTangential
+from vggtgeo.geometry import lie, pinhole, rigid
+from vggtgeo.geometry.camera_models import AbstractCamera, KannalaBrandt, Pinhole, RadialTangential
 
 
 def numbers(count: int, largest: float) -> st.SearchStrategy[np.ndarray]:

@@ -11,7 +11,7 @@ from conftest import ROOT
 FILES = sorted(file for folder in ("vggtgeo", "solvers", "models") for file in (ROOT / folder).rglob("*.py"))
 ALLOWED = {
     "solvers": {"vggtgeo.solvers", "equinox", "jax", "jaxtyping", "numpy", "optimistix"},
-    "models": {"vggtgeo.models", "cv2", "numpy", "onnxruntime", "scipy"},
+    "models": {"vggtgeo.models", "vggtgeo.io", "vggtgeo.geometry", "cv2", "numpy", "onnxruntime", "scipy"},
 }
 STAIR = (
     ("io",),

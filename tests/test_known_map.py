@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS
+from reported import raises
 from same_leaves import differences
 from typer.testing import CliRunner
 from vggtgeo.models.classical import NoDepth, OrbMatcher, SiftMatcher
@@ -179,17 +180,16 @@ def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
     """Another camera, other images, no map, a state in place of a map: one sentence; oracle: the sentence."""
     camera = sequence().camera
     longer = replace(camera, intrinsics=(300.0, 300.0, 159.5, 119.5))
-    focal = r"is of a camera with fx, fy, cx, cy = 266\.2, 266\.2, 159\.5, 119\.5 px; that of this run has 300\.0"
-    for other, sentence in (
-        (replace(camera, width=640), "is of images of 320 x 240 pixels; those of this run are 640 x 240"),
-        (longer, focal),
+    for other, named in (
+        (replace(camera, width=640), ("320 x 240", "640 x 240")),
+        (longer, ("266.2, 266.2, 159.5, 119.5", "300.0")),
     ):
-        with pytest.raises(vg.InputError, match=sentence):
+        with raises("known_map", *named):
             next(vg.run(sequence().frames(), ROLES, SETTINGS, camera=other, known_map=known))
     with pytest.raises(vg.InputError, match=r"localise_only` .*`known_map`"):
         vg.reconstruct(sequence(), ROLES, FIXED)
     save_state(tmp_path / "state", first_half())
-    with pytest.raises(vg.InputError, match="is a state; expected a map"):
+    with raises(tmp_path / "state", "'map'"):
         vg.load_map(tmp_path / "state")
     slam = first_half()
     with pytest.raises(vg.InputError, match="there is no keyframe to save"):

@@ -14,15 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS, recorded_run
-from vggtgeo.models import pinhole
 from vggtgeo.models.classical import NoDepth, SiftMatcher
 
 import vggtgeo as vg
 from vggtgeo.datasets import Frame
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.cameras import SquarePinhole
+from vggtgeo.geometry.camera_models import SquarePinhole
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
 from vggtgeo.slam.global_map.global_adjustment import _taken_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from vggtgeo.models import pinhole
 from vggtgeo.models.classical import sample_segments
-from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, RelativeView, Segments
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.covisibility import Directed, match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from vggtgeo.models.classical import SiftMatcher, search_near, search_tree
-from vggtgeo.models.rigid_motion import exponential
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings

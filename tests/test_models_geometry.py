@@ -6,11 +6,13 @@ import numpy as np
 import plane_views as views
 import pytest
 from scipy.linalg import expm
-from vggtgeo.models import pinhole, roles
+from vggtgeo.models import roles
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry, TwoViewStart
 from vggtgeo.models.classical.pose_refinement import refine_pose
-from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import GeometryResult
+
+from vggtgeo.geometry import pinhole
+from vggtgeo.geometry.rigid import exponential
 
 POSE = views.pose((5.0, -10.0, 3.0), (0.3, -0.2, 0.1))
 IMAGE = np.zeros((240, 320, 3), np.uint8)

@@ -3,6 +3,7 @@
 import numpy as np
 import plane_views as views
 import pytest
+from reported import raises
 from vggtgeo.models import roles
 from vggtgeo.models.classical import EpipolarVerifier, OrbMatcher, PatchAlignment, PatchFlow, SiftMatcher
 from vggtgeo.models.classical.key_points import spread
@@ -209,7 +210,7 @@ def test_alignment_reduces_the_error_of_targets() -> None:
 )
 def test_wrong_arguments_are_named(build, name: str) -> None:
     # Proves that a setting or an image out of range is refused by name. Oracle: the broken argument.
-    with pytest.raises(ValueError, match=f"`{name}`"):
+    with raises(f"`{name}`", error=ValueError):
         build()
 
 

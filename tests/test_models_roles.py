@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reported import raises
 from vggtgeo.models import roles
 
 INDEX = np.arange(3)
@@ -48,7 +49,7 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_output_is_refused_by_name(name: str) -> None:
     # Proves that an array of wrong shape, range or value raises an error that names it. Oracle: the broken argument.
-    with pytest.raises(ValueError, match=f"`{name}`"):
+    with raises(f"`{name}`", error=ValueError):
         WRONG[name]()
 
 

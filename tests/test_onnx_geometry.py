@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import tiny_networks as tiny
+from reported import raises
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.fit import Fit, at_multiples
@@ -142,7 +143,7 @@ def test_given_intrinsics_are_kept_and_too_many_views_refused(tmp_path: Path) ->
     window, *_ = _window(tmp_path, 2, (28, 42))
     images = [np.zeros((28, 42, 3), np.uint8)] * 2
     np.testing.assert_array_equal(window.window(images, np.array([1.0, 2, 3, 4])).intrinsics, [1, 2, 3, 4])
-    with pytest.raises(ValueError, match=r"`images` has 3 views, but .* takes at most 2"):
+    with raises("images", 3, 2, error=ValueError):
         window.window([*images, images[0]])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import plane_views as views
 import pytest
 import tiny_networks as tiny
+from reported import raises, warns
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.bounds import BoundedPoints
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
@@ -66,7 +67,7 @@ def test_key_points_of_maps_follow_the_known_motion(tmp_path: Path, size: tuple)
     # between two views of a plane; a blank image.
     fixed = (256, 320) if size == SIZE else size
     session = open_session(tiny.alike(tmp_path / "alike.onnx", fixed), contracts.ALIKE)
-    matcher = DensePointMatcher(session)
+    matcher = DensePointMatcher(session=session)
     assert isinstance(matcher, PointMatcher)
     first, second, homography = views.plane_pair(MOTION)
     described = matcher.describe(first), matcher.describe(second)
@@ -87,7 +88,7 @@ def test_answers_that_are_no_maps_give_no_key_point(tmp_path: Path) -> None:
     # Proves that scores of NaN cost the image, not the run, and are counted. Oracle: the count.
     maps = {"scores": np.full((1, 1, 64, 64), np.nan), "descriptors": np.ones((1, 8, 64, 64))}
     file = tiny.constant(tmp_path / "alike.onnx", "alike", {"image": (1, 3, 64, 64)}, maps)
-    matcher = BoundedPoints(DensePointMatcher(open_session(file, contracts.ALIKE)))
+    matcher = BoundedPoints(DensePointMatcher(session=open_session(file, contracts.ALIKE)))
     nothing = matcher.describe(np.zeros((64, 64, 3), np.uint8))
     assert len(nothing) == 0
     assert len(matcher.match(nothing, nothing)) == 0
@@ -114,10 +115,10 @@ def test_peaks_and_vectors_lie_between_pixels() -> None:
 def test_xfeat_s_blocks_have_vectors(tmp_path: Path) -> None:
     # Proves the adapter on the other contract, and that the two are told apart by their signatures. Oracle: shapes.
     file = tiny.xfeat(tmp_path / "xfeat.onnx")
-    features = DensePointMatcher(open_session(file, contracts.XFEAT)).describe(views.texture(0, (128, 96)))
+    features = DensePointMatcher(session=open_session(file, contracts.XFEAT)).describe(views.texture(0, (128, 96)))
     assert features.descriptors.vectors.shape == (len(features), 64)
     assert len(features) > 20
-    with pytest.raises(NetworkFileError, match="it looks like a file of `xfeat`"):
+    with raises("xfeat", error=NetworkFileError):
         open_session(file, contracts.ALIKE)
 
 
@@ -143,13 +144,11 @@ def test_encoder_and_decoder_must_be_of_one_size(tmp_path: Path) -> None:
     # Proves that halves of two different exports are refused before any image. Oracle: their sizes and channels.
     decoder = open_session(tiny.mast3r_decoder(tmp_path / "decoder.onnx", SIZE), contracts.MAST3R_DECODER)
     small = open_session(tiny.mast3r_encoder(tmp_path / "small.onnx", (48, 64)), contracts.MAST3R_ENCODER)
-    with pytest.raises(
-        NetworkFileError, match=r"small.onnx` takes images of \[48, 64\].*decoder.onnx` gives \[240, 320"
-    ):
+    with raises("small.onnx", "[48, 64]", "decoder.onnx", "[240, 320", error=NetworkFileError):
         Mast3rMatcher(small, decoder)
     features = {"features": np.zeros((1, 300, 9))}
     other = tiny.constant(tmp_path / "other.onnx", "mast3r_encoder", {"image": (1, 3, *SIZE)}, features)
-    with pytest.raises(NetworkFileError, match=r"gives 9 channels and .* takes 768"):
+    with raises(9, 768, error=NetworkFileError):
         Mast3rMatcher(open_session(other, contracts.MAST3R_ENCODER), decoder)
 
 
@@ -220,7 +219,7 @@ def test_attention_that_is_no_share_is_refused(
         return {**found, "attention": np.full_like(found["attention"], attention)}
 
     monkeypatch.setattr(Session, "run", changed)
-    with pytest.raises(NetworkValueError, match=rf"dinov3.onnx` gave an `attention` of {attention:.3g} to"):
+    with raises("dinov3.onnx", "attention", f"{attention:.3g}", error=NetworkValueError):
         replace(role, cache=MemoryCache()).confidence(image)
 
 
@@ -342,11 +341,11 @@ def test_a_full_disk_costs_the_answer_s_place_only(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("vggtgeo.models.onnx.cache.os.fsync", full)
+    monkeypatch.setattr("vggtgeo.io.files.os.fsync", full)
     cache = FolderCache(tmp_path / "cache")
     compute, calls = _counted({"a": np.arange(5.0)})
     ask = lambda: cache.get((session,), (), (), compute)["a"]
-    with pytest.warns(UserWarning, match=r"cannot be kept in `.*cache` \(No space left on device\)"):
+    with warns(tmp_path / "cache", "No space left on device", warning=UserWarning):
         np.testing.assert_array_equal(ask(), np.arange(5.0))
     np.testing.assert_array_equal(ask(), np.arange(5.0))  # of which no other warning tells: that would be an error
     assert len(calls) == 2

@@ -14,6 +14,7 @@ import onnx
 import pytest
 import tiny_networks as tiny
 from onnx import TensorProto, helper
+from reported import raises
 from vggtgeo.models.onnx import contracts, patience, providers
 from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
 from vggtgeo.models.onnx.graph_bytes import external_files
@@ -50,7 +51,7 @@ def test_a_file_is_taken_for_its_own_network_only(files: dict[str, Path], asked:
         session.warm_up()
         assert session.random_weights
         return
-    with pytest.raises(NetworkFileError, match=f"is not a file of `{asked}`.*expected .*found .*`{given}`$"):
+    with raises(files[given], asked, given, error=NetworkFileError):
         open_session(files[given], contracts.CONTRACTS[asked])
 
 
@@ -79,20 +80,18 @@ def test_an_operator_that_is_not_known_is_named(
     opsets = [helper.make_opsetid("", 17), *([helper.make_opsetid(domain, 1)] if domain and imported else [])]
     graph = helper.make_graph([node], "tiny", [value("image")], [value("y")])
     onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=9), tmp_path / "net.onnx")
-    with pytest.raises(
-        NetworkFileError, match=rf"net.onnx` uses the operator `{named}`, which onnxruntime \S+ does not"
-    ):
+    with raises("net.onnx", *named.split(":"), error=NetworkFileError):
         read_signature(tmp_path / "net.onnx")
 
 
-@pytest.mark.parametrize(("opset", "layout", "named"), [(99, 9, r"\(opset of ai.onnx\) 99"), (17, 99, r"\(IR\) 99")])
-def test_a_newer_file_is_no_damaged_one(opset: int, layout: int, named: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("opset", "layout", "named"), [(99, 9, 99), (17, 99, 99)])
+def test_a_newer_file_is_no_damaged_one(opset: int, layout: int, named: int, tmp_path: Path) -> None:
     """What is newer is named, with the newest that is known, as fetching it again would mend nothing."""
     value = lambda name: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3])
     graph = helper.make_graph([helper.make_node("Relu", ["image"], ["y"])], "tiny", [value("image")], [value("y")])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=layout)
     onnx.save(model, tmp_path / "net.onnx")
-    with pytest.raises(NetworkFileError, match=rf"{named}, and onnxruntime \S+ reads up to \d+; export it again"):
+    with raises("net.onnx", named, error=NetworkFileError):
         read_signature(tmp_path / "net.onnx")
 
 
@@ -116,31 +115,30 @@ def _folder(path: Path) -> None:
 
 
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
-    "missing": (Path.unlink, "is not there, expected an ONNX file"),
-    "folder": (_folder, "is a folder, expected an ONNX file"),
-    "empty": (lambda path: path.write_bytes(b""), "is empty, expected an ONNX file"),
-    "truncated": (_truncated, "bytes that are cut off or something else"),
+    "missing": (Path.unlink, "not there"),
+    "folder": (_folder, "folder"),
+    "empty": (lambda path: path.write_bytes(b""), "empty"),
+    "truncated": (_truncated, "onnxruntime"),
     "picture": (
         lambda path: path.write_bytes(b"\xff\xd8\xff\xe0" + bytes(100)),
-        "bytes that are cut off or something else",
+        "onnxruntime",
     ),
-    "checkpoint": (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)), "PyTorch checkpoint: export it first"),
+    "checkpoint": (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)), "vggtgeo models export"),
     "lfs": (lambda path: path.write_bytes(b"version https://git-lfs.github.com/spec/v1\n"), "git lfs pull"),
     "page": (lambda path: path.write_bytes(b"<!DOCTYPE html><html>"), "a web page"),
-    "no external data": (_without_data, r"in `vggt\.onnx\.data`, which is not there"),
-    "half its external data": (_with_half_its_data, r"are cut off: found \d+ bytes, expected \d+ or more"),
+    "no external data": (_without_data, "vggt.onnx.data"),
+    "half its external data": (_with_half_its_data, "onnxruntime"),
 }
 
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_file_is_refused_by_what_is_wrong_with_it(tmp_path: Path, case: str) -> None:
-    # Proves that nothing but a whole ONNX file opens, and that the message says why. Oracle: how it was broken.
-    spoil, message = BROKEN[case]
+    # Proves that only a whole ONNX file opens, and that the error names it and the fault. Oracle: how it was broken.
+    spoil, named = BROKEN[case]
     path = tiny.vggt(tmp_path / "vggt.onnx")
     spoil(path)
-    with pytest.raises(NetworkFileError, match=message) as caught:
+    with raises(path, named, error=NetworkFileError) as caught:
         open_session(path, contracts.VGGT)
-    assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -209,14 +207,14 @@ def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     path = tiny.constant(tmp_path / "letr.onnx", "letr", {"image": (1, 3, 28, 42)}, outputs)
     session = open_session(path, contracts.LETR)
     for attempt in (lambda: session.run({"image": np.zeros((1, 3, 28, 42))}), session.warm_up):
-        with pytest.raises(NetworkRunError, match="1 of 2 values of `pred_logits` that are not finite"):
+        with raises("pred_logits", "1 of 2", error=NetworkRunError):
             attempt()
 
 
 def test_a_wrong_input_is_an_error_of_the_network(files: dict[str, Path]) -> None:
     # Proves that what onnxruntime raises at run time names the file. Oracle: an image of a wrong size.
     session = open_session(files["letr"], contracts.LETR)
-    with pytest.raises(NetworkRunError, match=r"letr\.onnx` failed on cpu"):
+    with raises("letr.onnx", "cpu", error=NetworkRunError):
         session.run({"image": np.zeros((1, 3, 28, 43))})
 
 
@@ -229,7 +227,7 @@ def test_a_loop_without_end_is_ended_and_told(
     monkeypatch.setattr(patience, "LONGEST", 0.3)
     monkeypatch.setattr(patience, "_EVERY", 0.05)
     session = open_session(tiny.endless(tmp_path / "endless.onnx"), contracts.LETR)
-    with pytest.raises(NetworkRunError, match=r"endless\.onnx` gave no answer within .* s and was ended: a loop"):
+    with raises("endless.onnx", error=NetworkRunError):
         session.run({"image": np.zeros((1, 3, 28, 42))})
     assert "endless.onnx` has not answered for" in caplog.text
     other = open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
@@ -264,11 +262,9 @@ def test_an_answer_of_other_sizes_is_an_error_of_the_network(tmp_path: Path) -> 
     path = tiny.save(tmp_path / "vggt.onnx", nodes, {"images": ("n", 3, "h", "w")}, shapes, values)
     session = open_session(path, contracts.VGGT)
     assert session.run({"images": np.zeros((2, 3, 28, 42))})["depth"].shape == (2, 28, 42)
-    with pytest.raises(
-        NetworkRunError, match="other sizes than those of `vggt`: views is 3 in `images` and 2 in `pose"
-    ):
+    with raises("vggt", "images", 3, "pose_enc", 2, error=NetworkRunError):
         session.run({"images": np.zeros((3, 3, 28, 42))})
-    with pytest.raises(NetworkRunError, match="H is 14 in `images` and 28 in `depth`"):
+    with raises("images", 14, "depth", 28, error=NetworkRunError):
         session.run({"images": np.zeros((2, 3, 14, 42))})
 
 

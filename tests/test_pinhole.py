@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from vggtgeo.models import pinhole
+
+from vggtgeo.geometry import pinhole
 
 INTRINSICS = (525.0, 510.0, 318.5, 241.0)
 

@@ -9,6 +9,8 @@ from types import ModuleType
 import jax
 import numpy as np
 import pytest
+from changed_file import read, with_arrays
+from reported import raises
 from scenes import INTRINSICS, Scene, make_scene
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
@@ -63,7 +65,7 @@ def test_a_file_is_the_problem(tmp_path: Path) -> None:
 @pytest.mark.parametrize("missing", LAYOUT)
 def test_a_missing_array_is_named(tmp_path: Path, missing: str) -> None:
     # Proves that each required array is asked for by name, with where the layout is written.
-    with pytest.raises(InputError, match=rf"lacks the arrays {missing}; .*docs/reference/problem-file.md"):
+    with raises("problem.npz", missing, "docs/reference/problem-file.md"):
         load_problem(write(tmp_path, **{missing: None}))
 
 
@@ -78,9 +80,9 @@ def test_what_is_no_problem_file(tmp_path: Path) -> None:
     good = write(tmp_path).read_bytes()
     for name, content in {"empty.npz": b"", "cut.npz": good[:200], "text.npz": b"a picture of a cat"}.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match=name):
+        with raises(name):
             load_problem(tmp_path / name)
-    with pytest.raises(InputError, match="is no file"):
+    with raises("absent.npz"):
         load_problem(tmp_path / "absent.npz")
     for name, value in {
         "T_init": np.zeros((3, 4)),
@@ -88,7 +90,7 @@ def test_what_is_no_problem_file(tmp_path: Path) -> None:
         "k_init": np.ones(3),
         "d_prior": np.full(27, "far"),
     }.items():
-        with pytest.raises(InputError, match=name):
+        with raises(name):
             load_problem(write(tmp_path, **{name: value}))
 
 
@@ -103,12 +105,12 @@ def test_numbers_beyond_single_precision_are_refused(tmp_path: Path) -> None:
     for changes in ({"huber": np.float64(1e-50)}, {"T_init": far, **given}):
         file = write(tmp_path, **changes)
         load_problem(file)
-        with pytest.raises(InputError, match=r"problem.npz`: `(huber|poses\[1, 4\])` is .*; float32 holds numbers"):
+        with raises("problem.npz", "huber" if "huber" in changes else "poses[1, 4]", "float32"):
             load_problem(file, np.float32)
     saved = tmp_path / "saved.npz"
     save_problem(saved, *replace(SCENE.with_observations(**coarse), start_poses=far).pack())
     load_problem(saved)
-    with pytest.raises(InputError, match=r"`state/poses/wxyz_xyz\[1, 4\]` is 1e\+60; float32 holds numbers from"):
+    with raises("state.poses", "[1, 4]", "1e+60", "float32"):
         load_problem(saved, np.float32)
 
 
@@ -144,7 +146,7 @@ DAMAGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "halves": lambda array: array + 0.5,
 }
 OF_NUMBERS = ("numbers beyond the last", "numbers below zero", "halves")
-NOT_COUNTED = ("index/edge: a row too few",)
+NOT_COUNTED = ("index.edge: a row too few",)
 """Edges that are given, in the rows that are stored: fewer may be given."""
 
 
@@ -154,17 +156,16 @@ def test_a_saved_problem_that_was_cut_or_renumbered_is_refused(tmp_path: Path) -
     # file with each damage, all of which make another problem or none, and all of which are named.
     problem, state, index = SCENE.pack()
     save_problem(tmp_path / "whole.npz", problem.with_term(no_prior(problem.num_keyframes)), state, index)
-    with np.load(tmp_path / "whole.npz") as opened:
-        arrays = dict(opened)
+    _, arrays = read(tmp_path / "whole.npz")
     refused: list[str] = []
     taken: list[str] = []
-    for name in sorted(arrays.keys() - {"description"}):
+    for name in sorted(arrays):
         for damage, change in DAMAGES.items():
             whole = arrays[name].dtype.kind in "iu"
             least = 2 if "column" in damage or "axis" in damage else 1
             if arrays[name].ndim < (0 if damage in OF_NUMBERS else least) or (damage in OF_NUMBERS and not whole):
                 continue
-            np.savez(tmp_path / "cut.npz", **{**arrays, name: change(arrays[name])})
+            with_arrays(tmp_path / "whole.npz", lambda old: old.update({name: change(old[name])}), tmp_path / "cut.npz")  # noqa: B023
             try:
                 load_problem(tmp_path / "cut.npz")
                 taken.append(f"{name}: {damage}")

@@ -13,7 +13,7 @@ from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.view import View
-from vggtgeo.geometry.cameras import MIN_RELATIVE_DEPTH, Pinhole
+from vggtgeo.geometry.camera_models import MIN_RELATIVE_DEPTH, Pinhole
 
 POSES = make_scene().poses
 PIXEL, DEPTH = np.array([71.5, 180.25]), 2.6

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vggtgeo.models import pinhole
 from vggtgeo.models.classical import EpipolarVerifier, PnpGeometry, SampleOrder, SiftMatcher, TwoViewStart
 from vggtgeo.models.roles import PoseQuery
 
 import vggtgeo as vg
+from vggtgeo.geometry import pinhole
 
 K = np.array([400.0, 400.0, 320.0, 240.0])
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import re
-import zipfile
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
@@ -16,7 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from changed_file import with_header
 from recorded_run import ROLES, SETTINGS, recorded_run
+from reported import raises
 from same_leaves import differences
 from vggtgeo.models.roles import LineMatches
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
@@ -24,8 +23,7 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 from vggtgeo.bundle.marginalisation import no_prior
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.record_file import DATA, HEADER, Layout
-from vggtgeo.io.records import by_name
+from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pending_window import settled
@@ -151,10 +149,10 @@ class Box:
     content: Any
 
 
-BOX = Layout("box", 2, by_name([Box]))
+BOX = Format("box", 2, by_name([Box]))
 VALUES: dict[str, Any] = {
     "floats": (0.1, -0.0, 1e-320, float("inf"), -float("inf"), float("nan"), 2**70, -1, True, None, "ü\ud800"),
-    "containers": ([1, (2, [])], {"a": {}, "b": ()}, (), b"", b"\x00\xff", np.dtype(np.float16), Box),
+    "containers": ([1, (2, [])], {"a": {}, "b": ()}, (), b"", b"\x00\xff", np.array(["a", "bc"]), Box),
     "scalars": (np.float64(0.1), np.float32(np.nan), np.int16(-3), np.bool_(True)),
     "orders": tuple(
         np.arange(120.0).reshape(4, 5, 6)[view]
@@ -173,29 +171,12 @@ def test_any_value_comes_back(name: str, tmp_path: Path) -> None:
     assert facts == BOX.facts(tmp_path / "box") == {"why": name}
 
 
-@pytest.mark.parametrize("value", [object(), {1: 2}, np.array(["a"]), np.array([None]), Evidence(), Keyframe])
+@pytest.mark.parametrize("value", [object(), {1: 2}, np.array([None]), Evidence(), Keyframe])
 def test_what_is_not_listed_is_not_written(value: Any, tmp_path: Path) -> None:
     """A class that nobody listed ends the writing with the way to it, and leaves no file; oracle: the error."""
-    with pytest.raises(TypeError, match=r"`value\.content.*no file of states can hold"):
+    with raises("content[1]", error=TypeError):
         BOX.write(tmp_path / "box", Box((1, value)))
     assert not list(tmp_path.iterdir())
-
-
-def rewritten(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
-    """The file with another header."""
-    with zipfile.ZipFile(path) as archive:
-        members = {info.filename: archive.read(info) for info in archive.infolist()}
-    text = members[f"{HEADER}.npy"]
-    header = json.loads(text[text.index(b"\n") + 1 :])
-    values = np.frombuffer(json.dumps(change(header) or header).encode(), np.uint8)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in members.items():
-            with archive.open(name, "w") as member:
-                if name == f"{HEADER}.npy":
-                    np.lib.format.write_array(member, values)
-                else:
-                    member.write(data)
-    return path
 
 
 def box(tmp_path: Path, value: Any = 1.5) -> Path:
@@ -203,24 +184,27 @@ def box(tmp_path: Path, value: Any = 1.5) -> Path:
     return tmp_path / "box"
 
 
+NAME = "content[0]"
 BAD_HEADERS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
-    "another kind": (lambda h: h.update(vggtgeo="state"), "is a state; expected a box"),
-    "a later version": (lambda h: h.update(version=3), "is a box of version 3; this program reads version 2"),
-    "a version that is a list": (lambda h: h.update(version=[]), "is no box that vggtgeo wrote"),
-    "facts that are none": (lambda h: h.update(facts=5), "is no box that vggtgeo wrote"),
-    "no version": (lambda h: h.pop("version"), "is no box that vggtgeo wrote"),
-    "no object": (lambda h: ["text"], "is no box that vggtgeo wrote"),
-    "an unknown class": (lambda h: h["classes"].append(["Popen", []]), "holds a `Popen`, which this version"),
-    "a field less": (lambda h: h["classes"][0][1].clear(), r"`Box` has the fields \['content'\]; the file has \[\]"),
-    "beyond the data": (lambda h: h["arrays"][0].__setitem__(1, 8), "array 0 reaches beyond the 24 bytes"),
-    "before the data": (lambda h: h["arrays"][0].__setitem__(1, -8), "was changed since: array 0 has the place -8"),
-    "a huge shape": (lambda h: h["arrays"][0].__setitem__(2, [2**62]), "array 0 reaches beyond the 24 bytes"),
-    "objects": (lambda h: h["arrays"][0].__setitem__(0, "|O"), r"holds an array of '\|O'; expected numbers"),
-    "a record": (lambda h: h["arrays"][0].__setitem__(0, "(,)f8"), r"an array of '\(,\)f8'; expected numbers"),
-    "numbers of 3 bytes": (lambda h: h["arrays"][0].__setitem__(0, "<f3"), "is no box that vggtgeo wrote"),
-    "wide strides": (lambda h: h["arrays"][0].__setitem__(3, [2**40]), "of 24 bytes is spread over"),
-    "a sign of nothing": (lambda h: h.update(tree={"x": 1}), "'x', which means nothing"),
-    "too deep": (lambda h: h.update(tree=None) or _deep(h), "is no box that vggtgeo wrote"),
+    "another kind": (lambda h: h.update(vggtgeo="state"), "state"),
+    "a later version": (lambda h: h.update(version=3), "3"),
+    "an earlier version": (lambda h: h.update(version=0), "0"),
+    "a version that is a list": (lambda h: h.update(version=[]), "[]"),
+    "facts that are a number": (lambda h: h.update(facts=5), "int"),
+    "no version": (lambda h: h.pop("version"), "version"),
+    "no object": (lambda h: ["text"], "header"),
+    "an unknown class": (lambda h: h["classes"].append(["Popen", []]), "Popen"),
+    "a field less": (lambda h: h["classes"][0][1].clear(), "['content']"),
+    "beyond the data": (lambda h: h["arrays"][NAME].__setitem__(1, 8), NAME),
+    "before the data": (lambda h: h["arrays"][NAME].__setitem__(1, -8), "-8"),
+    "a huge shape": (lambda h: h["arrays"][NAME].__setitem__(2, [2**62]), NAME),
+    "objects": (lambda h: h["arrays"][NAME].__setitem__(0, "|O"), "|O"),
+    "a record": (lambda h: h["arrays"][NAME].__setitem__(0, "(,)f8"), "(,)f8"),
+    "numbers of 3 bytes": (lambda h: h["arrays"][NAME].__setitem__(0, "<f3"), "f3"),
+    "wide strides": (lambda h: h["arrays"][NAME].__setitem__(3, [2**40]), NAME),
+    "an unknown token": (lambda h: h.update(tree={"x": 1}), "'x'"),
+    "too deep": (lambda h: h.update(tree=None) or _deep(h), "recursion"),
+    "no array": (lambda h: h["arrays"].clear(), NAME),
 }  # fmt: skip
 
 
@@ -231,42 +215,31 @@ def _deep(header: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", BAD_HEADERS)
 def test_a_header_that_is_wrong(name: str, tmp_path: Path) -> None:
-    """One sentence with the file's name says what is wrong; oracle: the sentence."""
-    change, sentence = BAD_HEADERS[name]
-    path = rewritten(box(tmp_path), change)
-    with pytest.raises(InputError, match=sentence) as caught:
-        BOX.read(path)
-    assert str(path) in str(caught.value)
-
-
-def test_another_version_is_refused(tmp_path: Path) -> None:
-    """A file of another layout is not guessed at. Oracle: both versions are named."""
-    path = box(tmp_path)
-    rewritten(path, lambda header: header.update(version=0))
-    with pytest.raises(InputError, match=r"version 0\b.*\b2\b"):
+    """An invalid header is an error that names the file and the value; oracle: the table."""
+    change, named = BAD_HEADERS[name]
+    path = with_header(box(tmp_path), change)
+    with raises(path, named):
         BOX.read(path)
 
 
 def test_files_that_are_no_states(tmp_path: Path) -> None:
-    """Missing, foreign, packed, cut off: one sentence; oracle: the sentence."""
+    """A file that is missing, foreign, compressed or truncated is an error that names it; oracle: the name."""
     path = tmp_path / "box"
-    with pytest.raises(InputError, match="is no file; give"):
+    with raises(path):
         BOX.read(path)
     path.write_bytes(b"text")
-    with pytest.raises(InputError, match="is damaged, or no file of a box"):
+    with raises(path):
         BOX.read(path)
     np.savez(path.with_suffix(".npz"), description=np.zeros(3))
-    with pytest.raises(InputError, match="expected a header and its data"):
+    with raises(path.with_suffix(".npz"), "header", "data"):
         BOX.read(path.with_suffix(".npz"))
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in (HEADER, DATA):
-            archive.writestr(f"{name}.npy", b"0" * 1000)
-    with pytest.raises(InputError, match="`header` is compressed"):
+    replace(BOX, compressed=True).write(path, Box(np.zeros(1000)))
+    with raises(path):
         BOX.read(path)
     whole = box(tmp_path).read_bytes()
     for end in range(0, len(whole), 37):
         path.write_bytes(whole[:end])
-        with pytest.raises(InputError):
+        with raises(path):
             BOX.read(path)
 
 
@@ -304,56 +277,54 @@ def _cut(slots: Slots) -> Slots:
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("change", "named"),
     [
-        (lambda slam: replace(slam, window=replace(slam.window, members=(7,))), "names keyframes that are not there"),
-        (lambda slam: replace(slam, map=replace(slam.map, keyframes=())), "names keyframes that are not there"),
-        (lambda slam: _camera(slam, intrinsics=np.ones(3)), "`intrinsics` has shape [3], expected [4]"),
-        (lambda slam: _camera(slam, given=-slam.intrinsics), "expected positive pixels"),
-        (lambda slam: _first(slam, number=1), "not numbered one after the other"),
-        (lambda slam: _first(slam, pose=2.0 * np.eye(4)), "`pose` is not a rigid motion"),
-        (lambda slam: _first(slam, pose=np.full((4, 4), np.nan)), "`pose` has 16 values that are not finite"),
-        (lambda slam: _first(slam, points=_cut(slam.keyframes[0].points)), "`pixels of points` has shape"),
-        (lambda slam: _first(slam, samples=_cut(slam.keyframes[0].samples)), "`pixels of samples` has shape"),
-        (lambda slam: _first(slam, sample_segment=slam.keyframes[0].sample_segment + 10_000), "`sample_segment` has"),
-        (lambda slam: _first(slam, line_depths=np.zeros((0, 2))), "`line_depths` has shape"),
+        (lambda slam: replace(slam, window=replace(slam.window, members=(7,))), "keyframes"),
+        (lambda slam: replace(slam, map=replace(slam.map, keyframes=())), "keyframes"),
+        (lambda slam: _camera(slam, intrinsics=np.ones(3)), "intrinsics"),
+        (lambda slam: _camera(slam, given=-slam.intrinsics), "given"),
+        (lambda slam: _first(slam, number=1), "number"),
+        (lambda slam: _first(slam, pose=2.0 * np.eye(4)), "pose"),
+        (lambda slam: _first(slam, pose=np.full((4, 4), np.nan)), "pose"),
+        (lambda slam: _first(slam, points=_cut(slam.keyframes[0].points)), "pixels of points"),
+        (lambda slam: _first(slam, samples=_cut(slam.keyframes[0].samples)), "pixels of samples"),
+        (lambda slam: _first(slam, sample_segment=slam.keyframes[0].sample_segment + 10_000), "sample_segment"),
+        (lambda slam: _first(slam, line_depths=np.zeros((0, 2))), "line_depths"),
         (
             lambda slam: _first(slam, images=replace(slam.keyframes[0].images, depth=np.zeros((2, 2), np.float16))),
-            "expected four of one size",
+            "depth",
         ),
         (
             lambda slam: replace(
                 slam, map=replace(slam.map, pairs=(replace(slam.map.pairs[0], second=9), *slam.map.pairs[1:]))
             ),
-            "names keyframes that are not there",
+            "keyframes",
         ),
-        (lambda slam: _last(slam, seen=SeenPoints(np.array([99_999], np.int32), np.ones((1, 2)))), "`slots` has the"),
-        (lambda slam: _last(slam, seen=SeenPoints(np.zeros(2, np.int32), np.ones((1, 2)))), "`pixels` has shape"),
-        (lambda slam: _last(slam, arrival=(9, np.eye(4))), "names keyframes that are not there"),
-        (lambda slam: Evidence(), "holds a Evidence; expected the state of a run"),
+        (lambda slam: _last(slam, seen=SeenPoints(np.array([99_999], np.int32), np.ones((1, 2)))), "slots"),
+        (lambda slam: _last(slam, seen=SeenPoints(np.zeros(2, np.int32), np.ones((1, 2)))), "pixels"),
+        (lambda slam: _last(slam, arrival=(9, np.eye(4))), "keyframes"),
+        (lambda slam: Evidence(), "Evidence"),
     ],
 )
-def test_states_whose_parts_do_not_belong_together(
-    tmp_path: Path, change: Callable[[Slam], Any], sentence: str
-) -> None:
-    """A file of parts that do not fit is refused, not found at the end of a run; oracle: the sentence."""
+def test_states_whose_parts_do_not_belong_together(tmp_path: Path, change: Callable[[Slam], Any], named: str) -> None:
+    """A state with inconsistent parts is refused when it is read; oracle: what the error names."""
     STATE.write(tmp_path / "state.npz", change(recorded_run().slam))
-    with pytest.raises(InputError, match=re.escape(sentence)):
+    with raises("state.npz", named):
         load_state(tmp_path / "state.npz")
 
 
 def test_matches_of_key_points_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    """Rows of matches are looked at, those of points and those of lines; oracle: the sentence."""
+    """Matches of points and of lines with rows that do not exist are refused; oracle: what the error names."""
     slam = recorded_run().slam
     pair = slam.map.pairs[0]
     points = replace(pair.points, index_j=pair.points.index_j + 10_000)
     lines = LineMatches(np.array([0]), np.array([10_000]), np.array([1.0]))
-    for wrong, sentence in (
+    for wrong, named in (
         (replace(pair, points=points), "index_j of points"),
         (replace(pair, lines=lines), "of lines"),
     ):
         STATE.write(tmp_path / "state.npz", replace(slam, map=replace(slam.map, pairs=(wrong, *slam.map.pairs[1:]))))
-        with pytest.raises(InputError, match=sentence):
+        with raises("state.npz", named):
             load_state(tmp_path / "state.npz")
 
 
@@ -372,7 +343,7 @@ def test_a_damaged_image_of_a_keyframe_is_told(tmp_path: Path) -> None:
         images = replace(small.images, **{name: replace(getattr(small.images, name), **wrong)})
         keyframes = (replace(small, images=images), *slam.keyframes[1:])
         STATE.write(tmp_path / "state.npz", replace(slam, map=replace(slam.map, keyframes=keyframes)))
-        with pytest.raises(InputError, match=rf"`.*state.npz` .* the {name} of keyframe 0 "):
+        with raises("state.npz", f"{name} of keyframe 0"):
             load_state(tmp_path / "state.npz")
 
 

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
-from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery, Segments
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock

@@ -1,10 +1,10 @@
 """Camera models: how a point in front of a camera becomes a pixel."""
 
-from vggtgeo.geometry.cameras import AbstractCamera as AbstractCamera
-from vggtgeo.geometry.cameras import KannalaBrandt as KannalaBrandt
-from vggtgeo.geometry.cameras import Pinhole as Pinhole
-from vggtgeo.geometry.cameras import RadialTangential as RadialTangential
-from vggtgeo.geometry.cameras import SquareKannalaBrandt as SquareKannalaBrandt
-from vggtgeo.geometry.cameras import SquarePinhole as SquarePinhole
-from vggtgeo.geometry.cameras import SquarePixels as SquarePixels
-from vggtgeo.geometry.cameras import SquareRadialTangential as SquareRadialTangential
+from vggtgeo.geometry.camera_models import AbstractCamera as AbstractCamera
+from vggtgeo.geometry.camera_models import KannalaBrandt as KannalaBrandt
+from vggtgeo.geometry.camera_models import Pinhole as Pinhole
+from vggtgeo.geometry.camera_models import RadialTangential as RadialTangential
+from vggtgeo.geometry.camera_models import SquareKannalaBrandt as SquareKannalaBrandt
+from vggtgeo.geometry.camera_models import SquarePinhole as SquarePinhole
+from vggtgeo.geometry.camera_models import SquarePixels as SquarePixels
+from vggtgeo.geometry.camera_models import SquareRadialTangential as SquareRadialTangential

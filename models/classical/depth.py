@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_array, check_image
+from vggtgeo.models.checks import check_array, check_fields, check_image
 from vggtgeo.models.roles import DepthEstimate
 
 
@@ -38,14 +38,8 @@ class SensorDepth:
     reach: int = 2
 
     def __post_init__(self) -> None:
-        if not 0 <= self.nearest < self.farthest:
-            raise ValueError(
-                f"`nearest` is {self.nearest} m and `farthest` {self.farthest} m, expected 0 <= nearest < farthest"
-            )
-        if self.floor < 0 or not self.edge > 0 or self.reach < 0:
-            raise ValueError(
-                "`floor` and `reach` must not be negative and `edge` must be positive; correct the settings"
-            )
+        check_fields(self, nearest="[0, inf)", farthest=f"({self.nearest}, inf)")
+        check_fields(self, floor="[0, inf)", edge="(0, inf)", reach="[0, inf)")
 
     def estimate(
         self,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_array, check_image
+from vggtgeo.models.checks import check_array, check_fields, check_image
 from vggtgeo.models.classical.sub_pixel import patch_correlation
 
 
@@ -32,15 +32,7 @@ class PatchFlow:
     similarity: float = 0.8
 
     def __post_init__(self) -> None:
-        if self.window < 5 or self.levels < 0:
-            raise ValueError(
-                f"`window` is {self.window} and `levels` {self.levels}, expected at least 5 and at least 0"
-            )
-        if not self.round_trip > 0 or not -1 <= self.similarity < 1:
-            raise ValueError(
-                f"`round_trip` is {self.round_trip} and `similarity` {self.similarity}, "
-                "expected a positive number of pixels and a correlation in [-1, 1)"
-            )
+        check_fields(self, window="[5, inf)", levels="[0, inf)", round_trip="(0, inf)", similarity="[-1, 1)")
 
     def follow(
         self, image_i: np.ndarray, image_j: np.ndarray, pixels: np.ndarray, expected: np.ndarray

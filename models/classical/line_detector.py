@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_image
+from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.roles import Segments
 
 _SCALE = 0.8
@@ -27,11 +27,7 @@ class LsdDetector:
     count: int = 200
 
     def __post_init__(self) -> None:
-        if not self.shortest > 0 or self.count < 0:
-            raise ValueError(
-                f"`shortest` is {self.shortest} and `count` {self.count}, "
-                "expected a positive number of pixels and a count that is not negative"
-            )
+        check_fields(self, shortest="(0, inf)", count="[0, inf)")
 
     def detect(self, image: np.ndarray) -> Segments:
         """Segments of `image` (uint8 [H, W, 3]), longest first; none on a blank image."""

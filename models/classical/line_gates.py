@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from vggtgeo.models import pinhole
 from vggtgeo.models.classical.line_geometry import line_coefficients
 from vggtgeo.models.roles import RelativeView
+
+from vggtgeo.geometry import pinhole
 
 
 def allowed_pairs(

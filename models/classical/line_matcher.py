@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_image
+from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.line_gates import allowed_pairs
 from vggtgeo.models.classical.nearest import mutual_nearest
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
@@ -35,12 +35,7 @@ class BandLineMatcher:
     overlap: float = 0.3
 
     def __post_init__(self) -> None:
-        if self.bands < 2 or self.width < self.bands // 2:
-            raise ValueError(
-                f"`bands` is {self.bands} and `width` {self.width}, expected bands >= 2 and width >= bands / 2"
-            )
-        if not 0 < self.ratio <= 1:
-            raise ValueError(f"`ratio` is {self.ratio}, expected a value in (0, 1]; 0.9 is usual")
+        check_fields(self, bands="[2, inf)", width=f"[{self.bands // 2}, inf)", ratio="(0, 1]")
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
         """Band descriptors float32 [L, 8 * bands], of unit length, of `segments` in `image`."""

@@ -14,8 +14,9 @@ from itertools import permutations, product
 
 import cv2
 import numpy as np
-from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_array
+
+from vggtgeo.geometry import pinhole
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +61,7 @@ class ManhattanEstimator:
         planes = _Planes.of(endpoints, np.asarray(intrinsics, float))
         start = _search(planes, np.sin(self.gate)) if predicted is None else predicted
         rotation = np.array(start, float)
+        # Not `gauss_newton`: segments change their axis between steps, so that no energy must fall.
         for _ in range(10):
             fit = self._fit(rotation, planes)
             weight = fit.near / (fit.sigma**2 + fit.off**2)  # Cauchy, one deviation wide

@@ -2,38 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_image
 from vggtgeo.models.classical.key_points import spread
-from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, match_pixels
-from vggtgeo.models.classical.sub_pixel import PatchAlignment
-from vggtgeo.models.classical.verification import EpipolarVerifier
-from vggtgeo.models.roles import Features, PointMatches
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher
+from vggtgeo.models.roles import Features
 
 
 @dataclass(frozen=True)
-class OrbMatcher:
+class OrbMatcher(PixelMatcher):
     """ORB key points spread over the image, mutual Hamming matches, verified epipolar geometry.
 
-    count: most key points an image. ratio: largest ratio of the square roots of the best and the second-best Hamming
-    distance. radius, refinement: as for `SiftMatcher`.
+    ratio: maximum ratio of the square roots of the best and the second-best Hamming distance. Other fields:
+    `PixelMatcher`.
     """
-
-    count: int = 1500
-    ratio: float = 0.92
-    radius: float = 60.0
-    verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)
-    refinement: PatchAlignment | None = field(default_factory=PatchAlignment)
-
-    def __post_init__(self) -> None:
-        if self.count < 1:
-            raise ValueError(f"`count` is {self.count}, expected at least 1 key point an image")
-        if not 0 < self.ratio <= 1:
-            raise ValueError(f"`ratio` is {self.ratio}, expected a value in (0, 1]; 0.92 is usual")
 
     @cached_property
     def _orb(self) -> cv2.ORB:
@@ -50,10 +36,6 @@ class OrbMatcher:
         keep = spread(pixels, scores, self.count, gray.shape[::-1])
         bits = np.zeros((0, 32), np.uint8) if bits is None else bits[keep]
         return Features(pixels[keep], scores[keep], PixelDescriptors(_signs(bits), gray))
-
-    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """Verified matches from view i to view j; see `PointMatcher.match`."""
-        return match_pixels(features_i, features_j, self.ratio, self.verifier, self.refinement, predicted, self.radius)
 
 
 def _signs(bits: np.ndarray) -> np.ndarray:

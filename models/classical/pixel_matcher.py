@@ -1,11 +1,11 @@
-"""What SIFT and ORB share: from two sets of unit descriptors to verified matches."""
+"""Match key points by unit descriptors: shared by SIFT, ORB, ALIKE and XFeat."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from vggtgeo.models.checks import check_array
+from vggtgeo.models.checks import check_array, check_fields
 from vggtgeo.models.classical.nearest import exclude_far, mutual_nearest
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
@@ -14,10 +14,33 @@ from vggtgeo.models.roles import Features, PointMatches
 
 @dataclass(frozen=True)
 class PixelDescriptors:
-    """vectors: float32 [M, D] of unit length. gray: uint8 [H, W], the image they were seen in."""
+    """vectors: float32 [M, D] of unit length. gray: uint8 [H, W], their image."""
 
     vectors: np.ndarray
     gray: np.ndarray
+
+
+@dataclass(frozen=True)
+class PixelMatcher:
+    """Base of the `PointMatcher`s whose descriptors are `PixelDescriptors`.
+
+    count: maximum number of key points in an image. ratio: maximum ratio of the best to the second-best descriptor
+    distance. radius: maximum distance of a match from its predicted position, pixels, if there is a prediction.
+    refinement: sub-pixel alignment of the targets, or None.
+    """
+
+    count: int = 1500
+    ratio: float = 0.92
+    radius: float = 60.0
+    verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)
+    refinement: PatchAlignment | None = field(default_factory=PatchAlignment)
+
+    def __post_init__(self) -> None:
+        check_fields(self, count="[1, inf)", ratio="(0, 1]")
+
+    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
+        """Return verified matches from view i to view j; see `PointMatcher.match`."""
+        return match_pixels(features_i, features_j, self.ratio, self.verifier, self.refinement, predicted, self.radius)
 
 
 def match_pixels(
@@ -29,7 +52,7 @@ def match_pixels(
     predicted: np.ndarray | None = None,
     radius: float = np.inf,
 ) -> PointMatches:
-    """Mutual nearest neighbours that pass the ratio test and the verifier, refined where asked."""
+    """Return mutual nearest neighbours that pass the ratio test and the verifier, refined if `refinement` is given."""
     first: PixelDescriptors = features_i.descriptors
     second: PixelDescriptors = features_j.descriptors
     similarity = first.vectors @ second.vectors.T

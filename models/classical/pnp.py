@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models import pinhole
+from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.pose_refinement import refine_pose, residuals
 from vggtgeo.models.classical.sample_order import SampleOrder
 from vggtgeo.models.classical.two_view import TwoViewStart
 from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery, StartGuess
+
+from vggtgeo.geometry import pinhole
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,7 @@ class PnpGeometry:
     order: SampleOrder = field(default_factory=SampleOrder)
 
     def __post_init__(self) -> None:
-        if not self.threshold > 0:
-            raise ValueError(f"`threshold` is {self.threshold}, expected a positive number of pixels")
-        if self.least < 6:
-            raise ValueError(f"`least` is {self.least}, expected at least 6 points to determine a pose")
+        check_fields(self, threshold="(0, inf)", least="[6, inf)")
 
     def locate(self, query: PoseQuery) -> PoseGuess:
         """The pose of the query's frame; see `InitialGeometry.locate`."""

@@ -2,46 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_image
+from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.key_points import spread
-from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, match_pixels
-from vggtgeo.models.classical.sub_pixel import PatchAlignment
-from vggtgeo.models.classical.verification import EpipolarVerifier
-from vggtgeo.models.roles import Features, PointMatches
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher
+from vggtgeo.models.roles import Features
 
 
 @dataclass(frozen=True)
-class SiftMatcher:
+class SiftMatcher(PixelMatcher):
     """SIFT key points spread over the image, mutual RootSIFT matches, verified epipolar geometry.
 
-    count: most key points an image. contrast: detection threshold, smaller finds more (and fainter) points: 0.005 finds
-    twice the right matches on white walls, and takes nothing elsewhere.
-    ratio: largest ratio of the best to the second-best descriptor distance. radius: how far from its predicted
-    place a match may lie, pixels, where a prediction is given. area: an image of more pixels is shrunk to about so
-    many for detection, which bounds the cost; the refinement works at full resolution and makes up for it (at 640 x 480
-    almost half the time for the same trajectory error). refinement: sub-pixel alignment of the targets, or None.
+    contrast: detection threshold; a smaller one finds more and fainter points. area: maximum number of pixels for
+    detection; larger images are reduced, and the refinement at full resolution makes up for it (640 x 480: half the
+    time for the same trajectory error). Other fields: `PixelMatcher`.
     """
 
-    count: int = 1500
-    contrast: float = 0.005
     ratio: float = 0.85
-    radius: float = 60.0
-    verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)
+    contrast: float = 0.005
     area: int = 172_800
-    refinement: PatchAlignment | None = field(default_factory=PatchAlignment)
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise ValueError(f"`count` is {self.count}, expected at least 1 key point an image")
-        if not 0 < self.ratio <= 1:
-            raise ValueError(f"`ratio` is {self.ratio}, expected a value in (0, 1]; 0.85 is usual")
-        if self.area < 10_000:
-            raise ValueError(f"`area` is {self.area}, expected at least 10000 pixels; 172800 is usual")
+        super().__post_init__()
+        check_fields(self, area="[10000, inf)")
 
     @cached_property
     def _sift(self) -> cv2.SIFT:
@@ -60,10 +47,6 @@ class SiftMatcher:
         keep = spread(pixels, scores, self.count, gray.shape[::-1])
         vectors = np.zeros((0, 128), np.float32) if vectors is None else vectors[keep]
         return Features(pixels[keep], scores[keep], PixelDescriptors(_root(vectors), gray))
-
-    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """Verified matches from view i to view j; see `PointMatcher.match`."""
-        return match_pixels(features_i, features_j, self.ratio, self.verifier, self.refinement, predicted, self.radius)
 
 
 def _root(vectors: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_image
+from vggtgeo.models.checks import check_fields, check_image
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,7 @@ class StructureTensor:
     edges: float = 0.1
 
     def __post_init__(self) -> None:
-        if not (self.sigma > 0 and self.noise > 0 and self.edges >= 0):
-            raise ValueError(
-                f"`sigma` is {self.sigma}, `noise` {self.noise}, `edges` {self.edges}; "
-                "expected two positive numbers and one that is not negative"
-            )
+        check_fields(self, sigma="(0, inf)", noise="(0, inf)", edges="[0, inf)")
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         """Omega, float32 [H, W] in [0, 1], of `image` (uint8 [H, W, 3])."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from vggtgeo.models.checks import check_fields
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,7 @@ class PatchAlignment:
     similarity: float = 0.7
 
     def __post_init__(self) -> None:
-        if self.radius < 2 or self.steps < 1:
-            raise ValueError(f"`radius` is {self.radius} and `steps` {self.steps}, expected at least 2 and at least 1")
-        if not self.farthest > 0 or not -1 <= self.similarity < 1:
-            raise ValueError(
-                f"`farthest` is {self.farthest} and `similarity` {self.similarity}, "
-                "expected a positive number of pixels and a correlation in [-1, 1)"
-            )
+        check_fields(self, radius="[2, inf)", steps="[1, inf)", farthest="(0, inf)", similarity="[-1, 1)")
 
     def refine(
         self, gray_i: np.ndarray, gray_j: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray

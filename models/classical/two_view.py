@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from vggtgeo.models import pinhole
 from vggtgeo.models.checks import check_array
 from vggtgeo.models.classical.sample_order import SampleOrder
 from vggtgeo.models.roles import GeometryResult, StartGuess
+
+from vggtgeo.geometry import pinhole
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from vggtgeo.models import pinhole
+from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.sample_order import SampleOrder
+
+from vggtgeo.geometry import pinhole
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,7 @@ class EpipolarVerifier:
     order: SampleOrder = field(default_factory=SampleOrder)
 
     def __post_init__(self) -> None:
-        if not self.threshold > 0:
-            raise ValueError(f"`threshold` is {self.threshold}, expected a positive number of pixels")
-        if self.least < 8:
-            raise ValueError(f"`least` is {self.least}, expected at least 8, what a fundamental matrix needs")
+        check_fields(self, threshold="(0, inf)", least="[8, inf)")
 
     def inliers(self, pixels_i: np.ndarray, pixels_j: np.ndarray) -> np.ndarray:
         """Bool [m]: which of the matches float [m, 2] -> float [m, 2] agree. All False when there are too few."""

@@ -12,40 +12,27 @@ import cv2
 import numpy as np
 from vggtgeo.models.checks import check_image
 from vggtgeo.models.classical.key_points import spread
-from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, match_pixels
-from vggtgeo.models.classical.sub_pixel import PatchAlignment
-from vggtgeo.models.classical.verification import EpipolarVerifier
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 from vggtgeo.models.onnx.session import Session
-from vggtgeo.models.roles import Features, PointMatches
+from vggtgeo.models.roles import Features
 
 _RADIUS = 2
 """Pixels around a key point in which no other may be, as both networks are trained and published."""
 
 
 @dataclass(frozen=True, eq=False)
-class DensePointMatcher:
+class DensePointMatcher(PixelMatcher):
     """A `PointMatcher`. Key points: the local maxima of the score map, to a fraction of a pixel, spread over the image.
 
-    count: most key points an image. score: least score, in [0, 1]; ALIKE's authors take 0.2 and XFeat's 0.05, and less
-    keeps the faint ones of white walls. ratio, radius, refinement: as for `SiftMatcher`.
+    score: minimum score, in [0, 1]; the authors use 0.2 (ALIKE) and 0.05 (XFeat), and less keeps faint points of white
+    walls. Other fields: `PixelMatcher`.
     """
 
-    session: Session
+    session: Session = field(kw_only=True)
     cache: OutputCache = field(default_factory=MemoryCache)
-    count: int = 1500
     score: float = 0.02
-    ratio: float = 0.92
-    radius: float = 60.0
-    verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)
-    refinement: PatchAlignment | None = field(default_factory=PatchAlignment)
-
-    def __post_init__(self) -> None:
-        if self.count < 1:
-            raise ValueError(f"`count` is {self.count}, expected at least 1 key point an image")
-        if not 0 < self.ratio <= 1:
-            raise ValueError(f"`ratio` is {self.ratio}, expected a value in (0, 1]; 0.92 is usual")
 
     def describe(self, image: np.ndarray) -> Features:
         """Key points and unit vectors of `image` (uint8 [H, W, 3]); none where no score is high enough."""
@@ -54,10 +41,6 @@ class DensePointMatcher:
         found = self.cache.get((self.session,), settings, (image,), lambda: self._run(image))
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         return Features(found["pixels"], found["scores"], PixelDescriptors(found["vectors"], gray))
-
-    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """Verified matches from view i to view j; see `PointMatcher.match`."""
-        return match_pixels(features_i, features_j, self.ratio, self.verifier, self.refinement, predicted, self.radius)
 
     def _run(self, image: np.ndarray) -> Outputs:
         contract = self.session.contract

@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vggtgeo.models.onnx.contracts import CONTRACTS, Contract, Patches, Tensor
-
-UNREADABLE = (
-    *(OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, struct.error, RuntimeError, MemoryError),
-    *(SyntaxError, TypeError, AttributeError, KeyError, OverflowError, tokenize.TokenError),
-)
-"""What numpy and zipfile raise of files that are damaged, whatever bit of them is."""
 
 
 class NetworkFileError(ValueError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.line_gates import allowed_pairs
 from vggtgeo.models.classical.nearest import mutual_nearest
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
@@ -29,10 +30,7 @@ class DenseLineMatcher:
     overlap: float = 0.3
 
     def __post_init__(self) -> None:
-        if self.samples < 2 or not 0 < self.ratio <= 1:
-            raise ValueError(
-                f"`samples` is {self.samples} and `ratio` {self.ratio}, expected at least 2 and a value in (0, 1]"
-            )
+        check_fields(self, samples="[2, inf)", ratio="(0, 1]")
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
         """Descriptors float16 [L, samples, C] along `segments` of `image` (uint8 [H, W, 3])."""

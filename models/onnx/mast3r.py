@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_image
+from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs, key_of
@@ -54,11 +54,7 @@ class Mast3rMatcher:
     _encoded: OrderedDict[str, DeviceArray] = field(default_factory=OrderedDict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.spacing < 1 or self.stride < 1 or self.tolerance < 0 or self.kept < 2:
-            raise ValueError(
-                f"`spacing` is {self.spacing}, `stride` {self.stride}, `tolerance` {self.tolerance} and `kept` "
-                f"{self.kept}; expected at least 1, 1, 0 and 2"
-            )
+        check_fields(self, spacing="[1, inf)", stride="[1, inf)", tolerance="[0, inf)", kept="[2, inf)")
         self._check_pair()
 
     @property

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import least_squares
-from vggtgeo.models.checks import check_image
+from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.depth import no_depth
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import MOGE2
@@ -33,11 +33,7 @@ class MogeDepth:
     sigma: float = 0.05
 
     def __post_init__(self) -> None:
-        if not self.sigma > 0 or not 0 <= self.threshold < 1 or self.tokens < 1:
-            raise ValueError(
-                f"`sigma` is {self.sigma}, `threshold` {self.threshold} and `tokens` {self.tokens}; expected a "
-                "positive number, one in [0, 1), and at least one token"
-            )
+        check_fields(self, sigma="(0, inf)", threshold="[0, 1)", tokens="[1, inf)")
 
     def estimate(
         self,

@@ -1,10 +1,9 @@
-"""One onnxruntime session for every network: opened and checked once, run on CUDA where there is CUDA, else the CPU."""
+"""Sessions of onnxruntime for all networks: opened and checked once; run on CUDA if available, else on the CPU."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
-import re
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
@@ -48,9 +47,9 @@ _DTYPES = {
     "tensor(bool)": "bool",
 }
 _LARGE = 2**30
-"""Bytes of weights above which they stay mapped from the file, on the CPU, in the place of a rearranged copy: of the
-1.2 GB of DINOv3 L that leaves 0.2 GB of memory taken (and the rest for the system to reclaim), for 13 % of the time."""
-# What onnxruntime raises: all but the last derive from nothing narrower than Exception.
+"""Bytes of weights above which they are mapped from the file instead of copied, on the CPU: with the 1.2 GB of DINOv3 L
+0.2 GB of memory stay in use, for 13 % of the time."""
+# Errors of onnxruntime; all but the last derive directly from Exception.
 _RUNTIME_ERRORS = (
     raised.Fail,
     raised.InvalidArgument,
@@ -64,16 +63,16 @@ _RUNTIME_ERRORS = (
 
 
 class NetworkRunError(RuntimeError):
-    """A network failed while it ran, or gave values that are not finite."""
+    """A network failed while it ran, or returned values that are not finite."""
 
 
 class NetworkValueError(NetworkRunError):
-    """A network ran and gave values that are not finite, or that its role cannot have."""
+    """A network returned values that are not finite, or invalid for its role."""
 
 
 @dataclass(frozen=True)
 class DeviceArray:
-    """An output that stays where it was computed; other libraries read it through DLPack without a copy."""
+    """An output on the device; other libraries read it by DLPack, without a copy."""
 
     value: onnxruntime.OrtValue
 
@@ -85,11 +84,11 @@ class DeviceArray:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Its sizes."""
+        """Return the shape."""
         return tuple(self.value.shape())
 
     def numpy(self) -> np.ndarray:
-        """A copy on the host, in the file's own element type."""
+        """Return a copy on the host, in the element type of the file."""
         return self.value.numpy()
 
 
@@ -98,7 +97,7 @@ Input = np.ndarray | DeviceArray
 
 @dataclass
 class Tally:
-    """How often a network ran since it was warm, and the seconds of that. Nothing is computed from it."""
+    """Number of runs since `warm_up`, and their time, s; reported only."""
 
     calls: int = 0
     seconds: float = 0.0
@@ -106,7 +105,7 @@ class Tally:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """A network's file that keeps its contract, ready to run. Made by `open_session`."""
+    """A network that fulfils its contract, ready to run; see `open_session`."""
 
     path: Path
     contract: Contract
@@ -119,34 +118,34 @@ class Session:
 
     @property
     def random_weights(self) -> bool:
-        """Whether the file says that its weights are random, so that its results mean nothing."""
+        """Whether the metadata declare random weights, whose results are meaningless."""
         return self.metadata.get(METADATA_WEIGHTS) == RANDOM_WEIGHTS
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the file and of the external data beside it, hexadecimal."""
+        """Return the SHA-256 of the file and its external data, hexadecimal."""
         return digest_of(self.path)
 
     def run(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """The outputs `wanted` (all, if None) as arrays on the host; half precision comes back as float32.
+        """Return the outputs `wanted` (None: all) as arrays on the host, half precision as float32.
 
-        Raises `NetworkRunError` where onnxruntime fails, `NetworkValueError` for values that are not finite.
+        Raises `NetworkRunError` if onnxruntime fails, `NetworkValueError` for values that are not finite.
         """
         found = {name: array.numpy() for name, array in self.run_on_device(inputs, wanted).items()}
         for name, array in found.items():
             bad = int(np.count_nonzero(~np.isfinite(array)))
             if bad:
                 raise NetworkValueError(
-                    f"`{self.path}` gave {bad} of {array.size} values of `{name}` that are not finite; "
-                    "look at it with `vggtgeo models verify`"
+                    f"`{name}` of `{self.path}` must be finite, got {bad} of {array.size} values that are not; see "
+                    "`vggtgeo models verify`"
                 )
         return {name: _full_precision(array) for name, array in found.items()}
 
     def run_on_device(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, DeviceArray]:
-        """The same, left on the device in the file's own element type; of the values nothing is checked.
+        """Return the outputs on the device, in the element type of the file; values are not checked.
 
-        Raises `NetworkRunError` where onnxruntime fails, and for an answer of other sizes than the contract's: a file
-        may leave sizes open.
+        Raises `NetworkRunError` if onnxruntime fails, or for outputs of other sizes than the contract's: a file may
+        leave sizes open.
         """
         names = list(self.outputs if wanted is None else wanted)
         began = time.perf_counter()
@@ -167,9 +166,9 @@ class Session:
         return found
 
     def warm_up(self, seed: int = 0) -> None:
-        """Run once on noise, where all inputs are images of a fixed size: the first run allocates, and on CUDA tunes.
+        """Run once on noise, if all input sizes are fixed: the first run allocates memory, and on CUDA tunes kernels.
 
-        Raises `NetworkRunError` as `run` does, so that a network that cannot run is found out before it is needed.
+        Raises `NetworkRunError` as `run` does, so that a network that cannot run is detected early.
         """
         fixed = {
             name: [size for size in signature.shape if size is not None]
@@ -184,8 +183,8 @@ class Session:
     def _why_failed(self, call: Call, error: Exception) -> str:
         if call.ended:
             return (
-                f"`{self.path}` gave no answer within {call.seconds:.0f} s and was ended: a loop in it may have no "
-                "end; export it again, or give smaller images"
+                f"`{self.path}` was ended after {call.seconds:.0f} s without a result: it may have an endless loop; "
+                "export it again, or give smaller images"
             )
         return f"`{self.path}` failed on {self.provider}: {error}"
 
@@ -196,7 +195,7 @@ class Session:
         wrong = wrong_sizes(self.contract, given, {name: array.shape for name, array in found.items()})
         if wrong:
             raise NetworkRunError(
-                f"`{self.path}` answers with other sizes than those of `{self.contract.network}`: {'; '.join(wrong)}; "
+                f"`{self.path}` has output sizes that `{self.contract.network}` does not allow: {'; '.join(wrong)}; "
                 "export it again"
             )
 
@@ -216,10 +215,10 @@ def open_session(
     memory_limit_gb: float | None = None,
     threads: int | None = None,
 ) -> Session:
-    """Open `path` and check it against `contract`; raises `NetworkFileError` for any file that is not that network.
+    """Open `path` and check it against `contract`; raise `NetworkFileError` if it is not that network.
 
-    provider: "auto" takes CUDA where onnxruntime offers it. memory_limit_gb: most memory the network may take on
-    CUDA, weights included, or it fails. threads: of one operator on the CPU, None for onnxruntime's own choice.
+    provider: "auto" uses CUDA if onnxruntime offers it. memory_limit_gb: maximum memory on CUDA, weights included.
+    threads: per operator on the CPU; None for the default of onnxruntime.
     """
     path = Path(path)
     check_looks_like_onnx(path)
@@ -234,14 +233,14 @@ def open_session(
 
 
 def read_signature(path: str | Path) -> tuple[Signatures, Signatures, Mapping[str, str]]:
-    """Inputs, outputs and metadata of any ONNX file; raises `NetworkFileError` for anything else."""
+    """Return inputs, outputs and metadata of any ONNX file; raise `NetworkFileError` for other files."""
     path = Path(path)
     check_looks_like_onnx(path)
     return _described(path, _open(path, "cpu", None, None))
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of an ONNX file and of the files of external data that its graph names, hexadecimal."""
+    """Return the SHA-256 of an ONNX file and the external data that its graph names, hexadecimal."""
     total = hashlib.sha256()
     for part in _parts(path):
         with part.open("rb") as file:
@@ -250,14 +249,14 @@ def digest_of(path: Path) -> str:
 
 
 def _parts(path: Path) -> list[Path]:
-    """The file and its external data."""
+    """Return the file and its external data."""
     return [path, *external_files(path)]
 
 
 def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int | None) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # The exception reports what is wrong, once.
-    # An arena would keep the largest working memory of every network: half as much again, for a tenth of the time.
+    # An arena would keep the working memory of every network: 1.5 times the memory, for 10 % of the time.
     options.enable_cpu_mem_arena = False
     if sum(part.stat().st_size for part in _parts(path)) > _LARGE:
         options.add_session_config_entry("session.disable_prepacking", "1")
@@ -269,81 +268,27 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
         limit = {} if memory_limit_gb is None else {"gpu_mem_limit": int(memory_limit_gb * 2**30)}
         providers.insert(0, (NAMES["cuda"], {**CUDA_OPTIONS, **limit}))
     try:
-        # Without CUDA there is nothing to fall back on, and onnxruntime would say on stdout that it tries.
+        # Without CUDA there is no fallback, and onnxruntime would print that it tries.
         again = int(device == "cuda")
         with quiet() if device == "cuda" else nullcontext():
             return onnxruntime.InferenceSession(str(path), options, providers, enable_fallback=again)
     except (*_RUNTIME_ERRORS, UnicodeError) as error:  # of a name that is no UTF-8, in the file or of it
-        raise NetworkFileError(_why_not_opened(path, str(error))) from None
+        reason = " ".join(str(error).split())
+        raise NetworkFileError(
+            f"`{path}` cannot be opened by onnxruntime {onnxruntime.__version__}: {reason}; fetch it again with all "
+            "its files, or export it for this version"
+        ) from None
 
 
 def _described(path: Path, opened: onnxruntime.InferenceSession) -> tuple[Signatures, Signatures, Mapping[str, str]]:
-    """Inputs, outputs and metadata of an open file."""
+    """Return inputs, outputs and metadata of an open file."""
     try:
         inputs, outputs = (_signatures(nodes) for nodes in (opened.get_inputs(), opened.get_outputs()))
         return inputs, outputs, opened.get_modelmeta().custom_metadata_map
     except UnicodeDecodeError as error:
         raise NetworkFileError(
-            f"`{path}` is damaged: its names or metadata are no text ({error}); export or fetch it again"
+            f"`{path}` is damaged: invalid text in its names or metadata ({error}); export or fetch it again"
         ) from None
-
-
-def _why_not_opened(path: Path, message: str) -> str:
-    absent = re.search(r'data path does not exist: "([^"]+)"', message)
-    if absent:
-        return (
-            f"`{path}` expects its weights beside it in `{Path(absent[1]).name}`, which is not there; copy that file "
-            "too, under this name, or export it again"
-        )
-    short = re.search(r"offset: (\d+) size to read: (\d+) given file_length: (\d+)", message)
-    if short:
-        offset, size, found = map(int, short.groups())
-        return (
-            f"the weights beside `{path}` are cut off: found {found} bytes, expected {offset + size} or more; "
-            "copy them again, or export it again"
-        )
-    reason = " ".join(message.split())
-    if unknown := _unknown_operator(reason):
-        return (
-            f"`{path}` uses the operator `{unknown}`, which onnxruntime {onnxruntime.__version__} does not know; "
-            "export it again with standard operators, or update onnxruntime"
-        )
-    if newer := _newer_version(reason):
-        kind, version, newest = newer
-        return (
-            f"`{path}` is of {kind} {version}, and onnxruntime {onnxruntime.__version__} reads up to {newest}; "
-            "export it again with an older one, or update onnxruntime"
-        )
-    reason = f"onnxruntime: {reason if len(reason) < 200 else '... ' + reason[-200:]}"
-    if "xternal" in message and ("data" in message or "initializer" in message):
-        return (
-            f"`{path}` lacks its external data or has too little of it, expected the data file beside it as it was "
-            f"exported; copy both, or export it again ({reason})"
-        )
-    return (
-        f"`{path}` is not an ONNX file that can be read: expected a whole one, found {path.stat().st_size} bytes that "
-        f"are cut off or something else; export or fetch it again ({reason})"
-    )
-
-
-def _newer_version(message: str) -> tuple[str, str, str] | None:
-    """Of an error that says that a file is newer than what is known: of what version, its own, and the newest known."""
-    operators = re.search(r"Opset (\d+) is under development.* domain (\S+) is till opset (\d+)", message)
-    if operators:
-        return f"the operators' version (opset of {operators[2]})", operators[1], operators[3]
-    layout = re.search(r"Unsupported model IR version: (\d+), max supported IR version: (\d+)", message)
-    return ("the layout's version (IR)", layout[1], layout[2]) if layout else None
-
-
-def _unknown_operator(message: str) -> str | None:
-    """Of an error that says that a node's operator, its version or its domain is none that is known."""
-    node = re.search(r'In Node, \("[^"]*", ([\w.]+), "([\w.]*)"', message)
-    if node and re.search(r"No opset import for domain|No Op registered|is not a registered function", message):
-        return f"{node[2]}:{node[1]}" if node[2] else node[1]
-    named = re.search(r"Fatal error: ([\w.]*:?[\w.]+)\(-?\d+\) is not a registered", message) or re.search(
-        r"(?:No Op registered for|Could not find an implementation for) ([\w.]+)", message
-    )
-    return named and named[1]
 
 
 def _signatures(nodes: Iterable[Any]) -> Signatures:

@@ -1,30 +1,34 @@
-"""Does a network's file do what it should? Finite on an image, how fast, and equal to what PyTorch gave."""
+"""Verification of a network's file: finite outputs, latency, and parity with PyTorch."""
 
 from __future__ import annotations
 
 import time
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from vggtgeo.models.onnx.contracts import Patches, Tensor
-from vggtgeo.models.onnx.file_checks import UNREADABLE, NetworkFileError, Signature
+from vggtgeo.models.onnx.file_checks import NetworkFileError, Signature
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 from vggtgeo.models.onnx.mlsd import prepare
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.onnx.vggt import WIDTH
 
+from vggtgeo.io.archives import read_archive
+from vggtgeo.io.errors import InputError
+
 TOLERANCE = 1e-3
 """Largest relative difference from PyTorch in single precision."""
 HALF_TOLERANCE = 3e-2
-"""The same where the file computes in half precision."""
+"""Largest relative difference from PyTorch in half precision."""
+_MAX_RECORD = 2**31
+"""Bytes of a parity record."""
 
 
 @dataclass(frozen=True)
 class Output:
-    """What one output held: its shape, how many values are not finite, and the range of those that are."""
+    """Summary of an output: shape, number of values that are not finite, and range of the others."""
 
     shape: tuple[int, ...]
     not_finite: int
@@ -33,7 +37,7 @@ class Output:
 
 
 def example_inputs(session: Session, image: np.ndarray, seed: int = 0) -> dict[str, np.ndarray]:
-    """`image` (uint8 [H, W, 3]) as this network wants it; encoder features are standard normal numbers."""
+    """Return `image` (uint8 [H, W, 3]) as inputs of the network; encoder features are standard normal."""
     rng = np.random.default_rng(seed)
     return {
         tensor.name: _example(session, tensor, image, rng)
@@ -43,13 +47,13 @@ def example_inputs(session: Session, image: np.ndarray, seed: int = 0) -> dict[s
 
 
 def check_outputs(session: Session, inputs: Mapping[str, np.ndarray]) -> dict[str, Output]:
-    """The contract's outputs for `inputs`, counted and bounded."""
+    """Return a summary of each output of the contract."""
     wanted = [tensor.name for tensor in session.contract.outputs if tensor.name in session.outputs]
     return {name: _summary(array.numpy()) for name, array in session.run_on_device(inputs, wanted).items()}
 
 
 def latency(session: Session, inputs: Mapping[str, np.ndarray], runs: int) -> float:
-    """Seconds of the median of `runs` runs, inputs copied to the device and outputs back, after one that warms up."""
+    """Return the median time of `runs` runs, s, with copies to and from the device, after one warm-up run."""
     session.run_on_device(inputs)
     seconds = []
     for _ in range(runs):
@@ -61,7 +65,7 @@ def latency(session: Session, inputs: Mapping[str, np.ndarray], runs: int) -> fl
 
 
 def parity(session: Session, recorded: Path) -> dict[str, float]:
-    """max |difference| / max |PyTorch| of each recorded output; raises `NetworkFileError` for a file that is no record.
+    """Return max |difference| / max |PyTorch| of each recorded output; raise `NetworkFileError` for an invalid record.
 
     recorded: an `.npz` of `input.NAME` and `output.NAME` arrays, as an export writes it beside its file.
     """
@@ -71,7 +75,7 @@ def parity(session: Session, recorded: Path) -> dict[str, float]:
 
 
 def tolerance(session: Session) -> float:
-    """The largest difference from PyTorch that is only rounding, by the precision the file states."""
+    """Return the largest difference from PyTorch that rounding explains, by the precision of the file."""
     half = "16" in session.metadata.get("vggtgeo.precision", "") or any(
         signature.dtype == "float16" for signature in session.inputs.values()
     )
@@ -105,14 +109,12 @@ def _summary(array: np.ndarray) -> Output:
 
 
 def _read_record(session: Session, recorded: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    if not recorded.is_file():  # a pipe has no end
-        raise NetworkFileError(f"`{recorded}` is no file; give a parity record (.npz)")
     try:
-        # NumPy takes what is no archive for a pickle, and would have the user trust it.
-        with recorded.open("rb") as handle, zipfile.ZipFile(handle), np.load(handle, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except UNREADABLE as error:
-        raise NetworkFileError(f"`{recorded}` cannot be read as a parity record (.npz): {error}") from None
+        arrays = read_archive(
+            recorded, "a parity record (.npz)", lambda file: file.read(file.members, lambda headers: None, _MAX_RECORD)
+        )
+    except InputError as error:
+        raise NetworkFileError(str(error)) from None
     inputs, outputs = (
         {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
         for kind in ("input.", "output.")

@@ -20,7 +20,7 @@ from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.node import node_residuals
 from vggtgeo.bundle.terms.term import robust_energy
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import Cameras
+from vggtgeo.geometry.camera_models import Cameras
 
 EdgeData = tuple[dict[str, Any], ...]
 """Data and weights of each edge term, of one edge or with a leading axis of edges."""

@@ -54,7 +54,7 @@ from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
-from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
+from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy

@@ -14,7 +14,7 @@ from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.terms.term import check_width
-from vggtgeo.geometry.cameras import AbstractCamera
+from vggtgeo.geometry.camera_models import AbstractCamera
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_real, check_whole, real_numbers
 

@@ -27,7 +27,7 @@ from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
+from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 

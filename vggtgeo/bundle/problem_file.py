@@ -1,14 +1,17 @@
-"""Problems and solutions as `.npz` files."""
+"""Problems and solutions as files."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
+from jax.dtypes import canonicalize_dtype
 from jax.typing import DTypeLike
 
 from vggtgeo.bundle.observations import Observations
@@ -18,18 +21,35 @@ from vggtgeo.bundle.packing_checks import check_dtype
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.pair_checks import check_kinds
 from vggtgeo.bundle.precision import check_precision
-from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.saved_checks import check_problem
-from vggtgeo.bundle.saved_modules import describe, restore
+from vggtgeo.bundle.terms.baseline import BaselinePrior
+from vggtgeo.bundle.terms.depth import DepthPrior
+from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.line import LineTerm
+from vggtgeo.bundle.terms.marginal import MarginalPrior
+from vggtgeo.bundle.terms.point import PointTerm
+from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
+from vggtgeo.bundle.terms.rotation import RotationPrior
+from vggtgeo.geometry import camera_models as cameras
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.io.given import check_kind, path_of
-from vggtgeo.solvers.kernels import Huber
+from vggtgeo.io.persistence import DATA, HEADER, Format, by_name
+from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 
-DESCRIPTION = "description"
-"""Array of a saved problem that says, in JSON, which class each part is and where its arrays are."""
-VERSION = 1
+PROBLEM_CLASSES: tuple[type, ...] = (
+    *(Problem, State, Edges, SlotIndex, jaxlie.SE3, jaxlie.SO3),
+    *(PointTerm, LineTerm, HostPixel, DepthPrior, IntrinsicsPrior, MarginalPrior),
+    *(RelativePose, SurfaceAlignment, RotationPrior, BaselinePrior),
+    *(Square, Huber, Cauchy, GemanMcClure, Barron),
+    *(cameras.Pinhole, cameras.RadialTangential, cameras.KannalaBrandt),
+    *(cameras.SquarePinhole, cameras.SquareRadialTangential, cameras.SquareKannalaBrandt),
+)
+"""All classes of the package that a saved problem may have."""
+PROBLEM = Format("problem", 2, by_name(PROBLEM_CLASSES), True, ": pass your own classes as `terms`")
 
 LAYOUT: dict[str, tuple[str | int, ...]] = {
     "edges": ("E", 2),
@@ -48,26 +68,22 @@ LAYOUT: dict[str, tuple[str | int, ...]] = {
 OPTIONAL: dict[str, tuple[str | int, ...]] = {"var_segment": ("D",)}
 """Arrays that a problem may lack."""
 INDICES = ("edges", "var_kf", "pt_edge", "pt_var", "ln_edge", "ln_var", "var_segment")
-_OF_ROWS = ("part", "step")
-"""Arrays of the index of a problem in which a keyframe has several rows of landmarks."""
-_SAVED = ("problem/", "state/", "index/")
-"""How the arrays of a saved problem begin."""
 
 
 def load_problem(
     path: Path, dtype: DTypeLike | None = None, *, terms: Sequence[type] = ()
 ) -> tuple[Problem, State, SlotIndex]:
-    """Read a problem: flat lists as other programs write them, or what `save_problem` wrote.
+    """Load a problem: flat lists as other programs write them, or a file of `save_problem`.
 
     Args:
-        path: `.npz`; docs/reference/problem-file.md has both layouts.
-        dtype: float type of all arrays, as `vggtgeo.pack` takes it.
-        terms: classes of your own that a saved problem holds: terms, kernels, a camera. A file only names them; no code
-            in it is run.
+        path: `.npz`; docs/reference/problem-file.md describes both layouts.
+        dtype: float type of all arrays, as in `vggtgeo.pack`.
+        terms: your own classes that a saved problem has: terms, kernels, a camera. A file only names classes; no code
+            in it is executed.
 
     Raises:
-        InputError: the file is missing, is no `.npz`, lacks an array, holds one that does not fit, or names a class
-            that is neither the package's nor given.
+        InputError: the file is missing or damaged, an array is missing or invalid, or a class is neither the
+            package's nor in `terms`.
 
     Example:
         >>> import vggtgeo as vg
@@ -75,17 +91,17 @@ def load_problem(
         >>> vg.load_problem(Path("no.npz"))
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `no.npz` is no file; give that of a bundle-adjustment problem
+        vggtgeo.io.errors.InputError: `no.npz` does not exist or is not a file; give the file of a problem
 
     """
     path = path_of("path", path)
     if dtype is not None:
         check_dtype(dtype)
     if not isinstance(terms, list | tuple) or not all(isinstance(kind, type) for kind in terms):
-        raise InputError(f"`terms` is {terms!r:.60}; expected a list of classes, as [PositionFix]")
-    arrays = _read(path)
-    if DESCRIPTION in arrays:
-        return _restored(path, arrays, terms, dtype)
+        raise InputError(f"`terms` must be a list of classes, such as [PositionFix], got {terms!r:.60}")
+    arrays = read_archive(path, "a problem", _flat)
+    if not arrays:
+        return _load_saved(path, terms, lambda name, values: _as_jax(path, name, values, dtype))
     observations = Observations(
         edges=arrays["edges"].astype(int),
         host=arrays["var_kf"].astype(int),
@@ -105,7 +121,7 @@ def load_problem(
         segment=arrays["var_segment"].astype(int) if "var_segment" in arrays else None,
     )
     if not arrays["huber"] > 0:
-        raise InputError(f"array `huber` of `{path}` is {arrays['huber']}; it must be positive")
+        raise InputError(f"array `huber` of `{path}` must be positive, got {arrays['huber']}")
     start = arrays["T_init"], arrays["k_init"], arrays["d_init"]
     try:
         check_precision({"huber": arrays["huber"]}, dtype, positive=("huber",))
@@ -118,26 +134,22 @@ def load_problem(
 
 
 def load_arrays(path: Path, terms: Sequence[type] = ()) -> tuple[Problem, State, SlotIndex]:
-    """What `save_problem` wrote, with leaves of numpy and without JAX: for the workers of a data loader.
+    """Load a file of `save_problem` with numpy leaves and without using JAX, for the workers of a data loader.
 
     Raises:
         InputError: as `load_problem`.
 
     """
-    arrays = _read(path)
-    if DESCRIPTION not in arrays:
-        raise InputError(f"`{path}` is no problem that `save_problem` wrote")
-    return _restored(path, arrays, terms, None, np.asarray)
+    return _load_saved(path, terms, lambda name, values: values)
 
 
 def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -> None:
-    """Write a problem with all its terms, kernels and its camera, a state and where the landmarks went, as `.npz`.
+    """Save a problem with all its terms, kernels and its camera, a state, and where the landmarks are, atomically.
 
-    `load_problem` gives the same leaves back, bit by bit. The file is written atomically and holds no pickles.
+    `load_problem` returns the same leaves, bit by bit. The file has no pickles.
 
     Raises:
-        InputError: they are not a problem, a state and an index, or a term holds something that is no array, number or
-            text.
+        InputError: an argument has another type, or a term holds something that is not an array, number or text.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()`):
         >>> import tempfile
@@ -151,20 +163,18 @@ def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -
     """
     check_kinds(problem, state)
     check_kind("index", index, SlotIndex, "a `SlotIndex`, the third of what `vggtgeo.pack` gives")
-    arrays: dict[str, np.ndarray] = {}
-    parts = {"problem": problem, "state": state}
-    description = {name: describe(part, name, arrays) for name, part in parts.items()}
-    whole = {"version": VERSION, "index": list(index.shape), **description}
-    for name in ("host", "slot", "edge", *_OF_ROWS):
-        if getattr(index, name) is not None:
-            arrays[f"index/{name}"] = getattr(index, name)
-    with atomic_open(path, "wb") as file:
-        named: dict[str, Any] = {DESCRIPTION: np.array(json.dumps(whole)), **arrays}
-        np.savez_compressed(file, **named)
+    names = [term.name for term in problem.terms]
+    if len(set(names)) < len(names):
+        raise InputError(f"`terms` must have distinct names, got {names}")
+    value = {"problem": problem, "state": state, "index": index}
+    try:
+        PROBLEM.with_classes(_classes(problem)).write(path, value)
+    except (TypeError, ValueError) as error:
+        raise InputError(str(error)) from None
 
 
 def save_solution(path: Path, state: State, index: SlotIndex) -> None:
-    """Write a solution as `.npz`, atomically: `T [N, 7]`, `k [4]`, `d [D]` in the conventions of the problem's file."""
+    """Save a solution as `.npz`, atomically: `T [N, 7]`, `k [4]`, `d [D]` in the conventions of the flat lists."""
     with atomic_open(path, "wb") as file:
         np.savez(
             file,
@@ -174,49 +184,66 @@ def save_solution(path: Path, state: State, index: SlotIndex) -> None:
         )
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of either layout, and no others."""
-    return read_archive(path, "a bundle-adjustment problem", _saved_or_flat)
+def _classes(value: Any) -> Iterator[type]:
+    """Yield the classes in a tree of modules."""
+    if isinstance(value, type):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        yield type(value)
+        for field in dataclasses.fields(value):
+            yield from _classes(getattr(value, field.name))
+    elif isinstance(value, list | tuple | dict):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _classes(item)
 
 
-def _saved_or_flat(archive: Archive) -> dict[str, np.ndarray]:
-    if DESCRIPTION in archive:
-        found = [name for name in archive.members if name == DESCRIPTION or name.startswith(_SAVED)]
-        return archive.read(found, lambda headers: None)
+def _flat(archive: Archive) -> dict[str, np.ndarray]:
+    """Read the arrays of flat lists; none if the file is one of `save_problem`."""
+    if {HEADER, DATA} <= archive.members.keys():
+        return {}
     missing = [name for name in LAYOUT if name not in archive]
     if missing:
         raise InputError(
-            f"`{archive.path}` lacks the arrays {', '.join(missing)}; the layout is in docs/reference/problem-file.md"
+            f"the arrays {', '.join(missing)} are missing in `{archive.path}`; see docs/reference/problem-file.md"
         )
     optional = [name for name in OPTIONAL if name in archive]
     return archive.read([*LAYOUT, *optional], lambda headers: _check_flat(archive.path, headers))
 
 
-def _restored(
-    path: Path,
-    arrays: dict[str, np.ndarray],
-    terms: Sequence[type],
-    dtype: DTypeLike | None,
-    as_array: Callable[..., Any] = jnp.asarray,
+def _load_saved(
+    path: Path, terms: Sequence[type], convert: Callable[[str, np.ndarray], Any]
 ) -> tuple[Problem, State, SlotIndex]:
     try:
-        whole = json.loads(str(arrays[DESCRIPTION]))
-        if whole["version"] != VERSION:
-            raise InputError(f"it has the version {whole['version']}; this program reads {VERSION}")
-        problem, state = (restore(whole[name], arrays, terms, dtype, as_array) for name in ("problem", "state"))
-        host, slot, edge = (arrays[f"index/{name}"] for name in ("host", "slot", "edge"))
-        rows, edges, slots = map(int, whole["index"])
-        index = SlotIndex(host, slot, edge, (rows, edges, slots), *(arrays.get(f"index/{name}") for name in _OF_ROWS))
+        layout = PROBLEM.with_classes(terms)
+    except ValueError as error:
+        raise InputError(f"`terms`: {error}") from None
+    saved, _ = layout.read(path, np.asarray)
+    try:
+        problem, state, index = (saved[name] for name in ("problem", "state", "index"))
         check_problem(problem, state, index)
     except InputError as error:
-        raise InputError(f"`{path}` cannot be read as a problem: {error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
-        raise InputError(f"`{path}` is no problem that `save_problem` wrote, or was changed since: {error}") from error
-    return problem, state, index
+        raise InputError(f"`{path}` is not a valid problem: {error}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(f"`{path}` is not a valid problem: {error!r}") from error
+    named = {"problem": problem, "state": state}
+    leaf = lambda place, values: convert(jax.tree_util.keystr(place, simple=True, separator="."), np.asarray(values))
+    named = jax.tree_util.tree_map_with_path(leaf, named)
+    return named["problem"], named["state"], index
+
+
+def _as_jax(path: Path, name: str, values: np.ndarray, dtype: DTypeLike | None) -> jax.Array:
+    """Convert floats to `dtype` (None: JAX's own), other arrays as they are."""
+    if not np.issubdtype(values.dtype, np.floating):
+        return jnp.asarray(values, canonicalize_dtype(values.dtype))
+    try:
+        check_precision({name: values}, dtype)
+    except InputError as error:
+        raise InputError(f"`{path}`: {error}") from error
+    return jnp.asarray(values, canonicalize_dtype(dtype or values.dtype))
 
 
 def _check_flat(path: Path, found: Mapping[str, ArrayHeader]) -> None:
-    """Shapes and element types that the layout asks for, known before the arrays are read."""
+    """Check shapes and element types before the arrays are read."""
     sizes: dict[str | int, int] = {}
     for name, layout in {**LAYOUT, **OPTIONAL}.items():
         if name not in found:
@@ -226,15 +253,11 @@ def _check_flat(path: Path, found: Mapping[str, ArrayHeader]) -> None:
             if isinstance(axis, str):
                 sizes.setdefault(axis, length)
         expected = tuple(sizes.get(axis, axis) for axis in layout)
-        if header.shape != expected:
+        kinds, words = ("iu", "integers") if name in INDICES else ("iufb", "numbers")
+        if header.shape != expected or header.dtype.kind not in kinds:
             raise InputError(
-                f"array `{name}` of `{path}` has shape {header.shape}; expected {expected}, see "
-                "docs/reference/problem-file.md"
+                f"array `{name}` of `{path}` must be {words} of shape {expected}, got {header.dtype} {header.shape}; "
+                "see docs/reference/problem-file.md"
             )
-        kinds, words = ("iu", "whole numbers") if name in INDICES else ("iufb", "numbers")
-        if header.dtype.kind not in kinds:
-            raise InputError(f"array `{name}` of `{path}` holds {header.dtype}; expected {words}")
     if not sizes["N"] or not sizes["D"]:
-        raise InputError(
-            f"`{path}` has {sizes['N']} keyframes and {sizes['D']} landmarks; expected at least one of each"
-        )
+        raise InputError(f"`{path}` must have keyframes and landmarks, got {sizes['N']} and {sizes['D']}")

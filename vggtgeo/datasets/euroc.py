@@ -6,15 +6,23 @@ aerial vehicle datasets", IJRR 2016.
 
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.intrinsics import intrinsics_of, is_fisheye
-from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_text, states_list, trajectory_of, yaml_numbers
+from vggtgeo.datasets.pose_files import (
+    check_size,
+    poses_of,
+    read_matrices,
+    read_text,
+    states_list,
+    trajectory_of,
+    yaml_numbers,
+)
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning
@@ -46,15 +54,12 @@ class Euroc(FolderSequence):
                 f"`{folder}`: the IMU is not used; images alone leave the scale free", NoteWarning, stacklevel=3
             )
         camera_folder = base / "cam0"
-        files = tuple(
-            FrameFile(index, time, camera_folder / "data" / name)
-            for index, (time, name) in enumerate(sorted(_images(camera_folder / "data.csv")))
-        )
-        if not files:
-            raise InputError(f"`{camera_folder}/data.csv` lists no image; expected lines `nanoseconds,file`")
-        width, height = common_size(str(folder), files)
+        frames = [(time, camera_folder / "data" / name, None) for time, name in _images(camera_folder / "data.csv")]
+        if not frames:
+            raise InputError(f"`{camera_folder}/data.csv` has no image; it must have lines `nanoseconds,file`")
         sensor = camera_folder / "sensor.yaml"
-        return cls(base, folder.resolve().name, _camera(sensor, width, height), files)
+        whole = cls.listed(folder, sorted(frames), lambda width, height: _camera(sensor, width, height))
+        return replace(whole, folder=base)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses of the left camera, at their own times."""
@@ -74,12 +79,7 @@ def _camera(sensor: Path, width: int, height: int) -> Camera:
     "equidistant".
     """
     if states_list(sensor, "resolution"):
-        stated = yaml_numbers(sensor, "resolution", 2)
-        if stated != [width, height]:
-            raise InputError(
-                f"`{sensor}` is of images of {stated[0]:g} x {stated[1]:g} pixels; those here are {width} x {height}: "
-                "write the camera of these into it"
-            )
+        check_size(sensor, yaml_numbers(sensor, "resolution", 2), (width, height))
     intrinsics = intrinsics_of(sensor, yaml_numbers(sensor, "intrinsics"))
     coefficients = yaml_numbers(sensor, "distortion_coefficients")
     found = _MODEL.search(read_text(sensor))

@@ -3,10 +3,10 @@
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import cv2
 import numpy as np
@@ -75,6 +75,39 @@ class FolderSequence:
                     f"`{self.folder}`: `{file.image}` is listed as an image and as depth; expected two files"
                 )
 
+    @classmethod
+    def listed(
+        cls,
+        folder: Path,
+        frames: Iterable[tuple[float, Path, Path | None]],
+        camera: Callable[[int, int], Camera],
+        coding: DepthFormat = MILLIMETRES,
+        *,
+        as_images: bool = True,
+        **fields: Any,
+    ) -> Self:
+        """Make a sequence of frames (time, image, depth), with warnings about missing and invalid depth.
+
+        Args:
+            folder: where the frames are.
+            frames: in the order of the sequence.
+            camera: returns the camera for the width and height of the images.
+            coding: unit of the depth files.
+            as_images: whether depth files must have the size of the images; otherwise `load_depth` checks them.
+            fields: further fields of the class.
+
+        """
+        files = tuple(FrameFile(index, *frame) for index, frame in enumerate(frames))
+        warn_of_no_depth(folder, files)
+        width, height = common_size(str(folder), files)
+        has_depth = any(file.depth is not None for file in files)
+        whole = cls(folder, folder.resolve().name, camera(width, height), files, coding, has_depth, **fields)
+        if as_images:
+            usable = depth_is_usable(str(folder), files, coding, width, height, cls.depth_of_fewer_pixels)
+        else:
+            usable = has_depth and whole.depth_can_be_read()
+        return replace(whole, has_depth=usable)
+
     def __len__(self) -> int:
         return len(self.files)
 
@@ -119,7 +152,8 @@ class FolderSequence:
                 reason = reason or str(error)
             else:
                 return True
-        warnings.warn(f"{reason}; reading the images only", InputWarning, stacklevel=4)
+        text = f"{reason}; reading the images only, without their {len(depths)} depth images"
+        warnings.warn(text, InputWarning, stacklevel=4)
         return False
 
     def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
@@ -259,6 +293,11 @@ def depth_is_usable(
         text = f"`{name}`: none of the {len(with_depth)} depth images {what}; reading the images only"
         _warn(text, InputWarning if gone else UnusableDepthWarning)
     return False
+
+
+def existing(path: Path) -> Path | None:
+    """Return a path if it is a file, else None."""
+    return path if path.is_file() else None
 
 
 def warn_of_no_depth(folder: Path, files: Sequence[FrameFile]) -> None:

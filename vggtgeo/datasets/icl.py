@@ -12,7 +12,7 @@ from typing import Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
 from vggtgeo.datasets.intrinsics import guess_with_warning
@@ -54,14 +54,10 @@ class IclNuim(FolderSequence):
         pairs = read_pairs(folder / _LIST, "N") if (folder / _LIST).is_file() else _numbered(folder)
         if not pairs:
             raise InputError(f"`{folder}` has neither `{_LIST}` nor images `rgb/N.png` with `depth/N.png`")
-        files = tuple(
-            FrameFile(index, number / FRAMES_PER_SECOND, folder / image, folder / depth)
-            for index, (number, image, depth) in enumerate(sorted(pairs))
-        )
-        width, height = common_size(str(folder), files)
-        camera = icl_camera(folder, width, height)
-        has_depth = depth_is_usable(str(folder), files, FIVE_THOUSANDTHS, width, height)
-        return cls(folder, folder.resolve().name, camera, files, FIVE_THOUSANDTHS, has_depth)
+        frames = [
+            (number / FRAMES_PER_SECOND, folder / image, folder / depth) for number, image, depth in sorted(pairs)
+        ]
+        return cls.listed(folder, frames, lambda *size: icl_camera(folder, *size), FIVE_THOUSANDTHS)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses of the mirrored world."""

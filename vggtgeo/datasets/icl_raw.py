@@ -17,7 +17,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, warn_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.icl import MIRROR, icl_camera, icl_truth
 from vggtgeo.datasets.image_files import MAX_DEPTH
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
@@ -47,16 +47,13 @@ class IclNuimRaw(FolderSequence):
         images = list(_images(folder))
         if not images:
             raise InputError(f"`{folder}` has no images `scene_00_0000.png`; expected ICL-NUIM as POV-Ray rendered it")
-        depths = [path.with_suffix(".depth") for path in images]
         # The number of the scene comes first in the names: `scene_00_0012`.
         numbers = rows_of([path.with_name(path.stem.rpartition("_")[2]) for path in images], None)
-        files = tuple(
-            FrameFile(index, number / FRAMES_PER_SECOND, image, depth if depth.is_file() else None)
-            for index, (number, image, depth) in enumerate(zip(numbers, images, depths, strict=True))
-        )
-        warn_of_no_depth(folder, files)
-        camera = icl_camera(folder, *common_size(str(folder), files))
-        return cls(folder, folder.resolve().name, camera, files, has_depth=any(file.depth for file in files))
+        frames = [
+            (number / FRAMES_PER_SECOND, image, existing(image.with_suffix(".depth")))
+            for number, image in zip(numbers, images, strict=True)
+        ]
+        return cls.listed(folder, frames, lambda *size: icl_camera(folder, *size), as_images=False)
 
     def load_depth(self, path: Path) -> Float[np.ndarray, "h w"]:
         """The depth along the optical axis, float32, NaN for none; InputError for another count of numbers."""

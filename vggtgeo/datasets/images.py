@@ -10,10 +10,10 @@ from typing import Self
 import cv2
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES, UNFINISHED, read_image
-from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.intrinsics import camera_or_guess
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
 
@@ -61,12 +61,8 @@ class ImageFolder(FolderSequence):
         _warn_of_series(folder, images)
         _warn_of_more(folder, len(images))
         times = times_by_name(images)
-        files = tuple(
-            FrameFile(index, time, image) for index, (time, image) in enumerate(sorted(zip(times, images, strict=True)))
-        )
-        width, height = common_size(str(folder), files)
-        camera = camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
-        return cls(folder, folder.resolve().name, camera, files)
+        frames = [(time, image, None) for time, image in sorted(zip(times, images, strict=True))]
+        return cls.listed(folder, frames, lambda *size: camera_or_guess(folder, *size))
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
         """See `FolderSequence.frames`; warns at the end of images that were added since the folder was opened."""

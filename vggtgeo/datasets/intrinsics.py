@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.pose_files import read_json, same_size
+from vggtgeo.datasets.pose_files import check_size, read_json, same_size
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 from vggtgeo.io.text_files import whole_text
@@ -93,6 +93,11 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
             warn_of_other_size(f"`{file}`", camera)
             return camera
     return _camera_of_record3d(folder, width, height) or _camera_of_another_name(folder, width, height)
+
+
+def camera_or_guess(folder: Path, width: int, height: int) -> Camera:
+    """Return the camera of `camera_from_folder`, else a guess, with a GuessedCameraWarning."""
+    return camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
 
 
 def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
@@ -260,12 +265,7 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
     content = read_json(file)
     if not isinstance(content, dict):
         raise InputError(f"`{file}`: found {type(content).__name__}; expected an object with the camera")
-    size = content.get("width", width), content.get("height", height)
-    if not same_size(size, (width, height)):
-        raise InputError(
-            f"`{file}` is of images of {size[0]} x {size[1]} pixels; those here are {width} x {height}: write the "
-            f"camera of these into `{CALIBRATION}`, or give --intrinsics fx,fy,cx,cy"
-        )
+    check_size(file, (content.get("width", width), content.get("height", height)), (width, height))
     matrix = content.get("intrinsic_matrix")
     if isinstance(matrix, list) and len(matrix) == 9:
         by_row = matrix[6:8] == [0, 0] and matrix[2] != 0  # somebody's own script

@@ -5,16 +5,16 @@ Source: A. Geiger et al., "Are we ready for autonomous driving?", CVPR 2012.
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import image_files, rows_of
-from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, intrinsics_of
+from vggtgeo.datasets.intrinsics import camera_or_guess, intrinsics_of
 from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -56,14 +56,21 @@ class Kitti(FolderSequence):
                 f"{len(times)} times; give those of the whole drive"
             )
         every = [times[row] if times else (row - rows[0]) / RATE for row in rows]
-        files = tuple(FrameFile(index, *pair) for index, pair in enumerate(zip(every, images[place], strict=True)))
-        width, height = common_size(str(folder), files)
+        frames = [(time, image, None) for time, image in zip(every, images[place], strict=True)]
         if (folder / "oxts").is_dir():
             warnings.warn(
                 f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", NoteWarning, stacklevel=3
             )
-        camera, baseline = _camera(folder, place.relative_to(folder).parts[0], width, height)
-        return cls(folder, folder.resolve().name, camera, files, baseline=baseline)
+        name = place.relative_to(folder).parts[0]
+        baseline = 0.0
+
+        def camera(width: int, height: int) -> Camera:
+            nonlocal baseline
+            found, baseline = _camera(folder, name, width, height)
+            return found
+
+        whole = cls.listed(folder, frames, camera)
+        return replace(whole, baseline=baseline)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses of the camera that is read."""
@@ -123,8 +130,7 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
                 row = _numbers(file, key, values[key], 12)
                 intrinsics = intrinsics_of(file, (row[0], row[5], row[2], row[6]))
                 return Camera(intrinsics, width, height), -row[3] / row[0]
-    own = camera_from_folder(folder, width, height)
-    return own or guess_with_warning(str(folder), width, height), 0.0
+    return camera_or_guess(folder, width, height), 0.0
 
 
 def _calibration(file: Path) -> dict[str, str]:

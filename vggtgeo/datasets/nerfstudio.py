@@ -22,8 +22,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, warn_of_no_depth
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, is_there, read_depth
+from vggtgeo.datasets.folder import FolderSequence, enlarged
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
 from vggtgeo.datasets.pose_files import read_json, trajectory_of
@@ -67,22 +67,13 @@ class Nerfstudio(FolderSequence):
             text = f"{len(frames) - len(images)} of its frames name an image once more: the last pose of each is read"
             warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=3)
         order = sorted(images, key=lambda path: natural_key(str(path.relative_to(folder))))
-        files = tuple(
-            FrameFile(index, index / FRAMES_PER_SECOND, image, _depth(folder, file, images[image]))
-            for index, image in enumerate(order)
-        )
-        warn_of_no_depth(folder, files)
-        width, height = common_size(str(folder), files)
-        camera = _camera(file, content, list(images.values()), width, height)
-        listed = [one.depth for one in files if one.depth is not None]
-        has_depth = any(map(is_there, listed))
-        if listed and not has_depth:
-            text = f"none of the {len(listed)} depth images is there: `{listed[0]}`, ...; reading the images only"
-            warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=3)
+        rows = [
+            (index / FRAMES_PER_SECOND, image, _depth(folder, file, images[image])) for index, image in enumerate(order)
+        ]
         unit = _positive(file, "integer_depth_scale", content.get("integer_depth_scale", 1e-3))
         coding = replace(MILLIMETRES, units_per_metre=1.0 / unit)
-        whole = cls(folder, folder.resolve().name, camera, files, coding, has_depth)
-        return whole if not has_depth or whole.depth_can_be_read() else replace(whole, has_depth=False)
+        camera = lambda *size: _camera(file, content, list(images.values()), *size)
+        return cls.listed(folder, rows, camera, coding, as_images=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth, enlarged to the images where it is smaller, as a phone's is."""

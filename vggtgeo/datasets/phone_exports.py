@@ -14,15 +14,15 @@ beside are not read. Poses are those of ARKit, which are no independent truth.
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, warn_of_no_depth
-from vggtgeo.datasets.image_files import MILLIMETRES, read_depth
+from vggtgeo.datasets.folder import FolderSequence, enlarged, existing
+from vggtgeo.datasets.image_files import read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
@@ -91,19 +91,13 @@ class PhoneExport(FolderSequence):
         if not known:
             raise InputError(f"`{folder}` has no image beside a file of its camera that can be read")
         times = _times(folder, [stated.time for _, stated in known])
-        files = tuple(
-            FrameFile(index, time, part.image, part.depth if part.depth.is_file() else None)
-            for index, (time, (part, _)) in enumerate(zip(times, known, strict=True))
-        )
-        warn_of_no_depth(folder, files)
-        camera = _camera(folder, [stated for _, stated in known], *common_size(str(folder), files))
+        frames = [(time, part.image, existing(part.depth)) for time, (part, _) in zip(times, known, strict=True)]
         trusted = {part.depth: part.confidence for part, _ in known if part.confidence.is_file()}
-        has_depth = any(file.depth is not None for file in files)
-        if has_depth and not trusted:
-            _warn(f"`{folder}` has no confidence beside its depth, which is used whatever the phone thought of it")
+        if not trusted and any(depth is not None for _, _, depth in frames):
+            _warn(f"`{folder}` has no confidence beside its depth: all depth is used")
         poses = {part.image: stated.pose for part, stated in known}
-        whole = cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, poses, trusted)
-        return whole if not has_depth or whole.depth_can_be_read() else replace(whole, has_depth=False)
+        camera = lambda *size: _camera(folder, [stated for _, stated in known], *size)
+        return cls.listed(folder, frames, camera, as_images=False, poses=poses, confidence=trusted)
 
 
 @dataclass(frozen=True)

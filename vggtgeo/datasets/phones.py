@@ -13,7 +13,7 @@ those of ARKit, which are no independent truth: differences from them are not er
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, warn_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, enlarged
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.images import files_like
@@ -157,14 +157,8 @@ class ArkitScenes(FolderSequence):
         if not images:
             raise InputError(f"`{folder}/lowres_wide` has no images named `..._SECONDS.png`")
         depths = _timed(folder / "lowres_depth") if (folder / "lowres_depth").is_dir() else []
-        files = tuple(
-            FrameFile(index, time, image, _nearest(time, depths)) for index, (time, image) in enumerate(images)
-        )
-        warn_of_no_depth(folder, files)
-        width, height = common_size(str(folder), files)
-        has_depth = any(file.depth is not None for file in files)
-        whole = cls(folder, folder.resolve().name, _pincam(folder, width, height), files, MILLIMETRES, has_depth)
-        return whole if not has_depth or whole.depth_can_be_read() else replace(whole, has_depth=False)
+        frames = [(time, image, _nearest(time, depths)) for time, image in images]
+        return cls.listed(folder, frames, lambda *size: _pincam(folder, *size), as_images=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth, enlarged to the images where it is smaller."""

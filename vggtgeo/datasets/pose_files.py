@@ -167,6 +167,15 @@ def same_size(stated: Sequence[object], size: tuple[int, int]) -> bool:
         return False
 
 
+def check_size(file: Path, stated: Sequence[object], size: tuple[int, int]) -> None:
+    """Raise InputError if a camera's file is of images of another size."""
+    if not same_size(stated, size):
+        raise InputError(
+            f"`{file}` is of images of {stated[0]} x {stated[1]} pixels; those here are {size[0]} x {size[1]}: write "
+            "the camera of these into it"
+        )
+
+
 _MOST_DIGITS = 300
 """Of a whole number that float64 holds, whatever its digits are."""
 

@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float
 
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
 
 _MOST_REACH = 16
@@ -24,12 +25,12 @@ _BORDER_STEPS = 64
 class DepthRegistration:
     """Brings depth of the camera `source` into the images of the camera `target`.
 
-    Fields: rays float64 [h, w, 2], x / z and y / z of each pixel of `source`, its lens undone; target; motion float64
+    Fields: rays float64 [h, w, 3], of each pixel of `source`, undistorted, z = 1; target; motion float64
     [4, 4], source -> target camera coordinates, metres; reach, half of the square that a pixel covers, pixels of
     `target`, along x and y.
     """
 
-    rays: Float[np.ndarray, "h w 2"]
+    rays: Float[np.ndarray, "h w 3"]
     target: Camera
     motion: Float[np.ndarray, "4 4"]
     reach: tuple[float, float]
@@ -38,9 +39,8 @@ class DepthRegistration:
     def of(cls, source: Camera, target: Camera, motion: Float[np.ndarray, "4 4"]) -> Self:
         """Prepares the rays: make it once for a recording."""
         pixels = np.stack(np.meshgrid(np.arange(source.width), np.arange(source.height)), axis=-1)
-        focal, centre = np.split(np.array(source.intrinsics), 2)
-        rays = (source.undistorted(pixels.astype(np.float64)) - centre) / focal
-        x, y = 0.5 * np.array(target.intrinsics[:2]) / focal
+        rays = pinhole.rays(source.undistorted(pixels.astype(np.float64)), source.intrinsics)
+        x, y = 0.5 * np.array(target.intrinsics[:2]) / source.intrinsics[:2]
         return cls(rays, target, motion, (float(x), float(y)))
 
     def __call__(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h2 w2"]:
@@ -51,10 +51,9 @@ class DepthRegistration:
         """
         known = np.isfinite(depth)
         z = depth[known].astype(np.float64)
-        points = np.column_stack([self.rays[known] * z[:, None], z]) @ self.motion[:3, :3].T + self.motion[:3, 3]
+        points = self.rays[known] * z[:, None] @ self.motion[:3, :3].T + self.motion[:3, 3]
         points = points[points[:, 2] > 0]
-        focal, centre = np.split(np.array(self.target.intrinsics), 2)
-        pixels, z = points[:, :2] / points[:, 2:] * focal + centre, points[:, 2]
+        pixels, z = pinhole.project(points, self.target.intrinsics, nearest=0.0), points[:, 2]
         if self.target.distorts:  # beyond its images a polynomial may lead back into them
             low, high = _undistorted_box(self.target)
             seen = ((pixels >= low) & (pixels <= high)).all(axis=1)

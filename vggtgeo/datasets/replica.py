@@ -7,13 +7,13 @@ The camera is in `cam_params.json` beside the rooms; the depth is in 1 / 6553.5 
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, NamedTuple, Self
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, warn_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.image_files import DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
-from vggtgeo.datasets.pose_files import read_json, read_matrices, same_size, trajectory_of_rows
+from vggtgeo.datasets.pose_files import check_size, read_json, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -21,6 +21,7 @@ from vggtgeo.io.errors import InputError
 _PUBLISHED = (600.0, 600.0, 599.5, 339.5)
 _PUBLISHED_SIZE = (1200, 680)
 _UNITS = 6553.5
+_CAMERA = "cam_params.json"
 
 
 @dataclass(frozen=True)
@@ -42,16 +43,15 @@ class Replica(FolderSequence):
         if not images:
             raise InputError(f"`{folder}` has no `results/frameXXXXXX.jpg`; expected a room of Replica")
         rows = rows_of(images, _poses_in(folder / "traj.txt"))
-        files = tuple(
-            FrameFile(index, (row - rows[0]) / FRAMES_PER_SECOND, image, _depth(image))
-            for index, (row, image) in enumerate(zip(rows, images, strict=True))
-        )
-        warn_of_no_depth(folder, files)
-        width, height = common_size(str(folder), files)
-        camera, units = _camera(folder, width, height)
-        coding = DepthFormat(units)
-        has_depth = depth_is_usable(str(folder), files, coding, width, height)
-        return cls(folder, folder.resolve().name, camera, files, coding, has_depth, rows=rows)
+        frames = [
+            ((row - rows[0]) / FRAMES_PER_SECOND, image, existing(_depth(image)))
+            for row, image in zip(rows, images, strict=True)
+        ]
+        places = (folder / _CAMERA, folder.resolve().parent / _CAMERA)
+        file = next((file for file in places if file.is_file()), None)
+        stated = None if file is None else _Stated.of(file)
+        coding = DepthFormat(_UNITS if stated is None else stated.scale)
+        return cls.listed(folder, frames, lambda *size: _camera(folder, stated, *size), coding, rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses."""
@@ -68,34 +68,40 @@ def _poses_in(file: Path) -> int | None:
         return None
 
 
-def _depth(image: Path) -> Path | None:
-    path = image.with_name(image.stem.replace("frame", "depth") + ".png")
-    return path if path.is_file() else None
+def _depth(image: Path) -> Path:
+    return image.with_name(image.stem.replace("frame", "depth") + ".png")
 
 
-def _camera(folder: Path, width: int, height: int) -> tuple[Camera, float]:
-    for file in (folder / "cam_params.json", folder.resolve().parent / "cam_params.json"):
-        if file.is_file():
-            values = read_json(file)
-            try:
-                camera = values["camera"]
-                found = tuple(float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
-                scale = float(camera["scale"])
-            except (KeyError, TypeError, ValueError) as error:
-                raise InputError(f"`{file}`: expected `camera` with fx, fy, cx, cy and scale ({error!r})") from None
-            if not (math.isfinite(scale) and scale > 0):
-                raise InputError(f"`{file}`: `scale` is {scale}; it must be a positive number of units a metre")
-            stated = camera.get("w", width), camera.get("h", height)
-            if not same_size(stated, (width, height)):
-                raise InputError(
-                    f"`{file}` is of images of {stated[0]} x {stated[1]} pixels; those here are {width} x {height}: "
-                    "write the camera of these into it"
-                )
-            return Camera(intrinsics_of(file, found), width, height), scale
+class _Stated(NamedTuple):
+    """Content of `cam_params.json`: size, as it is written; scale, units a metre."""
+
+    file: Path
+    intrinsics: tuple[float, float, float, float]
+    size: tuple[Any, Any]
+    scale: float
+
+    @classmethod
+    def of(cls, file: Path) -> Self:
+        try:
+            camera = read_json(file)["camera"]
+            intrinsics = intrinsics_of(file, [float(camera[name]) for name in ("fx", "fy", "cx", "cy")])
+            scale = float(camera["scale"])
+        except (KeyError, TypeError) as error:
+            raise InputError(f"`{file}` must have `camera` with fx, fy, cx, cy and scale ({error!r})") from None
+        if not (math.isfinite(scale) and scale > 0):
+            raise InputError(f"`{file}`: `scale` must be a positive number of units a metre, got {scale}")
+        return cls(file, intrinsics, (camera.get("w"), camera.get("h")), scale)
+
+
+def _camera(folder: Path, stated: _Stated | None, width: int, height: int) -> Camera:
+    if stated is not None:
+        if None not in stated.size:
+            check_size(stated.file, stated.size, (width, height))
+        return Camera(stated.intrinsics, width, height)
     own = camera_from_folder(folder, width, height)
     if own is None and (width, height) != _PUBLISHED_SIZE:
         raise InputError(
-            f"`{folder}` has no `cam_params.json`, and its images are {width} x {height} pixels; those of the "
-            f"published camera are {_PUBLISHED_SIZE[0]} x {_PUBLISHED_SIZE[1]}: put that file beside the scene"
+            f"`{folder}` has no `{_CAMERA}`, and its images are {width} x {height} pixels; those of the published "
+            f"camera are {_PUBLISHED_SIZE[0]} x {_PUBLISHED_SIZE[1]}: put that file beside the scene"
         )
-    return own or Camera(_PUBLISHED, width, height), _UNITS
+    return own or Camera(_PUBLISHED, width, height)

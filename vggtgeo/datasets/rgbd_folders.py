@@ -14,8 +14,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Self
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, warn_of_no_depth
-from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, MILLIMETRES
+from vggtgeo.datasets.folder import FolderSequence
+from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES
 from vggtgeo.datasets.images import image_files, times_by_name, warn_of_unread
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, list_of, lists_no_times, partners_in_time
@@ -83,17 +83,13 @@ class RgbdFolders(FolderSequence):
         times = times_by_name(images)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
         rows = sorted(zip(times, images, partners, strict=True), key=lambda row: row[0])
-        files = tuple(FrameFile(index, time, image, partner) for index, (time, image, partner) in enumerate(rows))
-        warn_of_no_depth(folder, files)
         _tell_of_no_image(folder, depths, partners)
-        width, height = common_size(str(folder), files)
-        camera = (
-            camera_from_folder(folder, width, height)
-            or camera_from_folder(colour, width, height)
-            or guess_with_warning(str(folder), width, height)
+        camera = lambda *size: (
+            camera_from_folder(folder, *size)
+            or camera_from_folder(colour, *size)
+            or guess_with_warning(str(folder), *size)
         )
-        has_depth = depth_is_usable(str(folder), files, MILLIMETRES, width, height, cls.depth_of_fewer_pixels)
-        return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth)
+        return cls.listed(folder, rows, camera)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses, if the folder has them."""

@@ -15,6 +15,7 @@ Source: A. Dai et al., "ScanNet", CVPR 2017.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +24,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, warn_of_no_depth
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_of_other_size
@@ -59,21 +60,21 @@ class ScanNet(FolderSequence):
         images = image_files(place, _COLOUR) if place.is_dir() else files_like(folder, "frame-*.color.*")
         if not images:
             raise InputError(f"`{place}` has no images; expected a scan of ScanNet, exported")
-        files = tuple(
-            FrameFile(index, _number(image, index) / FRAMES_PER_SECOND, image, _depth(folder, image))
+        frames = [
+            (_number(image, index) / FRAMES_PER_SECOND, image, _depth(folder, image))
             for index, image in enumerate(images)
-        )
-        warn_of_no_depth(folder, files)
+        ]
         colour, depth = _intrinsics(folder, "color"), _intrinsics(folder, "depth")
-        width, height = _size(folder, files)
-        # An absurd ratio of the two cameras would make a filter of any width.
-        taken = Camera(colour, *common_size(str(folder), files))
-        check_plausible(f"`{folder}`: the colour camera", taken)
-        warn_of_other_size(f"`{folder}`: the colour camera", taken)
-        has_depth = any(file.depth is not None for file in files)
-        camera = Camera(depth, width, height)
+
+        def camera(width: int, height: int) -> Camera:
+            # An absurd ratio of the two cameras would make a filter of any width.
+            taken = Camera(colour, width, height)
+            check_plausible(f"`{folder}`: the colour camera", taken)
+            warn_of_other_size(f"`{folder}`: the colour camera", taken)
+            return Camera(depth, *_size(folder, [depth for _, _, depth in frames]))
+
         motion = _extrinsics(folder, "color") @ np.linalg.inv(_extrinsics(folder, "depth"))
-        return cls(folder, folder.resolve().name, camera, files, MILLIMETRES, has_depth, colour, motion)
+        return cls.listed(folder, frames, camera, as_images=False, colour=colour, motion=motion)
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
         """The image as the depth camera would see it: an affine change of pixels, reduced with an average."""
@@ -171,13 +172,13 @@ def _calibration(folder: Path, what: str, camera: str, unstated: np.ndarray | No
     return info, np.array(values).reshape(4, 4)
 
 
-def _size(folder: Path, files: tuple[FrameFile, ...]) -> tuple[int, int]:
-    """Width and height of the depth images: of the first that can be read."""
+def _size(folder: Path, depths: Sequence[Path | None]) -> tuple[int, int]:
+    """Return width and height of the first depth image that can be read."""
     wrong = "has no depth image"
-    for file in files:
-        if file.depth is not None:
+    for file in depths:
+        if file is not None:
             try:
-                height, width = read_depth(file.depth, MILLIMETRES).shape
+                height, width = read_depth(file, MILLIMETRES).shape
             except InputError as error:
                 wrong = f"has no depth image that can be read ({error})"
                 continue

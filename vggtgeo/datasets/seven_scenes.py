@@ -11,15 +11,14 @@ objects stay some pixels off.
 
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, depth_is_usable, warn_of_no_depth
-from vggtgeo.datasets.image_files import MILLIMETRES
+from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.pose_files import trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
@@ -32,6 +31,7 @@ FRAMES_PER_SECOND = 30.0
 COLOUR_TRUTH = "groundtruth-colour.txt"
 _COLOUR = re.compile(r"frame-(\d+)\.color\.(?:png|jpe?g)")
 _KINECT = (525.0, 525.0, 320.0, 240.0)
+_AS_PUBLISHED = Camera(_KINECT, 640, 480)
 _KINECT_DEPTH = (585.0, 585.0, 320.0, 240.0)
 _TO_COLOUR = np.array(
     [
@@ -64,18 +64,12 @@ class SevenScenes(FolderSequence):
         if not _colour_files(folder):
             folder = _first_sequence(folder)
         numbered = _colour_files(folder)
-        files = tuple(
-            FrameFile(index, number / FRAMES_PER_SECOND, image, _beside(image, "depth.png"))
-            for index, (number, image) in enumerate(sorted(numbered.items()))
-        )
-        warn_of_no_depth(folder, files)
-        width, height = common_size(str(folder), files)
-        own = camera_from_folder(folder, width, height)
-        if own is not None and own.intrinsics == _KINECT_DEPTH:  # of what is not registered to the colour camera
-            own = None
-        camera = own or _published_camera(folder, width, height)
-        has_depth = depth_is_usable(str(folder), files, MILLIMETRES, width, height)
-        return cls(folder, folder.name, camera, files, MILLIMETRES, has_depth, own is None and camera.known)
+        frames = [
+            (number / FRAMES_PER_SECOND, image, existing(_beside(image, "depth.png")))
+            for number, image in sorted(numbered.items())
+        ]
+        whole = cls.listed(folder, frames, lambda *size: _camera(folder, *size))
+        return replace(whole, as_published=whole.camera is _AS_PUBLISHED)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """The depth in the colour camera."""
@@ -93,7 +87,7 @@ class SevenScenes(FolderSequence):
             return Trajectory.load_tum(self.folder / COLOUR_TRUTH)
         times, poses = [], []
         for file in self.files:
-            pose_file = file.image.with_name(file.image.name.split(".")[0] + ".pose.txt")
+            pose_file = _beside(file.image, "pose.txt")
             if pose_file.is_file() and (pose := _read_pose(pose_file)) is not None:
                 times.append(file.timestamp)
                 poses.append(pose @ np.linalg.inv(_TO_COLOUR) if self.as_published else pose)
@@ -123,12 +117,14 @@ def _first_sequence(folder: Path) -> Path:
     return sequences[0]
 
 
-def _beside(image: Path, suffix: str) -> Path | None:
-    path = image.with_name(f"{image.name.split('.')[0]}.{suffix}")
-    return path if path.is_file() else None
+def _beside(image: Path, suffix: str) -> Path:
+    return image.with_name(f"{image.name.split('.')[0]}.{suffix}")
 
 
-def _published_camera(folder: Path, width: int, height: int) -> Camera:
+def _camera(folder: Path, width: int, height: int) -> Camera:
+    own = camera_from_folder(folder, width, height)
+    if own is not None and own.intrinsics != _KINECT_DEPTH:  # to which the depth is not registered
+        return own
     if (width, height) != (640, 480):
         return guess_with_warning(str(folder), width, height)
     warnings.warn(
@@ -138,7 +134,7 @@ def _published_camera(folder: Path, width: int, height: int) -> Camera:
         NoteWarning,
         stacklevel=3,
     )
-    return Camera(_KINECT, width, height)
+    return _AS_PUBLISHED
 
 
 def _read_pose(file: Path) -> np.ndarray | None:

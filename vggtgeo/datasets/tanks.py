@@ -10,9 +10,9 @@ from typing import Self
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files, rows_of
-from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
+from vggtgeo.datasets.intrinsics import camera_or_guess
 from vggtgeo.datasets.pose_files import read_json, read_matrix, read_text, trajectory_of
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
@@ -47,11 +47,8 @@ class TanksAndTemples(FolderSequence):
         # The first image is `000001.jpg`, and 0 in the log.
         rows = rows_of(images, None)
         first = min(1, *rows)
-        times = [(row - first) / FRAMES_PER_SECOND for row in rows]
-        files = tuple(map(FrameFile, range(len(images)), times, images))
-        width, height = common_size(str(folder), files)
-        camera = camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
-        return cls(folder, folder.resolve().name, camera, files)
+        frames = [((row - first) / FRAMES_PER_SECOND, image, None) for row, image in zip(rows, images, strict=True)]
+        return cls.listed(folder, frames, lambda *size: camera_or_guess(folder, *size))
 
     def ground_truth(self) -> Trajectory | None:
         """COLMAP's poses of the images, a similarity applied where the scanner's frame is known."""

@@ -18,10 +18,11 @@ from typing import Self
 
 import numpy as np
 
-from vggtgeo.datasets.folder import LATEST, FolderSequence, FrameFile, common_size, depth_is_usable
+from vggtgeo.datasets.folder import LATEST, FolderSequence
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.text_files import whole_text
@@ -39,6 +40,7 @@ _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.tx
 MOST_FRAMES = 1e6
 """Whole numbers up to here are no times, but count frames."""
 _Entry = tuple[float, Path]
+_Frame = tuple[float, Path, Path | None]
 
 
 @dataclass(frozen=True)
@@ -56,23 +58,24 @@ class TumRgbd(FolderSequence):
         """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
         pairs = list_of(folder)
         if pairs is None or pairs.name == "rgb.txt":
-            files, coding = _of_lists(folder), FIVE_THOUSANDTHS
+            frames, coding = _of_lists(folder), FIVE_THOUSANDTHS
         else:
-            files, coding = _of_pairs(pairs)
-        width, height = common_size(str(folder), files)
-        camera = (
-            camera_from_folder(folder, width, height)
-            or published_camera(folder.resolve().name, width, height)
-            or published_camera(_recording(folder), width, height)
-            or guess_with_warning(str(folder), width, height)
-        )
-        has_depth = depth_is_usable(str(folder), files, coding, width, height)
-        return cls(folder, folder.resolve().name, camera, files, coding, has_depth)
+            frames, coding = _of_pairs(pairs)
+        return cls.listed(folder, frames, lambda *size: _camera(folder, *size), coding)
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
         file = self.folder / _TRUTH
         return Trajectory.load_tum(file) if file.exists() else None
+
+
+def _camera(folder: Path, width: int, height: int) -> Camera:
+    return (
+        camera_from_folder(folder, width, height)
+        or published_camera(folder.resolve().name, width, height)
+        or published_camera(_recording(folder), width, height)
+        or guess_with_warning(str(folder), width, height)
+    )
 
 
 def list_of(folder: Path) -> Path | None:
@@ -109,19 +112,19 @@ def _recording(folder: Path) -> str:
     return " ".join(line.partition("file:")[2] for line in head if line.startswith("#"))
 
 
-def _of_lists(folder: Path) -> tuple[FrameFile, ...]:
+def _of_lists(folder: Path) -> list[_Frame]:
     images = _read_list(folder / "rgb.txt", frames=True)
     depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
     partners = partners_in_time(images, depths)
     if depths and (alone := partners.count(None)):
         _warn(f"`{folder}`: {alone} of {len(images)} images have no depth within {MAX_DEPTH_DELAY} s")
-    return tuple(
-        FrameFile(index, time, image, None if partner is None else depths[partner][1])
-        for index, ((time, image), partner) in enumerate(zip(images, partners, strict=True))
-    )
+    return [
+        (time, image, None if partner is None else depths[partner][1])
+        for (time, image), partner in zip(images, partners, strict=True)
+    ]
 
 
-def _of_pairs(file: Path) -> tuple[tuple[FrameFile, ...], DepthFormat]:
+def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
     """The frames, and the unit of their depth: who counts frames is no benchmark, and has millimetres."""
     pairs = read_pairs(file, "TIME")
     counted = all(time.is_integer() and abs(time) < MOST_FRAMES for time, *_ in pairs)
@@ -134,9 +137,8 @@ def _of_pairs(file: Path) -> tuple[tuple[FrameFile, ...], DepthFormat]:
         (time / FRAMES_PER_SECOND if counted else time, file.parent / image): file.parent / depth
         for time, image, depth in pairs
     }
-    images = _in_order(file, list(depths), frames=True)
-    files = tuple(FrameFile(index, *image, depths[image]) for index, image in enumerate(images))
-    return files, MILLIMETRES if counted else FIVE_THOUSANDTHS
+    frames = [(*image, depths[image]) for image in _in_order(file, list(depths), frames=True)]
+    return frames, MILLIMETRES if counted else FIVE_THOUSANDTHS
 
 
 def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, real_array, real_numbers
-from vggtgeo.models import pinhole
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ B of the ground truth's point in the camera frame (lever arm and rotation),
 
 Both residuals have the noise model `drift_noise`, estimated alternately with the unknowns (D. Cochrane, G. H. Orcutt,
 JASA 44, 1949): errors of neighbouring poses are correlated, so that n poses are not n observations. Rotation and lever
-arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995. A Gauss-Newton loop of its own, in numpy, for
-two reasons: the whitening is O(n) per column, and the second Jacobian Z is not that of any residual.
+arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995. In numpy, not by `vggtgeo.solve`: whitening is
+O(n) per column, and the second Jacobian Z is not that of any residual.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ from scipy.stats import norm
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.evaluation.drift_noise import DriftNoise
 from vggtgeo.evaluation.interpolation import ContinuousTrajectory
+from vggtgeo.geometry.gauss_newton import gauss_newton
 from vggtgeo.geometry.rigid import cross
 from vggtgeo.geometry.trajectory import Trajectory
 
@@ -213,30 +214,24 @@ class OffsetModel:
         return Unknowns(rotation, solved[:3], scale, time, solved[3:6] if lever else np.zeros(3), turn)
 
     def _solved(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:
-        """Gauss-Newton with step halving."""
-        residuals = self._whitened(self._residuals(unknowns), noise)
-        for _ in range(_STEPS):
-            jacobian = self._whitened(self._jacobian(unknowns), noise) * (self._prior * free)
-            # The identity, the prior's information, keeps undetermined directions where they are.
-            normal = jacobian.T @ jacobian + np.eye(UNKNOWNS)
-            size = 1.0 / np.sqrt(np.diag(normal))
-            inverse = np.linalg.pinv(normal * np.outer(size, size), rcond=1e-13, hermitian=True)
-            step = -size * (inverse @ (size * (jacobian.T @ residuals)))
-            now, share = np.mean(residuals**2), 1.0
-            for _ in range(_HALVINGS):
-                moved = unknowns.moved(share * step * self._prior * free, self._middle)
-                share /= 2
-                if self.matched(moved.time) < 2:
-                    continue
-                residuals = self._whitened(self._residuals(moved), noise)
-                if np.mean(residuals**2) < now:
-                    break
-            else:
-                return unknowns
-            unknowns = moved
-            if now - np.mean(residuals**2) < 1e-7 * now:
-                return unknowns
-        return unknowns
+        """Return the solution of `J^T r = 0` by Gauss-Newton."""
+
+        def evaluate(unknowns: Unknowns) -> tuple[float, Callable[[], np.ndarray]]:
+            if self.matched(unknowns.time) < 2:
+                return np.inf, lambda: np.zeros(UNKNOWNS)
+            residuals = self._whitened(self._residuals(unknowns), noise)
+            return float(np.mean(residuals**2)), lambda: self._step(unknowns, residuals, free, noise)
+
+        moved = lambda unknowns, step: unknowns.moved(step * self._prior * free, self._middle)
+        return gauss_newton(unknowns, evaluate, moved, steps=_STEPS, trials=_HALVINGS)
+
+    def _step(self, unknowns: Unknowns, residuals: np.ndarray, free: np.ndarray, noise: Noises) -> np.ndarray:
+        jacobian = self._whitened(self._jacobian(unknowns), noise) * (self._prior * free)
+        # The identity, the prior's information, keeps undetermined directions where they are.
+        normal = jacobian.T @ jacobian + np.eye(UNKNOWNS)
+        size = 1.0 / np.sqrt(np.diag(normal))
+        inverse = np.linalg.pinv(normal * np.outer(size, size), rcond=1e-13, hermitian=True)
+        return np.asarray(-size * (inverse @ (size * (jacobian.T @ residuals))))
 
     def _predicted(self, unknowns: Unknowns, poses: np.ndarray) -> np.ndarray:
         found = poses.copy()

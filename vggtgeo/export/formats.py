@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-import time
 import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
@@ -60,8 +59,8 @@ FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
 _RECORD = ".vggtgeo-export"
 """Lists the files that exports wrote into a folder: the only ones that an export may replace."""
 _LOCK = ".vggtgeo-export.lock"
-_TRIES, _WAIT = 100, 0.1
-"""Number of times, and seconds between, that an export waits for another."""
+_TIMEOUT = 10.0
+"""Seconds that an export waits for another."""
 
 
 def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[str] | None = None) -> dict[str, float]:
@@ -136,19 +135,13 @@ def _new_stage(output: Path) -> Path:
 @contextmanager
 def _locked(output: Path) -> Iterator[None]:
     """Lock the folder against other exports, which hold it for a moment only; raise InputError after a timeout."""
-    with ExitStack() as lock:
-        for attempt in range(_TRIES + 1):
-            try:
-                lock.enter_context(locked(output / _LOCK))
-                break
-            except LockedError as error:
-                if attempt == _TRIES:
-                    raise InputError(
-                        f"`{output}` is in use by another export ({error}); give another folder with `-o`"
-                    ) from None
-                time.sleep(_WAIT)
-            except OSError as error:
-                raise not_written(output, error) from None
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(output / _LOCK, _TIMEOUT))
+        except LockedError:
+            raise InputError(f"`{output}` is in use by another export; give another folder with `-o`") from None
+        except OSError as error:
+            raise not_written(output, error) from None
         yield
 
 

@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from vggtgeo.geometry import pinhole
 from vggtgeo.io.errors import InputError
-from vggtgeo.models import pinhole
 
 GUESSED_FIELD_OF_VIEW = math.radians(60.0)
 """Of the longer image side: between phones (about 70 deg) and narrower depth and headset cameras (57 deg)."""

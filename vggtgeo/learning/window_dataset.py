@@ -25,16 +25,17 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_arrays, save_problem
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.datasets.image_files import is_there
-from vggtgeo.io.archives import read_archive
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import atomic_open, write_json
+from vggtgeo.io.files import write_json
 from vggtgeo.io.given import check_kind, check_whole, path_of
+from vggtgeo.io.persistence import Format
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 
 _INDEX = "windows.json"
-_VERSION = 1
+_VERSION = 2
+_LABELS = Format("set of labels", 1, {}, compressed=True)
 
 
 class LabelledWindow(NamedTuple):
@@ -83,8 +84,7 @@ class WindowWriter:
             raise InputError(f"`{self.folder}` holds windows already; give a new folder")
         self._check(problem, initial, arrays)
         save_problem(self.folder / _name(self.count), problem, initial, index)
-        with atomic_open(self.folder / f"{self.count:07d}.labels.npz", "wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
+        _LABELS.write(self.folder / f"{self.count:07d}.labels.npz", arrays)
         self.count += 1
 
     def __enter__(self) -> Self:
@@ -186,8 +186,7 @@ class WindowDataset:
         if not 0 <= row < self.count:
             raise IndexError(f"window {row} of {self.count}")
         problem, initial, _ = load_arrays(self.folder / _name(row), self.terms)
-        everything = lambda archive: archive.read(archive.members, lambda headers: None)
-        labels = read_archive(self.folder / f"{row:07d}.labels.npz", "the labels of a window", everything)
+        labels, _ = _LABELS.read(self.folder / f"{row:07d}.labels.npz")
         return LabelledWindow(problem, initial, labels)
 
     def order(self, seed: int, epoch: int = 0) -> np.ndarray:
@@ -268,8 +267,6 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
 
 
 def _label(name: str, given: Any) -> np.ndarray:
-    if name == "file" or "/" in name:
-        raise InputError(f"`{name}` can be no label: NumPy's files have no array of this name; give another")
     try:
         found = np.asarray(given)
     except ValueError as error:

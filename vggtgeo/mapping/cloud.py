@@ -7,11 +7,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.threads import map_in_threads
 

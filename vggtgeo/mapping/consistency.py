@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vggtgeo.geometry import pinhole
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.models import pinhole
 
 SIGMAS = 2.5
 """Largest difference of two views of one surface, standard deviations: 99 % of a normal distribution."""

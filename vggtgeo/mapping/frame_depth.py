@@ -10,11 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.mapping.consistency import DIFFERENCE_RANGE, PosedDepth, confirm
 from vggtgeo.mapping.dense import fill_holes
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.models import pinhole
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.state import Slam

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.camera import check_intrinsics
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
@@ -26,7 +26,6 @@ from vggtgeo.mapping.tsdf import (
     remove_small_parts,
     views_near,
 )
-from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 

@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.mapping.depth_map import COMPRESS_FROM
-from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 from vggtgeo.slam.threads import map_in_threads

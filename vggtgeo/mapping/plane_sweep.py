@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole
 
 NOISE = 1.0
 """Standard deviation of the image noise, grey levels: 2 of a camera, halved by averaging four pixels."""

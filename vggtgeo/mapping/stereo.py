@@ -13,6 +13,7 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 
+from vggtgeo.geometry import pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.consistency import PosedDepth, confirm
 from vggtgeo.mapping.depth_map import DepthMap
@@ -20,7 +21,6 @@ from vggtgeo.mapping.plane_sweep import Photo, matching_cost
 from vggtgeo.mapping.semi_global import semi_global
 from vggtgeo.mapping.stereo_views import choose_views, known_points
 from vggtgeo.mapping.uncertainty import support
-from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 GOOD_ANGLE = np.radians(3.0)

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 

@@ -23,10 +23,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.models import pinhole
 from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 
 Block = tuple[int, int, int]

@@ -25,8 +25,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.checkpoint_pace import EVERY, SHARE
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.given import check_real, path_of
-from vggtgeo.io.record_file import AGAIN, Layout
-from vggtgeo.io.records import by_name
+from vggtgeo.io.persistence import AGAIN, Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.output_checks import check_checkpoint_path
 from vggtgeo.results.summary import versions
@@ -130,7 +129,7 @@ class RunSoFar:
 
 
 KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, WindowRecord)
-CHECKPOINT = Layout("checkpoint", VERSION, by_name(KEPT_CLASSES))
+CHECKPOINT = Format("checkpoint", VERSION, by_name(KEPT_CLASSES))
 
 
 def run_identity(

@@ -1,13 +1,13 @@
 """Images, cameras and tracks of a run's views, for export to other programs.
 
 Views are the keyframes, or all frames. Files: `scene.npz`, `images/`, and `image-mask.png` if the undistorted images
-have invalid borders. `scene.npz` contains plain arrays, no pickles; `version` is that of its layout.
+have invalid borders.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,9 +16,8 @@ import numpy as np
 
 from vggtgeo.datasets import Sequence as Frames
 from vggtgeo.geometry import rigid
-from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import atomic_open
+from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.io.pictures import write_picture
 from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.results.reread_frames import reread_frames
@@ -27,23 +26,8 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import pieces_by_size
 
-VERSION = 1
 MASK = "image-mask.png"
 JPEG_QUALITY = 95
-_LAYOUT: dict[str, tuple[int | str, ...]] = {
-    "frames": ("k",),
-    "timestamps": ("k",),
-    "poses": ("k", 4, 4),
-    "intrinsics": (4,),
-    "size": (2,),
-    "metric": (),
-    "track_points": ("n", 3),
-    "track_colours": ("n", 3),
-    "track_point": ("m",),
-    "track_view": ("m",),
-    "track_pixel": ("m", 2),
-}
-"""Shapes of the arrays: `k` views, `n` points, `m` observations."""
 _MAX_COORDINATE, _MAX_PIXEL = 1e10, 1e7
 _MAX_SIDE = 100_000
 """Pixels."""
@@ -51,7 +35,6 @@ _ROTATION_TOLERANCE = 1e-3
 """Largest entry of `R R^T - I`."""
 _TIME_TOLERANCE, _POSITION_TOLERANCE = 1e-5, 1e-4
 """Seconds, and relative length: the rounding of pose files."""
-_INTEGERS = ("frames", "size", "track_point", "track_view")
 
 
 def image_name(frame: int) -> str:
@@ -136,83 +119,68 @@ class Scene:
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Scene:
-        """Load `scene.npz` of a run's folder; raise InputError if it is missing, invalid or of another layout."""
+        """Load `scene.npz` of a run's folder; raise InputError if it is missing, invalid or of another version."""
         path = Path(folder) / "scene.npz"
-        try:
-            return cls._of(read_archive(path, "the scene of a run", _read))
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"`{path}` is invalid ({error}); give a folder that `vggtgeo run` wrote") from None
-
-    @classmethod
-    def _of(cls, values: Mapping[str, np.ndarray]) -> Scene:
-        count = len(values["frames"])
-        poses, (width, height) = values["poses"], values["size"]
-        tracks = Tracks(*(values[f"track_{name}"] for name in ("points", "colours", "point", "view", "pixel")))
-        if not (len(tracks.point) == len(tracks.view) == len(tracks.pixel)):
-            raise ValueError("`track_point`, `track_view` and `track_pixel` must have equal lengths")
-        if len(tracks.point) and not (0 <= tracks.view.min() <= tracks.view.max() < count):
-            raise ValueError(f"`track_view` must be in [0, {count})")
-        if len(tracks.point) and not (0 <= tracks.point.min() <= tracks.point.max() < len(tracks)):
-            raise ValueError(f"`track_point` must be in [0, {len(tracks)})")
-        if len(np.unique(values["frames"])) != count or not np.isfinite(values["timestamps"]).all():
-            raise ValueError("`frames` must be distinct and `timestamps` finite")
-        size, intrinsics = (int(width), int(height)), values["intrinsics"]
-        wrong = _invalid_value(poses, intrinsics, size, tracks)
+        scene, _ = SCENE.read(path)
+        wrong = scene._invalid() if isinstance(scene, cls) else f"it holds a {type(scene).__name__}"
         if wrong:
-            raise ValueError(wrong)
-        return cls(values["frames"], values["timestamps"], poses, intrinsics, size, tracks, bool(values["metric"]))
+            raise InputError(f"`{path}` is invalid ({wrong}); give a folder that `vggtgeo run` wrote")
+        found: Scene = scene
+        return found
+
+    def _invalid(self) -> str | None:
+        """Describe the first invalid value, if any: the programs that import an export do not check."""
+        return self._invalid_array() or self._invalid_view() or self._invalid_track()
+
+    def _invalid_array(self) -> str | None:
+        tracks, views = self.tracks, len(self.frames)
+        arrays: dict[str, tuple[np.ndarray, tuple[int, ...], str]] = {
+            "frames": (self.frames, (views,), "iu"),
+            "timestamps": (self.timestamps, (views,), "iuf"),
+            "poses": (self.poses, (views, 4, 4), "iuf"),
+            "intrinsics": (self.intrinsics, (4,), "iuf"),
+            "points": (tracks.points, (len(tracks.points), 3), "iuf"),
+            "colours": (tracks.colours, (len(tracks.points), 3), "u"),
+            "point": (tracks.point, (len(tracks.point),), "iu"),
+            "view": (tracks.view, (len(tracks.point),), "iu"),
+            "pixel": (tracks.pixel, (len(tracks.point), 2), "iuf"),
+        }
+        for name, (array, shape, kinds) in arrays.items():
+            if array.shape != shape or array.dtype.kind not in kinds:
+                return f"`{name}` is {array.dtype} of shape {array.shape}, must have shape {shape}"
+            if not np.isfinite(array).all():
+                return f"`{name}` must be finite"
+        return None
+
+    def _invalid_view(self) -> str | None:
+        views = len(self.frames)
+        if len(np.unique(self.frames)) != views or not views:
+            return f"`frames` must be distinct, at least one, got {views}"
+        if not (0 < min(self.size) <= max(self.size) <= _MAX_SIDE):
+            return f"`size` must be at most {_MAX_SIDE} pixels a side, got {self.size}"
+        if not ((self.intrinsics[:2] > 0).all() and np.abs(self.intrinsics).max() < _MAX_PIXEL):
+            return f"`intrinsics` must have positive focal lengths, got {self.intrinsics}"
+        rotations = self.poses[:, :3, :3].astype(np.float64)
+        turned = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max() < _ROTATION_TOLERANCE
+        if not (turned and np.abs(self.poses).max() < _MAX_COORDINATE):
+            return "`poses` must be rigid motions"
+        return None
+
+    def _invalid_track(self) -> str | None:
+        tracks = self.tracks
+        for name, values, limit in (("points", tracks.points, _MAX_COORDINATE), ("pixel", tracks.pixel, _MAX_PIXEL)):
+            if np.abs(values).max(initial=0.0) > limit:
+                return f"`{name}` must be at most {limit:g}"
+        for name, values, count in (("view", tracks.view, len(self.frames)), ("point", tracks.point, len(tracks))):
+            if len(values) and not 0 <= values.min() <= values.max() < count:
+                return f"`{name}` must be in [0, {count})"
+        seen = np.bincount(tracks.point, minlength=len(tracks))
+        if (np.diff(tracks.point) < 0).any() or (seen == 0).any():
+            return "`point` must be sorted and contain every point"
+        return None
 
 
-def _invalid_value(poses: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], tracks: Tracks) -> str | None:
-    """Describe the first invalid value, if any: the programs that import an export do not check."""
-    if not len(poses):
-        return "`frames` is empty"
-    if not (0 < min(size) <= max(size) <= _MAX_SIDE):
-        return f"`size` is {size[0]} x {size[1]} pixels, at most {_MAX_SIDE} a side"
-    if not (np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all() and np.abs(intrinsics).max() < _MAX_PIXEL):
-        return f"`intrinsics` is {intrinsics}; it must be finite, with positive focal lengths"
-    rotations = poses[:, :3, :3].astype(np.float64)
-    if not (
-        np.isfinite(poses).all()
-        and np.abs(poses).max() < _MAX_COORDINATE
-        and np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max() < _ROTATION_TOLERANCE
-    ):
-        return "`poses` must be rigid motions"
-    if not (np.isfinite(tracks.points).all() and np.isfinite(tracks.pixel).all()):
-        return "`track_points` and `track_pixel` must be finite"
-    if np.abs(tracks.points).max(initial=0.0) > _MAX_COORDINATE or np.abs(tracks.pixel).max(initial=0.0) > _MAX_PIXEL:
-        return f"`track_points` or `track_pixel` is above {_MAX_COORDINATE:g} or {_MAX_PIXEL:g}"
-    if tracks.colours.dtype != np.uint8:
-        return f"`track_colours` is {tracks.colours.dtype}; expected uint8"
-    seen = np.bincount(tracks.point, minlength=len(tracks))
-    if (np.diff(tracks.point) < 0).any() or (seen == 0).any():
-        return "`track_point` must be sorted and contain every point"
-    return None
-
-
-def _read(archive: Archive) -> dict[str, np.ndarray]:
-    version = archive.read(["version"], lambda headers: None)["version"] if "version" in archive else np.array(0)
-    if version.shape or version != VERSION:
-        raise InputError(f"`{archive.path}` has layout version {version}, expected {VERSION}; run again")
-    missing = [name for name in _LAYOUT if name not in archive]
-    if missing:
-        raise ValueError(f"the arrays {', '.join(missing)} are missing")
-    return archive.read(_LAYOUT, _check)
-
-
-def _check(headers: Mapping[str, ArrayHeader]) -> None:
-    """Validate shapes and types against the layout, before the arrays are read."""
-    lengths: dict[int | str, int] = {}
-    for name, layout in _LAYOUT.items():
-        found = headers[name]
-        for axis, length in zip(layout, found.shape, strict=False):
-            lengths.setdefault(axis, length if isinstance(axis, str) else axis)
-        expected = tuple(lengths.get(axis, axis) for axis in layout)
-        kinds, expected_type = ("iu", "integers") if name in _INTEGERS else ("iufb", "numbers")
-        if found.shape != expected or found.dtype.kind not in kinds:
-            raise ValueError(f"`{name}` is {found.dtype} of shape {found.shape}; expected {expected_type}, {expected}")
+SCENE = Format("scene", 2, by_name((Scene, Tracks)))
 
 
 def _largest_submap(slam: Slam) -> tuple[Keyframe, ...]:
@@ -232,23 +200,7 @@ def write_scene(folder: Path, slam: Slam, valid: np.ndarray | None = None, frame
         scene = scene.with_frames(list(_other_frames(folder / "images", slam, scene, frames)))
     if valid is not None:
         write_picture(folder / MASK, np.where(valid, 255, 0).astype(np.uint8))
-    tracks = scene.tracks
-    with atomic_open(folder / "scene.npz", "wb") as handle:
-        np.savez_compressed(
-            handle,
-            version=VERSION,
-            frames=scene.frames,
-            timestamps=scene.timestamps,
-            poses=scene.poses,
-            intrinsics=scene.intrinsics,
-            size=scene.size,
-            metric=scene.metric,
-            track_points=tracks.points,
-            track_colours=tracks.colours,
-            track_point=tracks.point,
-            track_view=tracks.view,
-            track_pixel=tracks.pixel,
-        )
+    SCENE.write(folder / "scene.npz", scene)
 
 
 def _other_frames(folder: Path, slam: Slam, scene: Scene, frames: Frames) -> Iterator[tuple[int, float, np.ndarray]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-import resource
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -14,9 +13,10 @@ import numpy as np
 
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.cameras import RadialTangential
+from vggtgeo.geometry.camera_models import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.peak_memory import peak_memory_gb
 from vggtgeo.results.files import submap_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
@@ -75,7 +75,7 @@ def summarise(
         "keyframes": len(slam.keyframes),
         "pairs": len(slam.map.pairs),
         "pieces": list_submaps(slam),
-        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
+        "peak_memory_gb": round(peak_memory_gb(), 3),
         "scale": scale_name(slam, verdict),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
         **_pose_sigma(slam),

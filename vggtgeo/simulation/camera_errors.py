@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.degradations import Recording, with_images
@@ -35,12 +36,11 @@ def motion_field(
     Returns the motion of the pixels, float32 [H, W, 2], pixels a second, and that of their depth, float32 [H, W],
     metres a second.
     """
-    fx, fy, cx, cy = intrinsics
+    fx, fy = intrinsics[:2]
     known = np.isfinite(depth) & (depth > 0)
     usual = float(np.median(depth[known])) if known.any() else 1.0
     z = np.where(known, depth, usual)
-    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]].astype(np.float64)
-    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], -1)
+    points = pinhole.grid_rays((depth.shape[0], depth.shape[1]), intrinsics) * z[..., None]
     moved = np.cross(velocity[3:], points) + velocity[:3]
     x, y = points[..., 0] / z, points[..., 1] / z
     field = np.stack([fx * (moved[..., 0] - x * moved[..., 2]) / z, fy * (moved[..., 1] - y * moved[..., 2]) / z], -1)

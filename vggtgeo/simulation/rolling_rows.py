@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.geometry import lie, rigid
+from vggtgeo.geometry import lie, pinhole, rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -37,7 +37,7 @@ def rolled(frame: Frame, velocity: np.ndarray, intrinsics: tuple[float, ...], se
     """
     if frame.depth is None:
         raise InputError(f"frame {frame.index} has no depth; a rolling shutter is drawn by it: take frames with depth")
-    (height, width), (fx, fy, cx, cy) = frame.image.shape[:2], intrinsics
+    height, width = frame.image.shape[:2]
     known = np.isfinite(frame.depth) & (frame.depth > 0)
     if not known.any():
         return frame
@@ -46,15 +46,14 @@ def rolled(frame: Frame, velocity: np.ndarray, intrinsics: tuple[float, ...], se
     moments = seconds * ((np.arange(height) + 0.5) / height - 0.5)
     # From the camera at the moment of a row to the one of the frame.
     back = np.asarray(lie.exp(jnp.asarray(-moments[:, None] * velocity)).as_matrix(), np.float64)
-    v, u = np.mgrid[:height, :width].astype(np.float64)
-    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], -1)
+    rays = pinhole.grid_rays((height, width), intrinsics)
 
     def seen(depth: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """At the moment of the frame, what lies at these depths in the rows: its depth, and its pixels."""
         there = np.einsum("rij,rcj->rci", back[:, :3, :3], rays * depth[..., None]) + back[:, None, :3, 3]
-        ahead = np.maximum(there[..., 2], 1e-3)
-        at = (fx * there[..., 0] / ahead + cx, fy * there[..., 1] / ahead + cy)
-        return there[..., 2], (at[0].astype(np.float32), at[1].astype(np.float32))
+        ahead = np.concatenate([there[..., :2], np.maximum(there[..., 2:], 1e-3)], -1)
+        at = pinhole.project(ahead, intrinsics, nearest=0.0).astype(np.float32)
+        return there[..., 2], (at[..., 0], at[..., 1])
 
     depth = full.astype(np.float64)
     for _ in range(ROUNDS):

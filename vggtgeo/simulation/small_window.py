@@ -19,6 +19,7 @@ from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.geometry import pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_real, check_whole
 
@@ -237,13 +238,11 @@ def _seen(edges: np.ndarray, host: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def project_between(poses: np.ndarray, edges: np.ndarray, pixel: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Pixels in the target keyframe of each edge."""
-    focal, centre = np.array(INTRINSICS[:2]), np.array(INTRINSICS[2:])
     turns = Rotation.from_quat(poses[:, :4], scalar_first=True)
     host, target = edges.T
-    local = np.column_stack([(pixel - centre) / focal, np.ones(len(pixel))]) * depth[:, None]
+    local = pinhole.rays(pixel, INTRINSICS) * depth[:, None]
     world = turns[host].inv().apply(local - poses[host, 4:])
-    seen = turns[target].apply(world) + poses[target, 4:]
-    return seen[:, :2] / seen[:, 2:] * focal + centre
+    return pinhole.project(turns[target].apply(world) + poses[target, 4:], INTRINSICS)
 
 
 def _lines(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.models import pinhole
 from vggtgeo.simulation.raster import EMPTY, NEAR, View, inverse_depth_at
 from vggtgeo.simulation.render import Picture
 from vggtgeo.simulation.scene import Scene
@@ -56,25 +56,22 @@ def locate(
     view, picture: of the camera at `pose`. Exact at sub-pixel places: the ray meets the surface that the nearest
     pixel's centre sees.
     """
-    fx, fy, cx, cy = camera.intrinsics
     height, width = picture.surface.shape
     columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
     rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
     surface = picture.surface[rows, columns]
     there = surface != EMPTY
-    x, y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
+    rays = pinhole.rays(np.asarray(pixels, np.float64), camera.intrinsics)
     with np.errstate(divide="ignore"):
-        depth = 1.0 / inverse_depth_at(view, np.where(there, surface, 0), x, y)
-    points = depth[:, None] * np.stack([x, y, np.ones_like(x)], axis=1)
+        depth = 1.0 / inverse_depth_at(view, np.where(there, surface, 0), rays[:, 0], rays[:, 1])
+    points = depth[:, None] * rays
     return (points - pose[:3, 3]) @ pose[:3, :3], there & np.isfinite(depth) & (depth > 0)
 
 
 def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Pixels float64 [n, 2] and depths [n] of world points [n, 3]; NaN pixels behind the camera."""
-    fx, fy, cx, cy = camera.intrinsics
     local = points @ pose[:3, :3].T + pose[:3, 3]
-    z = np.where(local[:, 2] > NEAR, local[:, 2], np.nan)
-    return np.stack([fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy], axis=1), local[:, 2]
+    return pinhole.project(local, camera.intrinsics, NEAR), local[:, 2]
 
 
 def farthest_depth(picture: Picture) -> np.ndarray:
@@ -163,14 +160,12 @@ def _visible_parts(
     seen = is_visible(samples[:, :2], 1.0 / samples[:, 2], maps[0])
     seen[1:-1] |= seen[:-2] & seen[2:]  # one hidden sample is no gap
     bounds = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
-    fx, fy, cx, cy = camera.intrinsics
     parts = []
     for first, last in zip(bounds[::2], bounds[1::2] - 1, strict=True):
         run = samples[[first, last]]
         if np.linalg.norm(run[1, :2] - run[0, :2]) < shortest:
             continue
-        rays = np.column_stack([(run[:, 0] - cx) / fx, (run[:, 1] - cy) / fy, np.ones(2)])
-        points = (rays / run[:, 2:] - pose[:3, 3]) @ pose[:3, :3]
+        points = (pinhole.rays(run[:, :2], camera.intrinsics) / run[:, 2:] - pose[:3, 3]) @ pose[:3, :3]
         at = np.rint(samples[first : last + 1, :2]).astype(int)
         parts.append((run[:, :2], points, index, float(maps[1][at[:, 1], at[:, 0]].mean())))
     return parts

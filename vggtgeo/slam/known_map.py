@@ -17,8 +17,7 @@ import numpy as np
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import path_of
-from vggtgeo.io.record_file import Layout
-from vggtgeo.io.records import by_name
+from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
@@ -27,7 +26,7 @@ from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 
-MAP = Layout("map", VERSION, by_name(STATE_CLASSES))
+MAP = Format("map", VERSION, by_name(STATE_CLASSES))
 LEAST_KNOWN = 0.2
 """Share of a keyframe's key points that its own picture, described once more as it is kept, must match: 0.71 and more
 of SIFT's, 0.92 of ORB's (13 keyframes of redkitchen and building-walk); descriptors of another kind hardly any."""

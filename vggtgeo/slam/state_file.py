@@ -24,11 +24,10 @@ from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
 from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.cameras import Pinhole
+from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import path_of
-from vggtgeo.io.record_file import AGAIN, Layout
-from vggtgeo.io.records import by_name
+from vggtgeo.io.persistence import AGAIN, Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.mast3r import Mast3rView
@@ -76,9 +75,9 @@ STATE_CLASSES: tuple[type, ...] = (
     *(PointTerm, LineTerm, DepthPrior, IntrinsicsPrior, RelativePose, SurfaceAlignment, RotationPrior, BaselinePrior),
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
-"""All that a file may name; a state with anything else in it is not written."""
-VERSION = 15
-STATE = Layout("state", VERSION, by_name(STATE_CLASSES))
+"""All classes that a file may have; a state with any other is not written."""
+VERSION = 16
+STATE = Format("state", VERSION, by_name(STATE_CLASSES))
 
 
 def save_state(path: str | os.PathLike[str], slam: Slam) -> None:

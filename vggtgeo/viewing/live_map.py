@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots, read_at
 from vggtgeo.slam.state import Slam
 

@@ -27,7 +27,7 @@ from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import Pinhole
+from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.io.readable import Readable

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import Pinhole
+from vggtgeo.geometry.camera_models import Pinhole
 
 MOTIONS = ("translation along x", "translation along y", "translation along z", "pitch", "yaw", "roll")
 """The names of a tangent's coordinates."""

@@ -39,7 +39,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtgeo.geometry.cameras import MIN_RELATIVE_DEPTH
+from vggtgeo.geometry.camera_models import MIN_RELATIVE_DEPTH
 
 
 class Projection(NamedTuple):

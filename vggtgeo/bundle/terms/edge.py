@@ -36,7 +36,7 @@ from vggtgeo.bundle.terms.term import (
 )
 from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import Cameras, Pinhole, SquarePinhole
+from vggtgeo.geometry.camera_models import Cameras, Pinhole, SquarePinhole
 
 Rows = tuple[Float[Array, " p"], ...]
 """Entries of a residual, one array each: a stacked one keeps XLA from vectorising the loop around it."""

@@ -21,7 +21,7 @@ from vggtgeo.bundle.terms.term import (
     robust_energy,
 )
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import AbstractCamera, Cameras
+from vggtgeo.geometry.camera_models import AbstractCamera, Cameras
 from vggtgeo.io.errors import InputError
 
 _Index = Int[Array, " m"]

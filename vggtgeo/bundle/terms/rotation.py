@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from vggtgeo.bundle.terms.node import PoseTerm
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.cameras import AbstractCamera
+from vggtgeo.geometry.camera_models import AbstractCamera
 
 
 class RotationPrior(PoseTerm):

@@ -6,7 +6,7 @@ import equinox as eqx
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo.geometry.cameras import AbstractCamera
+from vggtgeo.geometry.camera_models import AbstractCamera
 
 
 class View(eqx.Module):

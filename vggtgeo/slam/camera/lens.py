@@ -24,7 +24,7 @@ from jaxtyping import Float
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.geometry.camera import Camera, Undistorter
-from vggtgeo.geometry.cameras import RadialTangential, SquarePinhole, SquareRadialTangential
+from vggtgeo.geometry.camera_models import RadialTangential, SquarePinhole, SquareRadialTangential
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.camera.camera_gain import gain

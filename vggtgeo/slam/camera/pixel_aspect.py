@@ -17,7 +17,7 @@ import numpy as np
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.geometry.cameras import Pinhole
+from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.slam.camera.camera_gain import gain
 
 MIN_STRETCH = 0.03

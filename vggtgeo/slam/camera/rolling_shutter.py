@@ -27,7 +27,7 @@ from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.cameras import SquarePinhole
+from vggtgeo.geometry.camera_models import SquarePinhole
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.camera_gain import MIN_HOSTS, gain, match_energies
 from vggtgeo.slam.threads import map_in_threads

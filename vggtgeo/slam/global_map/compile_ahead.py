@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
+from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.global_map.global_adjustment import camera_of
 from vggtgeo.slam.global_map.global_shape import LARGEST_DENSE, GlobalShape, global_solver, padded_count, shape_for

@@ -16,8 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.sparse_map.factors import surface_term
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 

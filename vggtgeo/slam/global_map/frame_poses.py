@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.camera.rolling_shutter import at_once
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions

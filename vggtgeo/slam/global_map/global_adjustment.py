@@ -10,7 +10,7 @@ import numpy as np
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
+from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.camera.camera_of_pairs import CameraPair

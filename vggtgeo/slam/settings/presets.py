@@ -233,7 +233,7 @@ def _players(
             return DenseLineMatcher(features[name]) if role == "line_matches" else features[name]
         if name == "mast3r":
             return Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache))
-        return _KINDS[NETWORKS[name].contract_name](networks[name], _cache(cache))
+        return _KINDS[NETWORKS[name].contract_name](session=networks[name], cache=_cache(cache))
 
     bounded = {role: _BOUNDED[role](player(role, name)) for role, name in parts.items() if role in _BOUNDED}
     refusals = {role: part.refusals for role, part in bounded.items()}

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.roles import LineMatches, PointMatches, RelativeView
 from vggtgeo.slam.settings.slam_settings import Roles, check_answer
 from vggtgeo.slam.sparse_map.keyframe import Keyframe

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
-from vggtgeo.models.rigid_motion import exponential
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.models.roles import LineFeatures, LineMatcher
 from vggtgeo.slam.perception.rgbd_alignment import Aligned
 from vggtgeo.slam.sparse_map.keyframe import Keyframe

@@ -22,10 +22,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.models.classical import line_coefficients
-from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import tangent, worst_sigma

@@ -15,10 +15,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2 as chi_square
 
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
-from vggtgeo.models.rigid_motion import exponential
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import tangent

@@ -13,7 +13,7 @@ from vggtgeo.bundle.padding import PaddedSize, SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.cameras import Pinhole, SquarePinhole
+from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
 from vggtgeo.slam.settings.slam_settings import SlamSettings

@@ -18,8 +18,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2 as chi_square
 
-from vggtgeo.geometry import rigid
-from vggtgeo.models import pinhole
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.keyframe import Keyframe

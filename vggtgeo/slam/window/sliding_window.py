@@ -17,7 +17,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.cameras import AbstractCamera, Pinhole
+from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.models.classical import can_search
 from vggtgeo.slam.precision import in_double_precision

@@ -241,7 +241,7 @@ class Cameras(eqx.Module):
 
     Example: keyframes 0 and 2 were taken by the first of two cameras.
         >>> import jax.numpy as jnp
-        >>> from vggtgeo.geometry.cameras import Cameras, SquarePinhole
+        >>> from vggtgeo.geometry.camera_models import Cameras, SquarePinhole
         >>> both = jnp.array([[500.0, 320.0, 240.0], [300.0, 160.0, 120.0]])
         >>> float(Cameras(both, SquarePinhole, jnp.array([0, 1, 0])).of(1).parameters[0])
         300.0

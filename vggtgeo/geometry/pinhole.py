@@ -1,4 +1,4 @@
-"""The ideal pinhole in numpy: where pixels become rays and points pixels, outside the bundle adjustment.
+"""The ideal pinhole in numpy: rays of pixels and projection of points. `camera_models.py` has it for JAX.
 
 Intrinsics are `(fx, fy, cx, cy)` in pixels, pixel (0, 0) is the centre of the top-left pixel, camera axes are x right,
 y down, z forward (Hartley and Zisserman 2004, section 6.1). Results keep the floating type of points and depths.
@@ -14,26 +14,26 @@ Intrinsics = Sequence[float] | np.ndarray
 
 
 def matrix(intrinsics: Intrinsics) -> np.ndarray:
-    """The calibration matrix K, float64 [3, 3]."""
+    """Return the calibration matrix K, float64 [3, 3]."""
     fx, fy, cx, cy = (float(value) for value in intrinsics)
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def rays(pixels: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
-    """Viewing rays with z = 1, float [..., 3], of pixels [..., 2]."""
+    """Return the viewing rays with z = 1, float [..., 3], of pixels [..., 2]."""
     focal, centre = _split(intrinsics, pixels.dtype)
     flat = (pixels - centre) / focal
     return np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
 
 
 def grid_rays(shape: tuple[int, int], intrinsics: Intrinsics, dtype: type[np.floating] = np.float64) -> np.ndarray:
-    """Viewing rays with z = 1 of all pixels of an image of `shape` (height, width), [h, w, 3]."""
+    """Return the viewing rays with z = 1 of all pixels of an image of `shape` (height, width), [h, w, 3]."""
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     return rays(np.stack([columns, rows], axis=-1).astype(dtype), intrinsics)
 
 
 def project(points: np.ndarray, intrinsics: Intrinsics, nearest: float = 1e-3) -> np.ndarray:
-    """Pixels [..., 2] of points [..., 3] in the camera's frame; NaN where they are nearer than `nearest` metres."""
+    """Return the pixels [..., 2] of points [..., 3] in the camera's frame, NaN where z <= `nearest` (metres)."""
     focal, centre = _split(intrinsics, points.dtype)
     z = np.where(points[..., 2] > nearest, points[..., 2], np.nan)
     pixels = np.empty((*z.shape, 2), np.result_type(points, focal))
@@ -45,9 +45,9 @@ def project(points: np.ndarray, intrinsics: Intrinsics, nearest: float = 1e-3) -
 def epipolar_distance(
     pixels_i: np.ndarray, pixels_j: np.ndarray, motion: np.ndarray, intrinsics: Intrinsics
 ) -> np.ndarray:
-    """Of `pixels_j` [n, 2] from the lines of `pixels_i` under a motion i -> j, float64 [4, 4]; pixels, float64 [n].
+    """Return the distances of `pixels_j` [n, 2] from the epipolar lines of `pixels_i`, float64 [n], pixels.
 
-    Of square pixels. Zero where there is no line: a camera that has not moved contradicts no match.
+    motion: i -> j, [4, 4]. Pixels must be square. Without translation there are no lines, and distances are 0.
     """
     essential = np.cross(motion[:3, 3], motion[:3, :3].T).T  # [t]x R: Hartley and Zisserman 2004, section 9.6
     lines = rays(np.asarray(pixels_i, np.float64), intrinsics) @ essential.T
@@ -60,10 +60,9 @@ def epipolar_distance(
 def visible(
     points: np.ndarray, intrinsics: Intrinsics, shape: tuple[int, int], nearest: float = 0.1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which points of the camera's frame [n, 3] an image of `shape` (height, width) sees, and in which pixels.
+    """Return which points [n, 3] in the camera's frame are inside an image of `shape` (height, width), bool [n].
 
-    Returns bool [n], then int row and column of those that are seen. Nothing is nearer than `nearest` metres: the
-    sensors of depth begin there.
+    Also returns row and column of those points, int. nearest: minimum depth, metres; that of depth sensors.
     """
     with np.errstate(invalid="ignore"):
         x, y = np.ascontiguousarray(np.rint(project(points, intrinsics, nearest)).T)
@@ -72,14 +71,14 @@ def visible(
 
 
 def coarser(intrinsics: Intrinsics, factor: int) -> np.ndarray:
-    """Intrinsics, float64 [4], of an image whose pixels are blocks of `factor` x `factor` pixels."""
+    """Return the intrinsics, float64 [4], of an image whose pixels are blocks of `factor` x `factor` pixels."""
     fx, fy, cx, cy = (float(value) for value in intrinsics)
     middle = 0.5 * (factor - 1)  # the centre of the first block, in pixels of the fine image
     return np.array([fx, fy, cx - middle, cy - middle]) / factor
 
 
 def projection_rows(points: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the pixel's x and y by the left tangent of the pose, [6, n] each, translation first.
+    """Return the derivatives of the pixel's x and y by the left tangent of the pose, [6, n] each, translation first.
 
     points: [n, 3] in the camera's frame, in front of it.
     """
@@ -92,6 +91,6 @@ def projection_rows(points: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndar
 
 
 def _split(intrinsics: Intrinsics, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
-    """Focal lengths and principal point [2] each, in `dtype` (float64 for pixels that are integers)."""
+    """Return focal lengths and principal point, [2] each, in `dtype` (float64 for integer pixels)."""
     values = np.asarray(intrinsics, dtype if np.issubdtype(dtype, np.floating) else np.float64)
     return values[:2], values[2:]

@@ -1,0 +1,53 @@
+"""Gauss-Newton for a pose, a camera or a few offsets, in numpy; problems with landmarks use `vggtgeo.solve`.
+
+With the residuals `r` and their Jacobian `J` by a local step, each iteration takes `dx = -(J^T W J)^-1 J^T W r` (the
+weights `W` of a robust kernel, Huber and Ronchetti 2009, section 7.8) and halves it until the energy falls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+Point = TypeVar("Point")
+_GAIN = 1e-7
+"""Relative decrease of the energy below which the iteration has converged."""
+
+
+def gauss_newton(
+    start: Point,
+    evaluate: Callable[[Point], tuple[float, Callable[[], np.ndarray]]],
+    moved: Callable[[Point, np.ndarray], Point],
+    *,
+    steps: int = 10,
+    trials: int = 4,
+) -> Point:
+    """Return the point to which Gauss-Newton with step halving descends from `start`.
+
+    evaluate: returns the energy at a point, infinite where it is undefined, and a function that returns the step from
+    there; the function is called for accepted points only. moved: applies a step to a point. trials: number of lengths
+    that are tried for a step, each half of the one before.
+    """
+    current, (energy, step) = start, evaluate(start)
+    for _ in range(steps):
+        full = step()
+        for halvings in range(trials):
+            trial = moved(current, full * 0.5**halvings)
+            trial_energy, trial_step = evaluate(trial)
+            if trial_energy < energy:
+                break
+        else:
+            return current
+        gain, current, energy, step = energy - trial_energy, trial, trial_energy, trial_step
+        if gain < _GAIN * energy + 1e-12:
+            return current
+    return current
+
+
+def damped_step(hessian: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Return `-H^-1 g`, with a damping of 1e-9 of the trace so that undetermined directions stay."""
+    damped = hessian.copy()
+    damped[np.diag_indices(len(hessian))] += 1e-9 * np.trace(hessian) + 1e-12
+    return np.asarray(-np.linalg.solve(damped, gradient))

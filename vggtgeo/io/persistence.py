@@ -1,0 +1,410 @@
+"""Save values of listed classes (states, maps, checkpoints, problems, scenes, cached arrays) as a file; load them.
+
+A file is a zip archive of two arrays of bytes. `header.npy` is JSON: the kind of the file, its version, plain facts
+about it, the classes and their fields, a table of the named arrays, and the tree of values. `data.npy` holds the bytes
+of all arrays. A value comes back exactly: floats, element types, memory order (a sum depends on it), and which fields
+share an array.
+
+Loading executes nothing: a file names classes, and the reader looks them up in its own list. Fields are set past
+constructors, so that a loaded value equals the saved one; their types are checked instead. The header is checked before
+any data are read, and zip's checksums detect damage. A file of another version is refused.
+
+In the tree, null, booleans, numbers and texts are themselves, and a list is a tuple. Everything else is an object:
+`l` a list, `d` a dictionary, `c` and `v` an object (number of its class, values of its fields), `k` a class, `t` an
+element type, `r` the result of a future; with the name of an array: `a` a numpy array, `s` a numpy scalar, `b` bytes,
+`j` a JAX array, `w` a weakly typed one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+import types
+import typing
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vggtgeo.io.archives import MAX_BYTES, Archive, ArrayHeader, read_archive
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import atomic_open
+
+MAX_HEADER = 2**27
+"""Bytes; the header of a state of 100,000 frames has 64 MiB."""
+HEADER, DATA = "header", "data"
+AGAIN = "use an unchanged copy, or write it again"
+_ELEMENTS = "biufU"
+"""Kinds of elements that arrays may have: booleans, integers, floats, texts."""
+_MAX_SPREAD = 64
+"""Largest ratio of the memory that a strided array spans to its own size (a column of a table, for example)."""
+_INVALID = (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError, OverflowError)
+Tree = Any
+"""A value of JSON."""
+
+
+def by_name(classes: Iterable[type]) -> dict[str, type]:
+    """Return classes by their short names; raise ValueError if two have the same name."""
+    named: dict[str, type] = {}
+    for kind in classes:
+        if named.setdefault(kind.__name__, kind) is not kind:
+            raise ValueError(f"two classes are called `{kind.__name__}`; rename one")
+    return named
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Format:
+    """A kind of file.
+
+    Fields: kind, a noun ("map"); version, a number that grows when the classes change; classes that values may have, by
+    name; compressed, whether the data are compressed (at most `MAX_BYTES` of them are then read); hint, what to do
+    about an unknown class.
+    """
+
+    kind: str
+    version: int
+    classes: Mapping[str, type]
+    compressed: bool = False
+    hint: str = ""
+
+    def with_classes(self, more: Iterable[type]) -> Format:
+        """Return the format with more classes; raise ValueError if two have the same name."""
+        return dataclasses.replace(self, classes=by_name((*self.classes.values(), *more)))
+
+    def write(self, path: Path, value: Any, facts: Mapping[str, Any] | None = None) -> None:
+        """Write a value and plain facts about it, atomically.
+
+        Raises:
+            TypeError: a part of the value has a class that is not listed; names the part.
+
+        """
+        encoder = _Encoder(self)
+        header = {"vggtgeo": self.kind, "version": self.version, "facts": dict(facts or {})}
+        header |= {"tree": encoder.tree(value, ""), "classes": encoder.classes, "arrays": encoder.arrays}
+        text = np.frombuffer(json.dumps(header).encode(), np.uint8)
+        method = zipfile.ZIP_DEFLATED if self.compressed else zipfile.ZIP_STORED
+        with atomic_open(path, "wb") as file, zipfile.ZipFile(file, "w", method) as archive:
+            _write_bytes(archive, HEADER, [text])
+            _write_bytes(archive, DATA, encoder.blocks)
+
+    def read(self, path: Path, as_array: Callable[[np.ndarray], Any] = jnp.asarray) -> tuple[Any, dict[str, Any]]:
+        """Return the value and the facts of a file.
+
+        as_array: makes a JAX array from numpy's; `numpy.asarray` reads without using JAX, which a forked process needs.
+
+        Raises:
+            InputError: the file is missing, damaged, too large, inconsistent, or of another kind or version.
+
+        """
+        path = Path(path)
+        header: dict[str, Any] = {}
+
+        def header_and_data(archive: Archive) -> dict[str, np.ndarray]:
+            header.update(self._header(archive))
+            limit = MAX_BYTES if self.compressed else archive.path.stat().st_size
+            return archive.read([DATA], _check_bytes, limit)
+
+        data = read_archive(path, self._article, header_and_data)[DATA]
+        try:
+            decoder = _Decoder(self, header["classes"], header["arrays"], data, as_array)
+            return decoder.value(header["tree"]), header["facts"]
+        except _INVALID as error:
+            raise InputError(f"`{path}` is not a valid {self.kind}: {error}; {AGAIN}") from None
+
+    def facts(self, path: Path) -> dict[str, Any]:
+        """Return the facts alone; raise InputError as `read` does."""
+        header: dict[str, Any] = {}
+
+        def only_header(archive: Archive) -> dict[str, np.ndarray]:
+            header.update(self._header(archive))
+            return {}
+
+        read_archive(Path(path), self._article, only_header)
+        facts: dict[str, Any] = header["facts"]
+        return facts
+
+    @property
+    def _article(self) -> str:
+        return f"{'an' if self.kind[0] in 'aeiou' else 'a'} {self.kind}"
+
+    def _header(self, archive: Archive) -> dict[str, Any]:
+        """Return the header, checked."""
+        methods = {info.compress_type for info in archive.members.values()}
+        allowed = {zipfile.ZIP_STORED} | ({zipfile.ZIP_DEFLATED} if self.compressed else set())
+        if set(archive.members) != {HEADER, DATA} or not methods <= allowed:
+            raise InputError(f"`{archive.path}` is not {self._article} of vggtgeo: it must have `header` and `data`")
+        text = archive.read([HEADER], _check_bytes, MAX_HEADER)[HEADER].tobytes()
+        try:
+            header = dict(json.loads(text))
+            kind, version, _ = (header[name] for name in ("vggtgeo", "version", "tree"))
+            _, _, header["facts"] = list(header["classes"]), dict(header["arrays"]), dict(header["facts"])
+            if type(version) is not int:
+                raise TypeError(f"its version is {version!r:.20}")
+        except _INVALID as error:
+            raise InputError(f"`{archive.path}` is not {self._article} of vggtgeo: {error!s:.200}; {AGAIN}") from None
+        if kind != self.kind:
+            raise InputError(f"`{archive.path}` is of kind {kind!r:.40}, must be {self.kind!r}")
+        if version != self.version:
+            raise InputError(
+                f"`{archive.path}` has version {version}, must be {self.version}: use the program that wrote it"
+            )
+        return header
+
+
+class _Encoder:
+    """Turns a value into JSON, a table of named arrays, and their bytes."""
+
+    def __init__(self, layout: Format) -> None:
+        self._kind = layout.kind
+        self._names = {kind: name for name, kind in layout.classes.items()}
+        self._numbers: dict[type, int] = {}
+        self._seen: dict[int, str] = {}
+        self._alive: list[Any] = []  # an `id` must not be used twice
+        self._size = 0
+        self.classes: list[tuple[str, list[str]]] = []
+        self.arrays: dict[str, list[Any]] = {}
+        self.blocks: list[np.ndarray] = []
+
+    def tree(self, value: Any, name: str) -> Tree:
+        kind = type(value)
+        if value is None or kind in (bool, int, float, str):
+            return value
+        if kind in self._names:
+            return self._object(value, name)
+        return self._items(value, name) if kind is tuple else self._tagged(value, name)
+
+    def _tagged(self, value: Any, name: str) -> Tree:
+        kind = type(value)
+        if kind is list:
+            return {"l": self._items(value, name)}
+        if kind is dict and all(type(key) is str for key in value):
+            return {"d": {key: self.tree(item, f"{name}.{key}" if name else key) for key, item in value.items()}}
+        if kind is np.ndarray:
+            return {"a": self._array(value, name, value)}
+        if kind is bytes:
+            return {"b": self._array(value, name, np.frombuffer(value, np.uint8))}
+        if isinstance(value, np.generic | jax.Array):
+            token = "s" if isinstance(value, np.generic) else "w" if value.weak_type else "j"
+            return {token: self._array(value, name, np.asarray(value))}
+        if isinstance(value, Future):
+            return {"r": self.tree(value.result(), name)}
+        if isinstance(value, np.dtype):
+            return {"t": value.str}
+        if isinstance(value, type) and value in self._names:
+            return {"k": self._names[value]}
+        raise TypeError(f"`{name}` is {value!r:.60} of type {kind.__qualname__}, which a {self._kind} cannot hold")
+
+    def _items(self, values: Sequence[Any], name: str) -> list[Tree]:
+        return [self.tree(item, f"{name}[{number}]") for number, item in enumerate(values)]
+
+    def _object(self, value: Any, name: str) -> Tree:
+        kind = type(value)
+        fields = [field.name for field in dataclasses.fields(kind)]
+        if kind not in self._numbers:
+            self._numbers[kind] = len(self.classes)
+            self.classes.append((self._names[kind], fields))
+        values = [self.tree(getattr(value, field), f"{name}.{field}" if name else field) for field in fields]
+        return {"c": self._numbers[kind], "v": values}
+
+    def _array(self, key: Any, name: str, values: np.ndarray) -> str:
+        """Add an array, once if several fields share it; return its name."""
+        if id(key) in self._seen:
+            return self._seen[id(key)]
+        if values.dtype.kind not in _ELEMENTS:
+            raise TypeError(f"`{name}` is an array of {values.dtype}, which a {self._kind} cannot hold")
+        strides = None if values.flags.c_contiguous else list(values.strides)
+        self.arrays[name] = [values.dtype.str, self._size, list(values.shape), strides]
+        block = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+        self.blocks.append(block)
+        self._size += block.nbytes
+        self._alive.append(key)
+        self._seen[id(key)] = name
+        return name
+
+
+class _Decoder:
+    """Makes the value of a header and its bytes."""
+
+    def __init__(
+        self,
+        layout: Format,
+        classes: Sequence[Any],
+        arrays: Mapping[str, Any],
+        data: np.ndarray,
+        as_array: Callable[[np.ndarray], Any],
+    ) -> None:
+        self._known, self._hint, self._arrays, self._data = layout.classes, layout.hint, arrays, data
+        self._classes = [self._checked(name, fields) for name, fields in classes]
+        self._made: dict[tuple[str, str], Any] = {}
+        self._from_array: dict[str, Callable[[np.ndarray], Any]] = {
+            "a": lambda values: values,
+            "s": lambda values: values[()],
+            "b": lambda values: values.tobytes(),
+            "j": as_array,
+            "w": lambda values: _weakly_typed(values) if as_array is jnp.asarray else as_array(values),
+        }
+
+    def value(self, tree: Tree) -> Any:
+        if isinstance(tree, list):
+            return tuple(self.value(item) for item in tree)
+        if not isinstance(tree, dict):
+            return tree
+        if tree.keys() == {"c", "v"}:
+            return self._object(self._classes[tree["c"]], tree["v"])
+        ((token, content),) = tree.items()
+        if token in self._from_array:
+            if (token, content) not in self._made:
+                self._made[token, content] = self._from_array[token](self._values(content))
+            return self._made[token, content]
+        if token == "l":
+            return [self.value(item) for item in content]
+        if token == "d":
+            return {str(key): self.value(item) for key, item in content.items()}
+        if token == "k":
+            return self._class(content)
+        if token == "t":
+            return _element_type("its type", content)
+        if token == "r":
+            return _finished(self.value(content))
+        raise ValueError(f"it has the unknown token {token!r:.20}")
+
+    def _class(self, name: str) -> type:
+        if name not in self._known:
+            raise ValueError(f"it holds a `{name!s:.60}`, which is not a known class{self._hint}")
+        return self._known[name]
+
+    def _checked(self, name: str, fields: list[str]) -> type:
+        kind = self._class(name)
+        own = [field.name for field in dataclasses.fields(kind)]
+        if own != list(fields):
+            raise ValueError(f"`{name}` has the fields {own}, but {fields} in the file (written by another version)")
+        return kind
+
+    def _object(self, kind: type, values: Sequence[Tree]) -> Any:
+        made: Any = object.__new__(kind)
+        for (name, (valid, words)), item in zip(_field_checks(kind).items(), values, strict=True):
+            value = self.value(item)
+            if not valid(value):
+                raise ValueError(f"`{name}` of `{kind.__name__}` must be {words}, got {value!r:.60}")
+            object.__setattr__(made, name, value)
+        return made
+
+    def _values(self, name: str) -> np.ndarray:
+        element, first, shape, strides = self._arrays[name]
+        dtype = _element_type(f"array `{name}`", element)
+        if not all(type(size) is int and size >= 0 for size in (first, *shape)):
+            raise ValueError(f"array `{name}` has the invalid offset {first} or shape {shape}")
+        size = math.prod(shape) * dtype.itemsize
+        if first + size > len(self._data):
+            raise ValueError(f"array `{name}` ends after the {len(self._data)} bytes of data")
+        values = self._data[first : first + size].copy().view(dtype).reshape(shape)
+        return values if strides is None else _strided(name, values, strides)
+
+
+def _element_type(name: str, element: Any) -> np.dtype[Any]:
+    # `numpy.dtype` also evaluates names of records and arbitrary text.
+    if not re.fullmatch(rf"[<>|=][{_ELEMENTS}]\d+", str(element)):
+        raise ValueError(f"{name} must be of numbers, got {element!r:.60}")
+    return np.dtype(element)
+
+
+def _weakly_typed(values: np.ndarray) -> jax.Array:
+    """Return a weakly typed array: JAX makes one of a Python number, or by an operation on weak types."""
+    weak = jnp.asarray(values.dtype.type(0).item())
+    return jnp.broadcast_to(weak, values.shape).at[...].set(values)
+
+
+def _finished(value: Any) -> Future[Any]:
+    future: Future[Any] = Future()
+    future.set_result(value)
+    return future
+
+
+def _strided(name: str, values: np.ndarray, strides: Sequence[int]) -> np.ndarray:
+    """Return the same values with other strides, as a view of a larger array has them."""
+    steps = list(zip(strides, values.shape, strict=True))
+    if not values.size:
+        return values
+    low = sum((size - 1) * step for step, size in steps if step < 0)
+    high = sum((size - 1) * step for step, size in steps if step > 0)
+    extent = high - low + values.itemsize
+    if extent > _MAX_SPREAD * values.nbytes:
+        raise ValueError(f"array `{name}` of {values.nbytes} bytes is spread over {extent}")
+    made = np.ndarray(values.shape, values.dtype, np.zeros(extent, np.uint8).data, -low, tuple(strides))
+    made[...] = values
+    return made
+
+
+def _check_bytes(headers: Mapping[str, ArrayHeader]) -> None:
+    for name, found in headers.items():
+        if found.dtype != np.uint8 or len(found.shape) != 1:
+            raise InputError(f"`{name}` is {found.dtype} {found.shape}, must be bytes")
+
+
+def _write_bytes(archive: zipfile.ZipFile, name: str, blocks: list[np.ndarray]) -> None:
+    """Write one member block by block, so that a map is not copied."""
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        size = sum(block.nbytes for block in blocks)
+        np.lib.format.write_array_header_1_0(member, {"descr": "|u1", "fortran_order": False, "shape": (size,)})
+        for block in blocks:
+            member.write(block.data)
+
+
+Check = Callable[[Any], bool]
+_NUMBERS: dict[Any, tuple[type, ...]] = {
+    bool: (bool, np.bool_),
+    int: (int, np.integer),
+    float: (float, int, np.floating, np.integer),
+}
+
+
+@cache
+def _field_checks(kind: type) -> Mapping[str, tuple[Check, str]]:
+    """Return, by field of a dataclass, a check of the annotated type and the type as text.
+
+    Array shapes, functions and protocols are not checked beyond their class.
+    """
+    try:
+        annotated = typing.get_type_hints(kind)
+    except (NameError, TypeError):  # a name that only type checkers see
+        annotated = {}
+    hints = {field.name: annotated.get(field.name, Any) for field in dataclasses.fields(kind)}
+    return {name: (_type_check(hint), getattr(hint, "__name__", str(hint))) for name, hint in hints.items()}
+
+
+def _type_check(hint: Any) -> Check:
+    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    if hint in _NUMBERS:
+        allowed, refused = _NUMBERS[hint], () if hint is bool else (bool, np.bool_)
+        return lambda value: isinstance(value, allowed) and not isinstance(value, refused)
+    if origin in (typing.Union, types.UnionType):
+        checks = [_type_check(one) for one in inside]
+        return lambda value: any(check(value) for check in checks)
+    if origin is tuple and len(inside) == 2 and inside[1] is ...:
+        each = _type_check(inside[0])
+        return lambda value: isinstance(value, tuple) and all(map(each, value))
+    if origin is tuple:
+        checks = [_type_check(one) for one in inside]
+        return lambda value: (
+            isinstance(value, tuple)
+            and len(value) == len(checks)
+            and all(check(item) for check, item in zip(checks, value, strict=True))
+        )
+    if origin is Mapping:
+        key, item = map(_type_check, inside)
+        return lambda value: isinstance(value, Mapping) and all(key(one) and item(two) for one, two in value.items())
+    kind = getattr(hint, "array_type", origin or hint)  # of jaxtyping's arrays the class alone
+    if kind is jax.Array:
+        return lambda value: isinstance(value, jax.Array | np.ndarray)
+    concrete = ("builtins", "numpy", "concurrent.futures._base")
+    if isinstance(kind, type) and (kind.__module__ in concrete or dataclasses.is_dataclass(kind)):
+        return lambda value: isinstance(value, kind)
+    return lambda value: True
