@@ -109,7 +109,11 @@ def reconstruct(
 
     """
     clock, began = Clock(), time.perf_counter()
-    _check_arguments(roles, settings, camera, known_map, callbacks, facts, warned, checkpoints, title, seed)
+    check_run_arguments(roles.roles if isinstance(roles, Perception) else roles, settings, camera, known_map)
+    check_kind("callbacks", callbacks, Iterable, "a list of `vggtgeo.Callback`")
+    check_kind("checkpoints", checkpoints, Checkpoints | None, "`vggtgeo.Checkpoints`, or None")
+    _check_report(title, facts, warned)
+    check_whole("seed", seed)
     settings = settings or SlamSettings()
     with program_settings(), interruption() as stop, collected_warnings() as collected:
         with stop.at_once():  # a live camera may not deliver any frame
@@ -164,22 +168,8 @@ def reconstruct(
         return _conclude(finished, settings, hooks, windows.records, overlay, evidence)
 
 
-def _check_arguments(
-    roles: Any,
-    settings: Any,
-    camera: Any,
-    known_map: Any,
-    callbacks: Any,
-    facts: Any,
-    warned: Any,
-    checkpoints: Any,
-    title: Any,
-    seed: Any,
-) -> None:
+def _check_report(title: Any, facts: Any, warned: Any) -> None:
     """Validate before the first frame what is used after the last one."""
-    check_run_arguments(roles.roles if isinstance(roles, Perception) else roles, settings, camera, known_map)
-    check_kind("callbacks", callbacks, Iterable, "a list of `vggtgeo.Callback`")
-    check_kind("checkpoints", checkpoints, Checkpoints | None, "`vggtgeo.Checkpoints`, or None")
     check_kind("title", title, str | None, "a text")
     check_plain("facts", {} if facts is None else facts)
     invalid = [key for key in facts or {} if not isinstance(key, str) or key in RESERVED_KEYS]
@@ -190,7 +180,6 @@ def _check_arguments(
         )
     if isinstance(warned, str) or not isinstance(warned, Iterable):
         check_kind("warned", warned, (), "a list of warnings or texts")
-    check_whole("seed", seed)
 
 
 @dataclass(frozen=True, eq=False)
