@@ -32,7 +32,7 @@ def _run(sequence: SequenceView, still_parts: bool) -> list[str]:
     """ATE in cm, the verdict, and the share of the picture that is left out."""
     settings = vg.SlamSettings(camera=vg.settings.CameraSettings(static_overlay=still_parts))
     result, error = judged(sequence, settings)
-    return [f"{100 * error:.1f}", result.verdict.level, f"{100 * result.summary.get('still_parts', 0.0):.0f} %"]
+    return [f"{100 * error:.1f}", result.verdict.level, f"{100 * result.summary.get('static_overlay', 0.0):.0f} %"]
 
 
 if __name__ == "__main__":

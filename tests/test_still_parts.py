@@ -248,7 +248,7 @@ def test_the_mask_is_undistorted_with_the_images() -> None:
 
 
 def test_a_lens_that_was_found_undistorts_the_mask(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames of a run whose first pass found a lens are undistorted by that; so must be what is left out of them.
+    """Frames of a run whose self-calibration found a lens are undistorted by that; so must be what is left out of them.
     Oracle: the mask that the lens itself undistorts.
     """
     lens = vg.Camera(CAMERA.intrinsics, WIDTH, HEIGHT, (-0.3, 0.05, 0.0, 0.0))
@@ -258,9 +258,9 @@ def test_a_lens_that_was_found_undistorts_the_mask(monkeypatch: pytest.MonkeyPat
     known = replace(known, camera=replace(known.camera, lens=lens))
     described = lambda frames, camera, roles, clock, waiting: given.update(camera=camera, roles=roles) or iter(())
     monkeypatch.setattr("vggtgeo.slam.run._described", described)
-    assert not list(run_frames(iter(()), CAMERA, vg.Roles(still_parts=parts), settings, Clock(), known))
+    assert not list(run_frames(iter(()), CAMERA, vg.Roles(static_overlay=parts), settings, Clock(), known))
     assert given["camera"] == lens
-    np.testing.assert_array_equal(given["roles"].still_parts.mask, parts.undistorted(lens).mask)
+    np.testing.assert_array_equal(given["roles"].static_overlay.mask, parts.undistorted(lens).mask)
     assert (parts.undistorted(lens).mask != parts.mask).any()
 
 

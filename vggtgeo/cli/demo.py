@@ -39,7 +39,7 @@ def demo(
 ) -> None:
     """Run in a synthetic office with exact truth, rendered on the spot."""
     from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.cli.run_sequence import Output, RunArguments, run_and_write
     from vggtgeo.simulation import simulate
     from vggtgeo.slam.settings.slam_settings import Roles
     from vggtgeo.viewing.target import check_target
@@ -59,6 +59,5 @@ def demo(
             as_json=report.as_json,
             resume=resume,
         ),
-        title=f"simulated {world.scene}",
-        facts={"simulated": True},
+        RunArguments(title=f"simulated {world.scene}", facts={"simulated": True}),
     )

@@ -74,7 +74,7 @@ def run(
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
         warnings.warn(text, InputWarning, stacklevel=2)
     from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.cli.run_sequence import Output, RunArguments, run_and_write
     from vggtgeo.slam.known_map import load_map
     from vggtgeo.slam.run import default_roles
 
@@ -96,11 +96,13 @@ def run(
             resume=options.resume,
             checkpoint_every=options.checkpoint_every,
         ),
-        (given.start, given.end, given.stride),
-        seed=options.seed,
-        dense=options.dense,
-        warned=warned,
-        known_map=None if options.map_file is None else load_map(options.map_file),
+        RunArguments(
+            (given.start, given.end, given.stride),
+            seed=options.seed,
+            dense=options.dense,
+            warned=warned,
+            known_map=None if options.map_file is None else load_map(options.map_file),
+        ),
     )
 
 

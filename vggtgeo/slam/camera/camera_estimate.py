@@ -42,8 +42,9 @@ class CameraEstimate:
         intrinsics: Current fx, fy, cx, cy, float64 [4], pixels.
         given: Mean of their prior.
         sigma: Standard deviation of their prior, pixels.
-        self_calibrated: The camera was not given; `given` and `lens` come from calibration frames (`first_pass.py`), or
-            from the run that made the known map. Windows hold them, and the last adjustment estimates the camera again.
+        self_calibrated: The camera was not given; `given` and `lens` come from calibration frames
+            (`self_calibration.py`), or from the run that made the known map. Windows hold them, and the last adjustment
+            estimates the camera again.
         lens: The distorting camera of the images as they were read, where the last adjustment found one. Pixels and
             images of all keyframes, and `intrinsics`, are then of undistorted images (`lens.py`).
         readout: Of the rolling shutter that the last adjustment found and removed from the poses

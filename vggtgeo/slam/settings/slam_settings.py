@@ -61,8 +61,8 @@ class Roles:
             that out.
         flow: Follows a keyframe's key points into frames that `alignment` then refines, so that most frames need no
             descriptors; None describes and matches every frame.
-        still_parts: What of the images, as they are read, belongs to the camera and not to the world: nothing is
-            looked for there. `vggtgeo.reconstruct` finds it.
+        static_overlay: Mask of the parts of the images, as they are read, that do not move with the scene; no
+            features are detected there. `vggtgeo.reconstruct` finds it.
 
     Example:
         >>> import vggtgeo as vg
@@ -81,7 +81,7 @@ class Roles:
     alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
     flow: PatchFlow | None = field(default_factory=PatchFlow)
 
-    still_parts: StillParts | None = None
+    static_overlay: StillParts | None = None
 
     def __post_init__(self) -> None:
         """InputError for what plays no role, which would be found in the middle of a run."""
@@ -92,7 +92,7 @@ class Roles:
                     f"`{role}` is {given!r:.60}; expected an object with the methods {', '.join(methods)}, such as "
                     f"`vggtgeo.Roles().{role}`"
                 )
-        for role, kind in (("alignment", RgbdAlignment), ("flow", PatchFlow), ("still_parts", StillParts)):
+        for role, kind in (("alignment", RgbdAlignment), ("flow", PatchFlow), ("static_overlay", StillParts)):
             check_kind(role, getattr(self, role), kind | None, f"a `{kind.__name__}`, or None")
 
     def seeded(self, seed: int) -> Roles:

@@ -38,7 +38,7 @@ def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
     """`settings` with the values of `tables`; all are put in at once, so that they are checked together.
 
     Raises:
-        InputError: a name that is no setting, or a value that it may not have.
+        InputError: an unknown setting, or an invalid value.
 
     """
     groups: dict[str, Any] = {}
@@ -56,7 +56,7 @@ def parsed(assignment: str) -> Tables:
     """`group.field=value` as a table; the value as in TOML, or a word without quotes.
 
     Raises:
-        InputError: there is no `=`, or the name is no setting.
+        InputError: there is no `=`, or the setting is unknown.
 
     """
     name, equals, text = (part.strip() for part in assignment.partition("="))

@@ -150,8 +150,8 @@ def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineF
         return roles.line_matches.describe(image, Segments(np.zeros((0, 2, 2)), np.zeros(0)))
     found = roles.lines.detect(image)
     check_answer("lines.detect", found, Segments)
-    if roles.still_parts is not None:
-        found = roles.still_parts.without_segments(found)
+    if roles.static_overlay is not None:
+        found = roles.static_overlay.without_segments(found)
     return roles.line_matches.describe(image, found)
 
 

@@ -22,7 +22,7 @@ from vggtgeo.slam.sparse_map.keyframe import LINE_SPACING, Keyframe, Slots
 from vggtgeo.slam.window.line_support import sample_shares, supported
 from vggtgeo.slam.window.selection import Selection
 
-LEAST_INVERSE_DEPTH = 1e-3
+MIN_INVERSE_DEPTH = 1e-3
 """1/m; a landmark starts no farther than a kilometre away."""
 LINE_GATE = 12.0
 """Largest distance of a line sample from its matched segment by the poses before an adjustment, pixels; outliers within
@@ -87,7 +87,7 @@ def build(
         observations,
         rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
         camera.parameters(intrinsics),
-        np.maximum(depths, LEAST_INVERSE_DEPTH),
+        np.maximum(depths, MIN_INVERSE_DEPTH),
         size=size,
         intrinsics_mean=camera.parameters(camera.mean),
         intrinsics_sigma=camera.parameters(camera.sigma),
@@ -277,7 +277,7 @@ def _initial_depths(
         np.add.at(weighted, landmark[chosen], weight * value)
         np.add.at(information, landmark[chosen], weight)
     triangulated = weighted / np.maximum(information, 1e-12)
-    good = (information > 0) & (triangulated > LEAST_INVERSE_DEPTH) & (triangulated * np.sqrt(information) > 5.0)
+    good = (information > 0) & (triangulated > MIN_INVERSE_DEPTH) & (triangulated * np.sqrt(information) > 5.0)
     known = np.isfinite(current)
     typical = np.median(current[known]) if np.any(known) else (np.median(triangulated[good]) if np.any(good) else 1.0)
     depths = np.where(known, current, np.where(good, triangulated, typical))
