@@ -27,7 +27,7 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
         for option in _options(parameter, hints[parameter.name])
     ]
     signature = inspect.Signature(options)
-    groups = {name: kind for name, kind in hints.items() if dataclasses.is_dataclass(kind)}
+    groups = {name: kind for name, kind in hints.items() if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
 
     @functools.wraps(command)
     def with_groups(*args: Any, **kwargs: Any) -> None:
