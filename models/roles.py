@@ -100,7 +100,7 @@ class PointMatches:
         return len(self.index_i)
 
     def select(self, keep: np.ndarray) -> PointMatches:
-        """The matches that `keep` (bool [m] or int [k]) names."""
+        """Return the matches that `keep` (bool [m] or int [k]) names."""
         return PointMatches(
             self.index_i[keep],
             self.index_j[keep],
@@ -115,7 +115,7 @@ class PointMatcher(Protocol):
     """Describes each image once, then matches any two descriptions."""
 
     def describe(self, image: np.ndarray) -> Features:
-        """Key points and descriptors of `image` (uint8 [H, W, 3]); zero key points on a blank image."""
+        """Return key points and descriptors of `image` (uint8 [H, W, 3]); zero key points on a blank image."""
         ...
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
@@ -201,7 +201,7 @@ class LineDetector(Protocol):
     """Finds straight segments."""
 
     def detect(self, image: np.ndarray) -> Segments:
-        """Segments of `image` (uint8 [H, W, 3]), best first; none on a blank image."""
+        """Return segments of `image` (uint8 [H, W, 3]), best first; none on a blank image."""
         ...
 
 
@@ -210,13 +210,13 @@ class LineMatcher(Protocol):
     """Describes the segments of each image once, then matches any two descriptions."""
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
-        """The appearance of `segments` in `image` (uint8 [H, W, 3])."""
+        """Return the appearance of `segments` in `image` (uint8 [H, W, 3])."""
         ...
 
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
-        """Matches from view i to view j; with `relative`, only those that the geometry allows."""
+        """Return the matches from view i to view j; with `relative`, only those that the geometry allows."""
         ...
 
 
@@ -252,7 +252,7 @@ class MetricDepth(Protocol):
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        """Depth of `image` (uint8 [H, W, 3]); `sensor_depth` is float32 [H, W] metres, NaN = none."""
+        """Return depth of `image` (uint8 [H, W, 3]); `sensor_depth` is float32 [H, W] metres, NaN = none."""
         ...
 
 
@@ -383,7 +383,7 @@ class InitialGeometry(Protocol):
     """Places one new view: in a known world (`locate`), or against a first one (`start`)."""
 
     def locate(self, query: PoseQuery) -> PoseGuess:
-        """The pose of the query's frame in the world its points live in. Failure is a result code."""
+        """Return the pose of the query's frame in the world its points live in. Failure is a result code."""
         ...
 
     def start(
@@ -393,7 +393,7 @@ class InitialGeometry(Protocol):
         intrinsics: np.ndarray,
         images: Sequence[np.ndarray] = (),
     ) -> StartGuess:
-        """Motion and structure from the matches of two views, float [n, 2] each, up to scale.
+        """Return motion and structure from the matches of two views, float [n, 2] each, up to scale.
 
         images: the two views, uint8 [H, W, 3], for an implementation that looks at them; may be empty.
         """

@@ -1,4 +1,4 @@
-"""Bringing a window that a model placed in its own frame and scale into a known metric world."""
+"""Alignment of a window in a model's own frame and scale with a known metric world."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from vggtgeo.models.roles import WindowGuess
 from vggtgeo.geometry import rigid
 
 _ENOUGH_PIXELS = 5000
-"""Of one view, for its scale."""
+"""Pixels of a view that determine its scale."""
 
 
 def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray] = ()) -> WindowGuess | None:
-    """The window in the world in which `poses` are, with metric translations and depths; None if that is undetermined.
+    """Return the window in the world in which `poses` are, with metric translations and depths; None if that is
+    undetermined.
 
-    Its scale s is the confidence-weighted median of `depths` / window depth, where both are known somewhere; else,
+    The scale s is the confidence-weighted median of `depths` / window depth where both are known; otherwise,
     unless the window is metric, the ratio of the spreads of the camera centres. Then X_window = R X_world + t is the
     rotation closest to all G_k^-1 P_k (chordal mean) and the translation that makes the mean centres coincide.
 
@@ -29,7 +30,7 @@ def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndar
     check_array("poses", poses, (None, 4, 4))
     count = len(poses)
     if count > len(guess.poses):
-        raise ValueError(f"`poses` has {count} entries, expected at most the window's {len(guess.poses)} views")
+        raise ValueError(f"`poses` must have at most the window's {len(guess.poses)} views, got {count}")
     use = np.flatnonzero(guess.found[:count])
     scale = _scale(guess, poses, depths, use)
     if not len(use) or scale is None:
@@ -52,7 +53,7 @@ def _scale(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray], 
     if guess.metric:
         return 1.0
     spreads = [np.linalg.norm(centres - centres.mean(axis=0)) for centres in _two_centres(guess.poses, poses, use)]
-    # Below a centimetre of movement the noise of the poses would set the scale.
+    # Below 1 cm of motion the scale would be noise of the poses.
     return float(spreads[1] / spreads[0]) if len(use) > 1 and spreads[1] > 0.01 and spreads[0] > 1e-9 else None
 
 
@@ -64,7 +65,7 @@ def _depth_scale(guess: WindowGuess, depths: Sequence[np.ndarray], use: np.ndarr
     ratios, weights = [], []
     for view in use[use < len(depths)]:
         check_array("depths", depths[view], guess.depth.shape[1:], finite=False)
-        # A median of some thousand pixels is that of all.
+        # The median of some thousand pixels is accurate enough.
         step = max(1, int(np.sqrt(depths[view].size / _ENOUGH_PIXELS)))
         own, known, confidence = (
             image[::step, ::step] for image in (guess.depth[view], depths[view], guess.confidence[view])

@@ -1,4 +1,4 @@
-"""A model that places a whole window, used to place one frame."""
+"""Localisation of one frame by a model that estimates a whole window."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from vggtgeo.geometry import pinhole, rigid
 
 @dataclass(frozen=True)
 class WindowLocator:
-    """An `InitialGeometry` from a `WindowGeometry` (VGGT, say) and a `judge` (PnP, say).
+    """An `InitialGeometry` from a `WindowGeometry` (VGGT, for example) and a `judge` (PnP).
 
-    The model places the query's keyframes and its frame together; the window is then aligned to the keyframes' known
-    poses, and the frame's pose in it becomes the prediction that the judge accepts, improves or replaces by its own.
-    Where the window does not determine it, the judge works with the query's prediction.
+    The model estimates the query's keyframes and frame together. The window is aligned with the known poses of the
+    keyframes, and the pose of the frame in it is the prediction that the judge accepts, refines or replaces. If the
+    window does not determine it, the judge uses the query's prediction.
 
-    The first two views start from the model's depth and motion, if matches bear them out; else by the judge alone.
-    Depth that is not triangulated needs less parallax, but some: the baseline is what holds the map's scale.
+    The first two views start from the model's depth and motion if matches confirm them, else by the judge alone.
+    Predicted depth needs less parallax than triangulation, but some: the baseline determines the map's scale.
 
-    least: fewest matches, and parallax: least median angle between their rays, radians, of such a start.
-    views: most views the model takes, the frame included, None for any number; the query's first keyframes are taken.
+    least: minimum number of matches, and parallax: minimum median angle between their rays, radians, of such a start.
+    views: maximum number of views of the model, the frame included, None for any; the first keyframes are used.
     """
 
     model: WindowGeometry
@@ -36,17 +36,17 @@ class WindowLocator:
 
     def __post_init__(self) -> None:
         if self.views is not None and self.views < 2:
-            raise ValueError(f"`views` is {self.views}, expected at least 2: a keyframe and the frame")
+            raise ValueError(f"`views` must be at least 2 (a keyframe and the frame), got {self.views}")
 
     def locate(self, query: PoseQuery) -> PoseGuess:
-        """The pose of the query's frame; see `InitialGeometry.locate`."""
+        """Return the pose of the query's frame; see `InitialGeometry.locate`."""
         predicted = self._predict(query)
         if predicted is None:
             return self.judge.locate(query)
         judged = self.judge.locate(replace(query, predicted=predicted))
         if len(query.points):
             return judged
-        # Without a match there is nothing to judge by: the model's word is all there is.
+        # Without matches the judge has no evidence: the model's pose is used.
         return PoseGuess(predicted, judged.inliers, judged.error, GeometryResult.SUCCESS)
 
     def start(
@@ -56,14 +56,14 @@ class WindowLocator:
         intrinsics: np.ndarray,
         images: Sequence[np.ndarray] = (),
     ) -> StartGuess:
-        """Motion and structure of the first two views; see `InitialGeometry.start`."""
+        """Return motion and structure of the first two views; see `InitialGeometry.start`."""
         guess = self._start(pixels_i, pixels_j, np.asarray(intrinsics), images) if len(images) else None
         return self.judge.start(pixels_i, pixels_j, intrinsics, images) if guess is None else guess
 
     def _start(
         self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray, images: Sequence[np.ndarray]
     ) -> StartGuess | None:
-        """The model's start, where the judge finds matches and parallax enough; else None."""
+        """Return the model's start if the judge finds enough matches and parallax, else None."""
         guess = self.model.window(images, intrinsics)
         if not guess.found.all():
             return None
@@ -103,7 +103,7 @@ class WindowLocator:
 
 
 def _unproject(pixels: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels [n, 2] have a depth, bool [n], and their points float64 [n, 3], camera frame, NaN = none."""
+    """Return which pixels [n, 2] have depth, bool [n], and their points in the camera's frame [n, 3], NaN = none."""
     height, width = depth.shape
     columns, rows = np.rint(pixels).astype(int).T
     z = depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from reported import raises
 from small_disk import small_disk
 
 from vggtgeo.io.files import atomic_open, atomic_path, write_json, write_text
@@ -109,7 +110,7 @@ def test_a_device_is_no_place_for_a_file(tmp_path: Path) -> None:
     # Proves that a pipe is refused and stays, instead of being replaced by a file. Oracle: the error names it.
     os.mkfifo(tmp_path / "pipe")
     with (
-        pytest.raises(OSError, match="it is no file but a device, a pipe or a socket") as error,
+        raises("device", error=OSError) as error,
         atomic_path(tmp_path / "pipe"),
     ):
         pass

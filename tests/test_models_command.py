@@ -74,7 +74,8 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
     # Proves that a typing error costs one line.
     result = invoke("models", "path", "vgtt")
     assert result.exit_code == 2
-    assert "`vgtt` is no network; it must be one of vggt, dinov3" in result.output
+    assert "`vgtt`" in result.output
+    assert "vggt, dinov3" in result.output
 
 
 # --- verify ------------------------------------------------------------------------------------------------------

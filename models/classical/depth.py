@@ -47,7 +47,7 @@ class SensorDepth:
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        """The sensor's depth with its noise; nothing anywhere when `sensor_depth` is None."""
+        """Return the sensor's depth with its noise; nothing anywhere when `sensor_depth` is None."""
         check_image("image", image)
         if sensor_depth is None:
             return no_depth(image.shape[:2])
@@ -64,7 +64,7 @@ class SensorDepth:
         )
 
     def noise(self, depth: np.ndarray) -> np.ndarray:
-        """Relative standard deviation of a depth (metres, any shape) away from jumps."""
+        """Return relative standard deviation of a depth (metres, any shape) away from jumps."""
         # In place, and not by np.hypot: a third of the time, and nothing here is near the ends of the numbers.
         away = depth - self.near
         away *= away
@@ -92,13 +92,13 @@ class NoDepth:
 
 
 def no_depth(shape: tuple[int, int]) -> DepthEstimate:
-    """An estimate of `shape` (H, W) that knows nothing."""
+    """Return an estimate of `shape` (H, W) that knows nothing."""
     nothing = np.full(shape, np.nan, dtype=np.float32)
     return DepthEstimate(nothing, np.zeros(shape, dtype=np.float32), nothing.copy())
 
 
 def _relative_jump(depth: np.ndarray, reach: int) -> np.ndarray:
-    """Float [H, W]: how far depth departs from a plane within `reach` pixels, relative to depth; 0 if NaN.
+    """Return float [H, W]: how far depth departs from a plane within `reach` pixels, relative to depth; 0 if NaN.
 
     The second difference of inverse depth vanishes on every plane, however slanted, so that only edges count.
     """

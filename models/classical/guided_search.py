@@ -1,4 +1,4 @@
-"""Matches of key points whose place in the other view is known well: searched near it, then by descriptor."""
+"""Guided matching: key points near their predicted position in the other view, then by descriptor."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, confidence_
 from vggtgeo.models.roles import Features, PointMatches
 
 NEIGHBOURS = 4
-"""Key points near a predicted place that are compared; more are never there within some pixels."""
+"""Key points near a predicted position that are compared; there are never more within some pixels."""
 
 
 def can_search(features: Features) -> bool:
-    """Whether the descriptors are vectors that can be compared one by one."""
+    """Return whether the descriptors are vectors, which can be compared one by one."""
     return isinstance(features.descriptors, PixelDescriptors)
 
 
 def search_tree(features: Features) -> cKDTree:
-    """The key points of one view, to be searched from many others."""
+    """Return a search tree of the key points of a view."""
     return cKDTree(features.pixels.reshape(-1, 2))
 
 
@@ -35,11 +35,11 @@ def search_near(
     ratio: float = 0.85,
     similarity: float = 0.8,
 ) -> PointMatches:
-    """Matches of some key points of view i within `radius` pixels of where they must be in view j.
+    """Return the matches of some key points of view i within `radius` pixels of their predicted position in view j.
 
-    Of the few key points there the most similar is taken if it is `similarity` alike (inner product of unit
-    vectors) and clearly more so than the next (Lowe's `ratio`, of distances). A key point of j is taken once, by the
-    most similar. No epipolar verification: the place says more.
+    The most similar key point there is matched if its inner product is at least `similarity` and the ratio of distances
+    to the second best passes (Lowe's `ratio`). A key point of j is matched once, to the most similar. There is no
+    epipolar verification: the predicted position is stricter.
 
     index: int [n], key points of i. predicted: float [n, 2], pixels. tree: `search_tree(features_j)`.
     """
@@ -74,7 +74,7 @@ def search_around(
     radius: float,
     ratio: float = 0.85,
 ) -> PointMatches:
-    """The same where the place is known roughly: `radius` holds many key points, and the best must be mutual."""
+    """Return mutual matches within a larger `radius`, for rough predictions; otherwise as `search_near`."""
     similarity = _vectors(features_i)[index] @ _vectors(features_j).T
     exclude_far(similarity, predicted, features_j.pixels, radius)
     rows, target, clarity = mutual_nearest(similarity, ratio)

@@ -1,4 +1,4 @@
-"""Choosing key points that cover the image."""
+"""Selection of key points that cover the image."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 
 def spread(pixels: np.ndarray, scores: np.ndarray, count: int, size: tuple[int, int], cells: int = 10) -> np.ndarray:
-    """Indices (int [<= count], best first) of key points that are strong and cover the image.
+    """Return indices (int [<= count], best first) of key points that are strong and cover the image.
 
-    A grid of `cells` columns of square cells lies over the image. Points are taken in rounds: the strongest of every
-    cell, then the second strongest of every cell, and so on. So a poor corner of the image keeps its few points and
-    a rich one gives up its weakest. Cost: one sort.
+    The image has a grid of square cells, `cells` columns. Points are taken in rounds: the strongest of every cell, then
+    the second strongest of every cell, and so on. So a poor region keeps its points, and a rich one loses its weakest.
+    Cost: one sort.
 
     pixels: float [M, 2]. scores: float [M]. size: (width, height) of the image.
     """

@@ -30,7 +30,7 @@ class LsdDetector:
         check_fields(self, shortest="(0, inf)", count="[0, inf)")
 
     def detect(self, image: np.ndarray) -> Segments:
-        """Segments of `image` (uint8 [H, W, 3]), longest first; none on a blank image."""
+        """Return segments of `image` (uint8 [H, W, 3]), longest first; none on a blank image."""
         check_image("image", image)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         # The detector is made anew for each image: it holds buffers, and making it costs microseconds.

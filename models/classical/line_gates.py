@@ -17,7 +17,7 @@ def allowed_pairs(
     distance: float,
     overlap: float,
 ) -> np.ndarray:
-    """Bool [L_i, L_j]: pairs of segments that can be one line.
+    """Return bool [L_i, L_j]: pairs of segments that can be one line.
 
     Without `relative`: their directions differ by less than `angle`. With it, a segment whose depth is known is
     moved into j and must lie within `distance` pixels of the other, and what the view may be off, in its direction,
@@ -49,7 +49,7 @@ def _directions(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _move(ends: np.ndarray, relative: RelativeView) -> np.ndarray:
-    """Where the ends of i appear in j, float [L, 2, 2]; NaN where depth is unknown or the end is behind j."""
+    """Return where the ends of i appear in j, float [L, 2, 2]; NaN where depth is unknown or the end is behind j."""
     rays = pinhole.rays(ends, relative.intrinsics)
     if np.linalg.norm(relative.pose[:3, 3]) < 1e-9:
         depths = np.ones(ends.shape[:2])  # Without a baseline depth has no effect.
@@ -106,7 +106,7 @@ def _on_epipolar_beam(
 
 
 def _turned(ends: np.ndarray, relative: RelativeView) -> np.ndarray:
-    """The ends as they appear after the rotation alone: how the image of a far segment turns."""
+    """Return the ends as they appear after the rotation alone: how the image of a far segment turns."""
     matrix = pinhole.matrix(relative.intrinsics)
     homography = matrix @ relative.pose[:3, :3] @ np.linalg.inv(matrix)
     moved = np.concatenate([ends, np.ones_like(ends[..., :1])], axis=2) @ homography.T

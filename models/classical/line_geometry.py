@@ -28,7 +28,7 @@ def line_coefficients(endpoints: np.ndarray) -> np.ndarray:
 
 
 def sample_segments(endpoints: np.ndarray, spacing: float = 10.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels every `spacing` along segments, centred so that both ends are equally far from a sample.
+    """Return pixels every `spacing` along segments, centred so that both ends are equally far from a sample.
 
     endpoints: float [L, 2, 2]. Returns index int [s], the segment of each sample; pixels float64 [s, 2]; and fraction
     float64 [s] in [0, 1], the position from end 0 to end 1. A segment of length l has floor(l / spacing) + 1.
@@ -48,7 +48,7 @@ def sample_segments(endpoints: np.ndarray, spacing: float = 10.0) -> tuple[np.nd
 
 
 def segment_depths(endpoints: np.ndarray, depth: np.ndarray, tolerance: float = 0.03, least: int = 4) -> np.ndarray:
-    """Depth of both ends, float64 [L, 2] in metres, NaN where the image's depth does not show a straight edge.
+    """Return depth of both ends, float64 [L, 2] in metres, NaN where the image's depth does not show a straight edge.
 
     Along the image of a 3D line inverse depth is affine, so an affine function is fitted to the inverse depths under
     each segment: for every pair of samples far apart, the function through both is scored by how many samples it
@@ -70,7 +70,7 @@ def segment_depths(endpoints: np.ndarray, depth: np.ndarray, tolerance: float = 
 
 
 def _foremost_depth(depth: np.ndarray, pixels: np.ndarray, jump: float = 0.15) -> np.ndarray:
-    """The median of those of the 3 x 3 depths that are within `jump` (relative) of the nearest, NaN = none.
+    """Return the median of those of the 3 x 3 depths that are within `jump` (relative) of the nearest, NaN = none.
 
     The nearest itself would be biased: on a floor seen at a grazing angle, and under noise, one of nine pixels is
     always nearer by a few per cent, and edges that are too near make the whole map too small.
@@ -111,5 +111,5 @@ def _affine_ends(fraction: np.ndarray, inverse: np.ndarray, tolerance: float, le
 
 @cache
 def _far_apart(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of samples that are at least a third of the segment apart."""
+    """Return all pairs of samples that are at least a third of the segment apart."""
     return np.triu_indices(count, k=max(1, count // 3))

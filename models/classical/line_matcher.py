@@ -16,14 +16,13 @@ from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segmen
 class BandLineMatcher:
     """Line band descriptors (after Zhang and Koch 2013), mutual nearest neighbours, geometric gates.
 
-    A strip of `width` pixels on either side of the segment is cut out and divided into `bands` parallel to it. Of
-    each band the mean and the spread of the four half-rectified gradient components (across and along, positive and
-    negative) describe it. The segment's direction makes the two sides distinguishable.
+    A strip of `width` pixels on either side of the segment is divided into `bands` parallel to it. The descriptor has
+    mean and standard deviation of the four half-rectified gradient components (across and along, positive and negative)
+    of each band. The direction of the segment distinguishes its sides.
 
-    ratio: largest ratio of best to second-best descriptor distance. similarity: least inner product of a pair.
-    angle: largest turn of a segment between two views of unknown relation, radians.
-    distance: largest distance of a predicted end from the matched line, pixels. overlap: least common part, relative
-    to the shorter one.
+    ratio: maximum ratio of best to second-best descriptor distance. similarity: minimum inner product of a pair.
+    angle: maximum rotation of a segment between views of unknown relative pose, radians. distance: maximum distance of
+    a predicted end from the matched line, pixels. overlap: minimum common part, relative to the shorter segment.
     """
 
     bands: int = 8
@@ -48,7 +47,7 @@ class BandLineMatcher:
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
-        """Matches from view i to view j; see `LineMatcher.match`."""
+        """Return the matches from view i to view j; see `LineMatcher.match`."""
         similarity = features_i.descriptors @ features_j.descriptors.T
         ends_i, ends_j = features_i.segments.endpoints, features_j.segments.endpoints
         allowed = allowed_pairs(ends_i, ends_j, relative, self.angle, self.distance, self.overlap)
@@ -58,7 +57,7 @@ class BandLineMatcher:
 
 
 def _strips(gray: np.ndarray, endpoints: np.ndarray, width: int, samples: int = 24) -> np.ndarray:
-    """float32 [L, samples, 2 width + 2]: the image around each segment, along the segment and across it."""
+    """Return float32 [L, samples, 2 width + 2]: the image around each segment, along the segment and across it."""
     smooth = cv2.GaussianBlur(gray, (0, 0), 1.0)
     along = endpoints[:, 1] - endpoints[:, 0]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
@@ -74,12 +73,12 @@ def _band_statistics(strips: np.ndarray, bands: int) -> np.ndarray:
     across = np.diff(strips, axis=2)[:, :-1]
     along = np.diff(strips, axis=1)[:, :, :-1]
     parts = np.stack([np.maximum(across, 0), np.maximum(-across, 0), np.maximum(along, 0), np.maximum(-along, 0)], 1)
-    # Pixels near the segment count more than those far away, which belong to something else.
+    # Pixels near the segment have more weight: those far away may belong to other objects.
     far = np.abs(np.linspace(-1.0, 1.0, parts.shape[3], dtype=np.float32))
     pieces = np.array_split(parts * np.exp(-(far**2) / 0.5), bands, axis=3)
     mean = np.stack([piece.mean(axis=(2, 3)) for piece in pieces], axis=1).reshape(len(strips), -1)
     spread = np.stack([piece.mean(axis=3).std(axis=2) for piece in pieces], axis=1).reshape(len(strips), -1)
-    # Normalised apart, so that neither the mean nor the spread swallows the other.
+    # Normalised separately, so that neither mean nor deviation dominates.
     return np.concatenate([_unit(mean), _unit(spread)], axis=1) / np.sqrt(np.float32(2.0))
 
 

@@ -1,4 +1,4 @@
-"""The orientation of a view in a world of three perpendicular directions, from its line segments.
+"""Orientation of a view in a Manhattan world (three perpendicular directions), from its line segments.
 
 The plane through the camera's centre and a segment has the normal n; a segment along the axis d satisfies n . d = 0.
 With the axes d_1, d_2, d_3 of a frame as columns of the rotation C (frame -> camera), C <- exp(w) C changes the
@@ -23,7 +23,7 @@ from vggtgeo.geometry import pinhole
 class ManhattanView:
     """rotation: float64 [3, 3], C, frame -> camera. information: float64 [3, 3], rad^-2, of w in C = exp(w) C_true.
 
-    share: of the length of all segments, how much lies along an axis. axes: int [3], segments on each.
+    share: of the length of all segments, along an axis. axes: int [3], number of segments on each.
     """
 
     rotation: np.ndarray
@@ -34,10 +34,12 @@ class ManhattanView:
 
 @dataclass(frozen=True)
 class ManhattanEstimator:
-    """end_error: standard deviation of a segment's end across it, pixels. gate: largest angle between a segment and its
-    axis, seen from the segment's middle, radians. least_share: of the segments' length that must lie along an axis.
-    least_segments: on each of two axes at least. clear: standard deviations by which a segment must miss all other
-    axes. floor: least standard deviation of the result, radians (a wall is never quite straight).
+    """Estimates the Manhattan frame of a view.
+
+    end_error: standard deviation of a segment's end across it, pixels. gate: maximum angle between a segment and its
+    axis, seen from the segment's middle, radians. least_share: minimum share of the segments' length along an axis.
+    least_segments: minimum number on two axes each. clear: minimum deviation of a segment from all other axes,
+    standard deviations. floor: minimum standard deviation of the result, radians (walls are not exactly straight).
     """
 
     end_error: float = 0.7
@@ -50,10 +52,11 @@ class ManhattanEstimator:
     def estimate(
         self, endpoints: np.ndarray, intrinsics: np.ndarray, predicted: np.ndarray | None = None
     ) -> ManhattanView | None:
-        """The frame's orientation in a view; None where the segments do not show three perpendicular directions.
+        """Return the frame's orientation in a view; None if the segments do not determine three perpendicular
+        directions.
 
-        endpoints: float [L, 2, 2], pixels. intrinsics: float [4]. predicted: float [3, 3], frame -> camera, near the
-        answer; without it the axes come in any order and with any signs.
+        endpoints: float [L, 2, 2], pixels. intrinsics: float [4]. predicted: float [3, 3], frame -> camera; without it
+        order and signs of the axes are arbitrary.
         """
         check_array("endpoints", endpoints, (None, 2, 2))
         if len(endpoints) < 2 * self.least_segments:
@@ -61,7 +64,7 @@ class ManhattanEstimator:
         planes = _Planes.of(endpoints, np.asarray(intrinsics, float))
         start = _search(planes, np.sin(self.gate)) if predicted is None else predicted
         rotation = np.array(start, float)
-        # Not `gauss_newton`: segments change their axis between steps, so that no energy must fall.
+        # Not `gauss_newton`: segments change their axis between steps, so that the energy need not decrease.
         for _ in range(10):
             fit = self._fit(rotation, planes)
             weight = fit.near / (fit.sigma**2 + fit.off**2)  # Cauchy, one deviation wide
@@ -76,15 +79,15 @@ class ManhattanEstimator:
 
     def _fit(self, rotation: np.ndarray, planes: _Planes) -> _Fit:
         products = planes.normals @ rotation
-        # An error of a segment's direction turns its plane about the ray to its middle, an error of its place about
-        # the direction across that ray.
+        # An error of a segment's direction rotates its plane about the ray to its middle, an error of its position
+        # about the direction across that ray.
         lever = np.abs(np.cross(planes.middles, planes.normals) @ rotation)
         turned = np.sqrt(2) * self.end_error / planes.lengths[:, None] * lever
         moved = self.end_error / (np.sqrt(2) * planes.focal) * np.abs(planes.middles @ rotation)
         sigmas = np.hypot(turned, moved)
         deviations = np.abs(products) / sigmas
         axis = np.argmin(deviations, axis=1)
-        # What could as well lie on another axis (a segment on the horizon, say) would be bent towards the nearer one.
+        # A segment that fits another axis as well (on the horizon, for example) would bias the result.
         clear = np.sort(deviations, axis=1)[:, 1] > self.clear
         own = np.arange(len(axis))
         off, sigma = products[own, axis], sigmas[own, axis]
@@ -104,7 +107,7 @@ class ManhattanEstimator:
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """Of each segment: unit normal of its plane and unit ray to its middle [L, 3], length in pixels [L]."""
+    """Segments: unit normals of their planes and unit rays to their middles [L, 3], lengths in pixels [L]."""
 
     normals: np.ndarray
     middles: np.ndarray
@@ -120,7 +123,7 @@ class _Planes:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Of each segment: its axis, the residual with derivative and standard deviation, and whether it is an inlier."""
+    """Segments: axis, residual with derivative and standard deviation, and whether it is an inlier."""
 
     axis: np.ndarray
     rows: np.ndarray
@@ -130,7 +133,7 @@ class _Fit:
 
 
 def nearest_frame(rotation: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """`rotation` [3, 3] with its columns permuted and their signs changed (24 ways) to lie nearest to `reference`."""
+    """Return `rotation` [3, 3] with columns permuted and signs changed (24 ways) to be nearest to `reference`."""
     return max((rotation @ symmetry for symmetry in _SYMMETRIES), key=lambda turned: float(np.sum(turned * reference)))
 
 
@@ -151,7 +154,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _search(planes: _Planes, near: float, longest: int = 24, kept: int = 12) -> np.ndarray:
-    """The rotation whose axes explain most length, among those that pairs of the longest segments propose."""
+    """Return the rotation whose axes explain most length, among candidates from pairs of the longest segments."""
     normals, lengths = planes.normals, planes.lengths
     top = np.argsort(-lengths)[:longest]
     first, second = np.triu_indices(len(top), k=1)

@@ -8,13 +8,13 @@ import numpy as np
 def mutual_nearest(
     similarity: np.ndarray, ratio: float, floor: float = -1.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs that are each other's best and clearly better than the second best.
+    """Return pairs that are each other's best and pass the ratio test.
 
     similarity: float [I, J], inner products of unit vectors; -inf where a pair is excluded. It is overwritten.
     ratio: accept when distance(best) < ratio * distance(second), with distance^2 = 2 - 2 similarity (Lowe 2004).
-    floor: least similarity of a pair.
+    floor: minimum similarity of a pair.
 
-    Returns index_i int [m], index_j int [m], and the distance ratio float [m] of each pair, smaller is clearer.
+    Returns index_i int [m], index_j int [m], and the distance ratio float [m] of each pair.
     """
     rows, columns = similarity.shape
     if rows == 0 or columns == 0:
@@ -24,7 +24,7 @@ def mutual_nearest(
     best = similarity[np.arange(rows), best_j]
     # A maximum along columns is read row by row; an argmax is not, and takes five times as long.
     index_i = np.nonzero((best >= similarity.max(axis=0)[best_j]) & (best > floor))[0]
-    # Of equal descriptors the first is taken: a column has one partner.
+    # A column is matched once: to the first of equal descriptors.
     index_i = np.sort(index_i[np.unique(best_j[index_i], return_index=True)[1]])
     index_j, best = best_j[index_i], best[index_i]
     similarity[index_i, index_j] = -np.inf
@@ -37,7 +37,7 @@ def mutual_nearest(
 def exclude_far(similarity: np.ndarray, predicted: np.ndarray, pixels: np.ndarray, radius: float) -> None:
     """Set `similarity` [I, J] to -inf, in place, where `pixels` [J, 2] is beyond `radius` of `predicted` [I, 2].
 
-    Rows whose prediction is NaN are left alone.
+    Rows with a NaN prediction are unchanged.
     """
     dx = predicted[:, 0, None] - pixels[:, 0]
     dy = predicted[:, 1, None] - pixels[:, 1]

@@ -27,7 +27,7 @@ class OrbMatcher(PixelMatcher):
         return cv2.ORB_create(nfeatures=2 * self.count, fastThreshold=10)
 
     def describe(self, image: np.ndarray) -> Features:
-        """Key points and binary vectors of `image` (uint8 [H, W, 3]); none on a blank image."""
+        """Return key points and binary vectors of `image` (uint8 [H, W, 3]); none on a blank image."""
         check_image("image", image)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         points, bits = self._orb.detectAndCompute(gray, None)

@@ -1,8 +1,8 @@
-"""One vector for a whole image, to find places seen before: aggregated local descriptors (VLAD, Jegou et al. 2010).
+"""Global descriptor of an image: aggregated local descriptors (VLAD, Jegou et al. 2010).
 
-Each descriptor, without the mean of its image, goes to one of 2^bits cells by the signs of its products with fixed
-random directions (Charikar 2002), in place of a trained vocabulary: nothing must be learnt or kept, and it fits any
-descriptor. The sums of the cells, square-rooted and normalised each and then together, are the vector.
+Each descriptor, minus the mean of its image, is assigned to one of 2^bits cells by the signs of its products with fixed
+random directions (Charikar 2002). This replaces a trained vocabulary and works for any descriptor. The sums of the
+cells, square-rooted and normalised per cell and then together, are the vector.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ BITS = 5
 
 
 def place_vector(features: Features) -> np.ndarray | None:
-    """float32 `[2^bits * D]` of unit length; None where the key points carry no vectors, or are fewer than 20."""
+    """Return a unit vector, float32 `[2^bits * D]`; None for descriptors without vectors, or fewer than 20 points."""
     if not isinstance(features.descriptors, PixelDescriptors) or len(features) < 20:
         return None
     vectors = features.descriptors.vectors - features.descriptors.vectors.mean(0)

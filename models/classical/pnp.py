@@ -1,4 +1,4 @@
-"""The pose of a new frame from known points (PnP), with a constant-velocity prediction to lean on."""
+"""Pose of a new frame from known points (PnP), supported by a predicted pose."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from vggtgeo.geometry import pinhole
 class PnpGeometry:
     """P3P inside MAGSAC++ (Barath et al. 2020), then a robust refinement weighted by confidence.
 
-    The predicted pose competes with the sampled one: where the prediction explains more matches it is the start of
-    the refinement, so that a frame whose few matches defeat sampling is still tracked. Where the refined prediction
-    explains the share `sure` of the matches, no other pose could explain as many, and none is sampled.
+    The predicted pose competes with the sampled one: the pose with more inliers is the start of the refinement, so that
+    a frame with too few matches for sampling is still tracked. If the refined prediction explains the share `sure` of
+    the matches, no other pose could explain as many, and none is sampled.
 
-    threshold: largest reprojection error of an inlier, pixels. least: fewest inliers of a success.
+    threshold: maximum reprojection error of an inlier, pixels. least: minimum number of inliers of a success.
     """
 
     threshold: float = 6.0
@@ -39,7 +39,7 @@ class PnpGeometry:
         check_fields(self, threshold="(0, inf)", least="[6, inf)")
 
     def locate(self, query: PoseQuery) -> PoseGuess:
-        """The pose of the query's frame; see `InitialGeometry.locate`."""
+        """Return the pose of the query's frame; see `InitialGeometry.locate`."""
         if len(query.points) < self.least:
             return failed_guess(query, GeometryResult.TOO_FEW_MATCHES)
         intrinsics = np.asarray(query.intrinsics, dtype=np.float64)
@@ -65,11 +65,11 @@ class PnpGeometry:
         intrinsics: np.ndarray,
         images: Sequence[np.ndarray] = (),
     ) -> StartGuess:
-        """Motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
+        """Return motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
         return self.two_view.start(pixels_i, pixels_j, intrinsics)
 
     def _start(self, query: PoseQuery, intrinsics: np.ndarray) -> np.ndarray | None:
-        """The prediction, refined, where most matches agree with that; else the better of it and a sampled pose."""
+        """Return the refined prediction if most matches agree with it, else the better of it and a sampled pose."""
         if query.predicted is not None:
             refined = refine_pose(query.predicted, query.points, query.pixels, query.confidence + 1e-3, intrinsics)
             if np.count_nonzero(self._inliers(refined, query)) >= max(self.sure * len(query.points), 3 * self.least):
@@ -108,16 +108,16 @@ class PnpGeometry:
 
 @dataclass(frozen=True)
 class ConstantVelocity:
-    """Takes the predicted pose as it is, for the bundle adjustment to correct; the matches only judge it.
+    """Use the predicted pose unchanged, for bundle adjustment to correct; matches are only counted.
 
-    threshold: largest reprojection error of an inlier, pixels; a prediction is coarse, so it is wide.
+    threshold: maximum reprojection error of an inlier, pixels; large, since a prediction is coarse.
     """
 
     threshold: float = 30.0
     two_view: TwoViewStart = field(default_factory=TwoViewStart)
 
     def locate(self, query: PoseQuery) -> PoseGuess:
-        """The prediction, with the matches it explains to `threshold`; see `InitialGeometry.locate`."""
+        """Return the prediction, with the matches it explains to `threshold`; see `InitialGeometry.locate`."""
         if query.predicted is None:
             return failed_guess(query, GeometryResult.NO_PREDICTION)
         errors = _errors(query.predicted, query)
@@ -132,12 +132,12 @@ class ConstantVelocity:
         intrinsics: np.ndarray,
         images: Sequence[np.ndarray] = (),
     ) -> StartGuess:
-        """Motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
+        """Return motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
         return self.two_view.start(pixels_i, pixels_j, intrinsics)
 
 
 def failed_guess(query: PoseQuery, result: GeometryResult) -> PoseGuess:
-    """A guess that says why there is none, at the predicted pose, or at the identity without a prediction."""
+    """Return a failure with its reason, at the predicted pose, or the identity without a prediction."""
     pose = np.eye(4) if query.predicted is None else query.predicted
     return PoseGuess(pose, np.zeros(len(query.points), dtype=bool), float("nan"), result)
 

@@ -1,7 +1,7 @@
-"""What a seed changes of robust estimation: the order in which matches are given to a sampler.
+"""Seeds for robust estimation: the order in which matches are passed to a sampler.
 
-OpenCV's samplers (USAC) draw from a generator that begins in the same state at every call, whatever `setRNGSeed` says,
-so a run is repeatable; in another order of the matches they draw other samples.
+OpenCV's samplers (USAC) have a generator that starts in the same state at every call, independent of `setRNGSeed`.
+Another order of the matches gives other samples.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Role = TypeVar("Role")
 
 @dataclass(frozen=True)
 class SampleOrder:
-    """The order of matches by a seed; 0 leaves them as they are found.
+    """Order of matches by a seed; 0 keeps the given order.
 
     Example:
         >>> from vggtgeo.models.classical import SampleOrder
@@ -28,20 +28,20 @@ class SampleOrder:
     seed: int = 0
 
     def of(self, count: int) -> np.ndarray:
-        """A permutation of `count` matches, int [count]."""
+        """Return a permutation of `count` matches, int [count]."""
         if self.seed == 0:
             return np.arange(count)
         return np.random.default_rng(self.seed).permutation(count)
 
     def undone(self, values: np.ndarray) -> np.ndarray:
-        """Values [count] of the matches in this order, in their own."""
+        """Return values [count] from this order in the given order."""
         own = np.empty_like(values)
         own[self.of(len(values))] = values
         return own
 
 
 def in_order(role: Role, order: SampleOrder) -> Role:
-    """A role, and all that it is made of, with another order of samples."""
+    """Return a role, with all its parts, with another order of samples."""
     if isinstance(role, SampleOrder):
         changed: Any = order
         return changed

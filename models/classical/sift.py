@@ -36,7 +36,7 @@ class SiftMatcher(PixelMatcher):
         return cv2.SIFT_create(contrastThreshold=self.contrast, enable_precise_upscale=True)
 
     def describe(self, image: np.ndarray) -> Features:
-        """Key points and RootSIFT vectors of `image` (uint8 [H, W, 3]); none on a blank image."""
+        """Return key points and RootSIFT vectors of `image` (uint8 [H, W, 3]); none on a blank image."""
         check_image("image", image)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         small, ratio = _shrunk(gray, self.area)

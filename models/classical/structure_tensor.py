@@ -1,4 +1,4 @@
-"""Dense confidence from the structure tensor: where image gradients fix a position."""
+"""Dense confidence from the structure tensor: how well gradients localise a pixel."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from vggtgeo.models.checks import check_fields, check_image
 
 @dataclass(frozen=True)
 class StructureTensor:
-    """Omega = s / (s + tau), with s the smoothed gradient energy that fixes the position of a pixel.
+    """Omega = s / (s + tau), with s the smoothed gradient energy that localises a pixel.
 
-    The structure tensor A = G * (grad I grad I^T) (Foerstner and Guelch 1987) has eigenvalues l1 >= l2; l2 says how
-    well both coordinates are fixed (corners), l1 how well one is (edges). s = l2 + `edges` l1, so that a pixel on a
-    straight edge keeps part of its confidence for the line residual. tau = `noise`^2: grey levels a pixel of
-    gradient at which the confidence is one half.
+    The structure tensor A = G * (grad I grad I^T) (Foerstner and Guelch 1987) has eigenvalues l1 >= l2; l2 measures how
+    well both coordinates are determined (corners), l1 one (edges). s = l2 + `edges` l1, so that a pixel on a straight
+    edge keeps part of its confidence for the line residual. tau = `noise`^2: grey levels a pixel of gradient at which
+    the confidence is one half.
 
     sigma: standard deviation of the Gaussian window G, pixels.
     """

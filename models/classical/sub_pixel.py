@@ -11,7 +11,7 @@ from vggtgeo.models.checks import check_fields
 
 @dataclass(frozen=True)
 class PatchAlignment:
-    """Moves each target until the patch around it looks like the reference patch.
+    """Move each target until its patch matches the reference patch.
 
     Lucas and Kanade (1981) in its inverse compositional form (Baker and Matthews 2004): the patch of view i is the
     template, an affine warp A x + u of it is sought in view j, and gain and offset of the brightness are removed by
@@ -21,8 +21,8 @@ class PatchAlignment:
     Measured on two indoor clips, near and far pairs: the median epipolar error falls by a quarter to a third for SIFT
     (0.20 to 0.13 px at best) and by 40 to 60 % for ORB; a patch that may only shift makes far pairs worse.
 
-    radius: half side of the patch, pixels. farthest: a target that would move farther than this stays, pixels.
-    similarity: least normalised cross-correlation of an accepted alignment.
+    radius: half side of the patch, pixels. farthest: maximum displacement, pixels; beyond it the target is unchanged.
+    similarity: minimum normalised cross-correlation of an accepted alignment.
     """
 
     radius: int = 7
@@ -36,7 +36,7 @@ class PatchAlignment:
     def refine(
         self, gray_i: np.ndarray, gray_j: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Refined targets float64 [n, 2], and whether each was accepted, bool [n]; the others are as they came.
+        """Return refined targets float64 [n, 2], and whether each was accepted, bool [n]; others are unchanged.
 
         gray_i, gray_j: uint8 [H, W]. pixels_i, pixels_j: float [n, 2].
         """
@@ -61,7 +61,7 @@ class PatchAlignment:
 def patch_correlation(
     gray_i: np.ndarray, gray_j: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray, radius: int = 7
 ) -> np.ndarray:
-    """Normalised cross-correlation of the patches around `pixels_i` and `pixels_j`, float [n, 2] each; float32 [n]."""
+    """Return the normalised cross-correlation of the patches around `pixels_i` and `pixels_j` [n, 2], float32 [n]."""
     side = _side(radius)
     first, second = (
         _normalised(_upright(gray, at, side, side)) for gray, at in ((gray_i, pixels_i), (gray_j, pixels_j))
@@ -71,7 +71,7 @@ def patch_correlation(
 
 @dataclass(frozen=True, eq=False)
 class _Template:
-    """The normalised patches of view i and what an alignment needs of them.
+    """Normalised patches of view i with derivatives and normal equations.
 
     patch: float32 [n, P]. across, down: float32 [n, P], its derivatives by a shift, as they come from the image; those
     by the four entries of the warp are these times an offset. inverse: [n, 6, 6] of the normal equations of all six,
@@ -83,7 +83,7 @@ class _Template:
     down: np.ndarray
     inverse: np.ndarray
     _along: np.ndarray
-    """float32 [n, 6]: what of each derivative normalising the patch takes away."""
+    """float32 [n, 6]: part of each derivative along the normalised patch."""
     _offsets: np.ndarray
     """float32 [P, 3]: one, and both offsets from the centre in half sides."""
 
@@ -107,14 +107,14 @@ class _Template:
         return cls(patch, across, down, np.linalg.inv(normal), along, offsets)
 
     def product(self, difference: np.ndarray) -> np.ndarray:
-        """Derivatives of the normalised patch times a difference of two such patches [n, P]; [n, 6]."""
+        """Return derivatives of the normalised patch times a difference of two such patches [n, P]; [n, 6]."""
         along = np.einsum("np,np->n", self.patch, difference)
         by_shift = ((side * difference) @ self._offsets for side in (self.across, self.down))
         return np.asarray(_by_warp(*by_shift) - self._along * along[:, None])
 
 
 def _by_warp(across: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """By shift and the four entries of the warp, [n, 6], from the sums [n, 3] of either derivative with `_offsets`."""
+    """Return sums by shift and the four entries of the warp, [n, 6], from those of both derivatives, [n, 3]."""
     return np.column_stack([across[:, 0], down[:, 0], across[:, 1:], down[:, 1:]])
 
 
@@ -139,7 +139,7 @@ def _grid(radius: int) -> np.ndarray:
 
 
 def _upright(gray: np.ndarray, centre: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """float32 [n, Y X]: `gray` at the offsets `x` [X] and `y` [Y] from each centre, row by row."""
+    """Return float32 [n, Y X]: `gray` at the offsets `x` [X] and `y` [Y] from each centre, row by row."""
     middle, count = centre.astype(np.float32), len(x) * len(y)
     column, row = np.empty((2, len(centre), len(y), len(x)), np.float32)
     column[:] = middle[:, 0, None, None] + x
@@ -148,8 +148,8 @@ def _upright(gray: np.ndarray, centre: np.ndarray, x: np.ndarray, y: np.ndarray)
 
 
 def _sample(gray: np.ndarray, centre: np.ndarray, warp: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """float32 [n, P]: `gray` at centre + warp @ offset."""
-    # One product for all patches, and the centre added after it, as large as it is.
+    """Return float32 [n, P]: `gray` at centre + warp @ offset."""
+    # One product for all patches; the centre is added afterwards, for its precision.
     turned = warp.astype(np.float32).transpose(1, 0, 2).reshape(-1, 2) @ grid.T
     column, row = turned.reshape(2, len(warp), -1)
     column += centre[:, 0, None].astype(np.float32)
@@ -168,13 +168,13 @@ def _normalised(patch: np.ndarray) -> np.ndarray:
 
 
 def _centred(patch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Patches [n, P] without their mean, and the length of each [n, 1], at least a thousandth."""
+    """Return patches [n, P] minus their mean, and their norms [n, 1], at least 1e-3."""
     centred = patch - patch.mean(axis=1, keepdims=True)
     return centred, np.maximum(np.sqrt(np.einsum("np,np->n", centred, centred))[:, None], 1e-3)
 
 
 def _compose(warp: np.ndarray, target: np.ndarray, step: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:
-    """The warp after the inverse of the template's increment: W <- W o dW^-1."""
+    """Return the warp after the inverse of the template's increment: W <- W o dW^-1."""
     a, b, c, d = (step[:, 2:] / radius).T
     a, d = 1 + a, 1 + d
     determinant = a * d - b * c

@@ -1,4 +1,4 @@
-"""The first two views of a sequence without depth: relative motion and structure up to scale."""
+"""Two-view initialization without depth: relative motion and structure up to scale."""
 
 from __future__ import annotations
 
@@ -16,20 +16,17 @@ from vggtgeo.geometry import pinhole
 
 @dataclass(frozen=True)
 class TwoViewStart:
-    """Essential matrix by MAGSAC++, the one of its four motions with points in front, triangulation.
+    """Essential matrix by MAGSAC++, choice among its four motions by points in front, triangulation.
 
-    Points of a plane have two motions that explain them (Longuet-Higgins, 1986), and matches choose between them by
-    their noise: a start of a wall was as often wrong as right, and what began wrongly goes on wrongly. So where a
-    motion of a plane that goes elsewhere explains nearly as many matches, the start has to wait; ORB-SLAM (Mur-Artal,
-    Montiel, Tardos, 2015) waits there, too. On two clips it explained 0.46 and 0.53 as many in right starts, 0.99 to
-    1.05 in wrong ones, and went elsewhere by 27 to 109 degrees, where the motions of a right start that a plane has
-    nearly, too, are 1 to 10 degrees apart.
+    Two motions explain the points of a plane (Longuet-Higgins, 1986), and noise decides between them. So if a motion of
+    a plane in another direction explains nearly as many matches, initialization waits for another pair, as in ORB-SLAM
+    (Mur-Artal, Montiel, Tardos, 2015). Measured: the rival explained 0.46 to 0.53 of the matches in correct starts, and
+    0.99 to 1.05 in wrong ones; its direction differed by 27 to 109 degrees in wrong ones, by 1 to 10 in correct ones.
 
-    threshold: largest epipolar error of an inlier, pixels. least: fewest points of a success: a start can wait for a
-    good pair, and on real clips those of about 50 points were often wrong.
-    parallax: least median angle between the rays of a point, radians; below it depth is mostly noise.
-    rival: share of the matches of the motion found from which another one makes it ambiguous; elsewhere: least angle
-    between the directions of both, radians.
+    threshold: maximum epipolar error of an inlier, pixels. least: minimum number of points; starts of about 50 points
+    were often wrong, and a start can wait for a better pair. parallax: minimum median angle between the rays of a
+    point, radians; below it depth is mostly noise. rival: share of the matches from which another motion makes the
+    result ambiguous; elsewhere: minimum angle between the directions of both, radians.
     """
 
     threshold: float = 1.5
@@ -42,7 +39,7 @@ class TwoViewStart:
     order: SampleOrder = field(default_factory=SampleOrder)
 
     def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
-        """Motion and structure from matches float [n, 2] each; see `InitialGeometry.start`."""
+        """Return motion and structure from matches float [n, 2] each; see `InitialGeometry.start`."""
         check_array("pixels_i", pixels_i, (None, 2))
         check_array("pixels_j", pixels_j, (len(pixels_i), 2))
         if len(pixels_i) < self.least:
@@ -65,7 +62,7 @@ class TwoViewStart:
         return StartGuess(pose, points, inliers, angle, GeometryResult.SUCCESS)
 
     def _has_rival(self, pose: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> bool:
-        """Whether a motion that a plane would have, and that goes elsewhere, explains nearly as many matches."""
+        """Return whether a plane's motion in another direction explains nearly as many matches."""
         explained = lambda motion: np.count_nonzero(
             pinhole.epipolar_distance(pixels_i, pixels_j, motion, intrinsics) < self.threshold
         )
@@ -77,7 +74,7 @@ class TwoViewStart:
     def _motions_of_a_plane(
         self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray
     ) -> list[np.ndarray]:
-        """Those of the homography that most matches agree with, its plane in front of the camera: two at most."""
+        """Return the motions, at most two, of the homography of most matches whose plane is in front of the camera."""
         order = self.order.of(len(pixels_i))
         first, second = (np.ascontiguousarray(pixels[order], np.float64) for pixels in (pixels_i, pixels_j))
         try:
@@ -119,7 +116,7 @@ class TwoViewStart:
         return essential, self.order.undone(mask.ravel().astype(bool))
 
     def _only_turned(self, rays_i: np.ndarray, rays_j: np.ndarray, intrinsics: np.ndarray) -> bool:
-        """Whether a rotation alone maps half of the rays of i onto those of j to within the threshold."""
+        """Return whether a rotation alone maps half of the rays of i onto those of j to within the threshold."""
         if len(rays_i) < 3:
             return False
         rotation = _rotation_between(rays_i, rays_j)
@@ -128,7 +125,7 @@ class TwoViewStart:
 
 
 def _direction_between(first: np.ndarray, second: np.ndarray) -> float:
-    """Angle between the translations of two motions, radians."""
+    """Return angle between the translations of two motions, radians."""
     one, other = first[:3, 3], second[:3, 3]
     cosine = one @ other / (np.linalg.norm(one) * np.linalg.norm(other))
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
@@ -140,7 +137,7 @@ def _rays(pixels: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 
 def _motion(essential: np.ndarray, rays_i: np.ndarray, rays_j: np.ndarray) -> np.ndarray:
-    """Of the four motions of an essential matrix, the one that puts most points in front of both cameras."""
+    """Return the motion of an essential matrix that places most points in front of both cameras."""
     rotation_1, rotation_2, translation = cv2.decomposeEssentialMat(essential)
     candidates = []
     for rotation in (rotation_1, rotation_2):
@@ -153,7 +150,7 @@ def _motion(essential: np.ndarray, rays_i: np.ndarray, rays_j: np.ndarray) -> np
 
 
 def _depths_along(pose: np.ndarray, rays_i: np.ndarray, rays_j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances along the two rays to their closest approach: least squares of s_j f_j = s_i R f_i + t."""
+    """Return distances along the two rays to their closest approach: least squares of s_j f_j = s_i R f_i + t."""
     turned, translation = rays_i @ pose[:3, :3].T, pose[:3, 3]
     cosine = (turned * rays_j).sum(axis=1)
     along_i, along_j = turned @ translation, rays_j @ translation
@@ -166,7 +163,7 @@ def _depths_along(pose: np.ndarray, rays_i: np.ndarray, rays_j: np.ndarray) -> t
 def _triangulate(
     pose: np.ndarray, rays_i: np.ndarray, rays_j: np.ndarray, agrees: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The midpoint of the two rays' closest approach, NaN unless in front of both and not almost parallel."""
+    """Return the midpoint of the two rays' closest approach, NaN unless in front of both and not almost parallel."""
     depth_i, depth_j = _depths_along(pose, rays_i, rays_j)
     to_first = pose[:3, :3].T
     midpoint = 0.5 * (depth_i[:, None] * rays_i + (depth_j[:, None] * rays_j - pose[:3, 3]) @ to_first.T)
@@ -185,12 +182,12 @@ def parallax(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def median_parallax(points: np.ndarray, pose: np.ndarray) -> float:
-    """The median of these angles."""
+    """Return the median of the angles of `parallax`."""
     return float(np.median(parallax(points, pose)))
 
 
 def _rotation_between(rays_i: np.ndarray, rays_j: np.ndarray) -> np.ndarray:
-    """The rotation that best maps unit vectors i to j: Kabsch (1976), reweighted towards least absolute error."""
+    """Return the rotation from unit vectors i to j: Kabsch (1976), reweighted for least absolute error."""
     rotation, _ = Rotation.align_vectors(rays_j, rays_i)
     for _ in range(5):
         off = np.linalg.norm(rotation.apply(rays_i) - rays_j, axis=1)

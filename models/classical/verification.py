@@ -16,14 +16,13 @@ from vggtgeo.geometry import pinhole
 
 @dataclass(frozen=True)
 class EpipolarVerifier:
-    """Keeps the matches that one epipolar geometry explains, estimated by MAGSAC++ (Barath et al. 2020).
+    """Keep the matches of one epipolar geometry, estimated by MAGSAC++ (Barath et al. 2020).
 
-    The model is the essential matrix where `intrinsics` are given, else the fundamental matrix. On a plane seen alone,
-    or from a camera that only turned, it is undetermined: it then accepts what a homography does, and wrong matches
-    that happen to lie on its lines. So where it explains no more than chance of what a homography leaves, the
-    homography decides.
+    The model is the essential matrix if `intrinsics` are given, else the fundamental matrix. For a single plane, or a
+    camera that only rotates, it is undetermined: it accepts the inliers of a homography, and wrong matches near its
+    epipolar lines. So if it explains no more of the outliers of a homography than chance, the homography decides.
 
-    threshold: largest epipolar (or transfer) error of an inlier, pixels. least: fewest matches that can be verified.
+    threshold: maximum epipolar (or transfer) error of an inlier, pixels. least: minimum number of matches.
     """
 
     threshold: float = 2.0
@@ -37,7 +36,7 @@ class EpipolarVerifier:
         check_fields(self, threshold="(0, inf)", least="[8, inf)")
 
     def inliers(self, pixels_i: np.ndarray, pixels_j: np.ndarray) -> np.ndarray:
-        """Bool [m]: which of the matches float [m, 2] -> float [m, 2] agree. All False when there are too few."""
+        """Return which of the matches [m, 2] -> [m, 2] agree, bool [m]; all False if there are too few."""
         if len(pixels_i) < self.least:
             return np.zeros(len(pixels_i), dtype=bool)
         order = self.order.of(len(pixels_i))
@@ -46,7 +45,7 @@ class EpipolarVerifier:
 
     def _inliers(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         epipolar = self._epipolar(first, second)
-        # A well determined epipolar geometry needs no second opinion, and the homography costs as much again.
+        # A well determined epipolar geometry needs no homography, which costs as much again.
         if np.count_nonzero(epipolar) >= 0.7 * len(first):
             return epipolar
         homography = self._homography(first, second)
@@ -86,7 +85,7 @@ def _adds_nothing(epipolar: np.ndarray, homography: np.ndarray) -> bool:
 
 
 def _quietly(estimate: Callable[..., tuple[Any, np.ndarray | None]], *arguments: Any) -> np.ndarray | None:
-    """The inlier mask of an OpenCV estimator, None where the points defeat it (all equal, collinear)."""
+    """Return the inlier mask of an OpenCV estimator; None for degenerate points (all equal, collinear)."""
     try:
         return estimate(*arguments)[1]
     except cv2.error:

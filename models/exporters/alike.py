@@ -25,7 +25,7 @@ _SIZES = {
 
 
 def build(request: Request) -> Graph:
-    """The network for one image of the request's size."""
+    """Return the network for one image of the request's size."""
     torch = load("torch")
     with CHECKOUT.importable(request.source), _stand_in(torch):
         seed(request)
@@ -45,7 +45,7 @@ def build(request: Request) -> Graph:
 
 
 def _stand_in(torch: Any) -> Any:
-    """The one module of torchvision that ALIKE imports, with the two functions that it calls."""
+    """Return the one module of torchvision that ALIKE imports, with the two functions that it calls."""
 
     def convolution(side: int) -> Any:
         def make(inputs: int, outputs: int, stride: int = 1) -> Any:

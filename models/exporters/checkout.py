@@ -33,7 +33,7 @@ class Checkout:
     roots: tuple[str, ...] = (".",)
 
     def root(self, source: Path) -> Path:
-        """The folder to import from; raises `ExportError` if `source` is no such checkout."""
+        """Return the folder to import from; raises `ExportError` if `source` is no such checkout."""
         for folder in self.roots:
             if (source / folder / self.marker).is_file():
                 return (source / folder).resolve()
@@ -44,7 +44,7 @@ class Checkout:
         )
 
     def find(self, folder: Path) -> Path | None:
-        """The checkout among the folders in `folder`, whatever it is called, or None."""
+        """Return the checkout among the folders in `folder`, whatever it is called, or None."""
         for candidate in sorted(path for path in folder.iterdir() if path.is_dir()):
             if any((candidate / root / self.marker).is_file() for root in self.roots):
                 return candidate
@@ -78,7 +78,9 @@ class Checkout:
 
 
 def import_from(source: Path, module: str, hint: str) -> Any:
-    """The module, inside `Checkout.importable`; `ExportError` with `hint` if something that it imports is missing."""
+    """Return the module, inside `Checkout.importable`; `ExportError` with `hint` if something that it imports is
+    missing.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -142,7 +142,7 @@ def _write(
 
 
 def _output_names(network: str, graph: Graph) -> tuple[str, ...]:
-    """The outputs in the order of `published`; they must be those of the contract."""
+    """Return the outputs in the order of `published`; they must be those of the contract."""
     contract = CONTRACTS[network]
     needed = {tensor.name for tensor in contract.outputs if not tensor.optional}
     known = {tensor.name for tensor in contract.outputs}
@@ -205,7 +205,7 @@ def _strip(model: Any) -> None:
 
 
 def _run(path: Path, expected: _Expected) -> tuple[dict[str, np.ndarray], float]:
-    """Outputs by name, and the seconds of the second call."""
+    """Return outputs by name, and the seconds of the second call."""
     runtime = load("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = load("torch").get_num_threads()
@@ -218,7 +218,7 @@ def _run(path: Path, expected: _Expected) -> tuple[dict[str, np.ndarray], float]
 
 
 def _compare(who: str, found: Mapping[str, np.ndarray], wanted: Mapping[str, np.ndarray], tolerance: float) -> float:
-    """The largest difference; `ExportError` if it is above `tolerance` or not a number, or if a shape differs."""
+    """Return the largest difference; raise `ExportError` above `tolerance`, for NaN, or for another shape."""
     largest = 0.0
     for name, reference in wanted.items():
         if found[name].shape != reference.shape:
@@ -266,7 +266,7 @@ def _check_output(output: Path) -> None:
 
 @contextlib.contextmanager
 def _folder_beside(output: Path) -> Iterator[Path]:
-    """A temporary folder on the same file system, so that moving its files out is one step each."""
+    """Return a temporary folder on the same file system, so that moving its files out is one step each."""
     output.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{output.stem}.", dir=output.parent))
     try:

@@ -28,7 +28,7 @@ _SMALL = ("--enc_layers", "--dec_layers", "--second_enc_layers", "--second_dec_l
 
 
 def build(request: Request) -> Graph:
-    """The network for one image of the request's size."""
+    """Return the network for one image of the request's size."""
     torch = load("torch")
     require_random(request, ("test",))
     with CHECKOUT.importable(request.source), _stand_ins(request):

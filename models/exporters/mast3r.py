@@ -59,7 +59,7 @@ _HEAD_OUTPUTS = {
 
 
 def build_encoder(request: Request) -> Graph:
-    """Image to features."""
+    """Return image to features."""
     torch = load("torch")
     network = _network(request)
     image = request.random_images(-1.0, 1.0)

@@ -17,7 +17,7 @@ FOURTH_CHANNEL = 1 / 127.5 - 1
 
 
 def build(request: Request) -> Graph:
-    """The network for its one size, 512 x 512."""
+    """Return the network for its one size, 512 x 512."""
     torch = load("torch")
     with CHECKOUT.importable(request.source):
         seed(request)

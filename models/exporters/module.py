@@ -9,7 +9,7 @@ from vggtgeo.models.exporters.packages import load
 
 
 def as_module(network: Any, forward: Callable[..., Any]) -> Any:
-    """A torch module that owns `network` and computes `forward(network, *inputs)`."""
+    """Return a torch module that owns `network` and computes `forward(network, *inputs)`."""
     base: Any = load("torch").nn.Module
 
     class Wrapped(base):

@@ -33,7 +33,7 @@ _CONFIGURATION = "configs/train/v2.json"
 
 
 def build(request: Request) -> Graph:
-    """The network for one image of the request's size, seen as about `request.tokens` patches."""
+    """Return the network for one image of the request's size, seen as about `request.tokens` patches."""
     torch = load("torch")
     configuration = _configuration(request)
     with CHECKOUT.importable(request.source), stand_in("utils3d"), _without_xformers():
@@ -57,7 +57,7 @@ def build(request: Request) -> Graph:
 
 
 def _configuration(request: Request) -> dict[str, Any]:
-    """The network's options: those in the checkpoint, else the published ones, fitted to the variant."""
+    """Return the network's options: those in the checkpoint, else the published ones, fitted to the variant."""
     if request.checkpoint is not None:
         configuration = read_checkpoint(request.checkpoint).get("model_config")
         if not isinstance(configuration, dict):
@@ -77,7 +77,7 @@ def _configuration(request: Request) -> dict[str, Any]:
 
 
 def _fitted(configuration: dict[str, Any], variant: str) -> dict[str, Any]:
-    """The configuration of the ViT-L for another backbone: its blocks, and its width where the class token goes."""
+    """Return the configuration of the ViT-L for another backbone: number of blocks and width."""
     blocks = _BLOCKS[variant]
     levels = [blocks * (quarter + 1) // 4 - 1 for quarter in range(4)]
     encoder = configuration["encoder"] | {"backbone": f"dinov2_{variant}14", "intermediate_layers": levels}

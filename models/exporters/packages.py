@@ -10,7 +10,7 @@ from vggtgeo.models.extras import install_hint
 
 
 def load(name: str) -> Any:
-    """The package `name`; an `ExportError` that names the extra when it, or one that it needs, is not installed."""
+    """Return the package `name`; raise `ExportError` naming the extra if it, or a dependency, is missing."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

@@ -37,13 +37,13 @@ class Recipe:
 
     @property
     def checkout(self) -> Checkout:
-        """Where its code is looked for."""
+        """Return where its code is looked for."""
         found: Checkout = importlib.import_module(f"{_HERE}.{self.module}").CHECKOUT
         return found
 
     @property
     def build(self) -> Callable[[Request], Graph]:
-        """Makes the network that a request asks for."""
+        """Make the network that a request asks for."""
         found: Callable[[Request], Graph] = getattr(importlib.import_module(f"{_HERE}.{self.module}"), self.function)
         return found
 
@@ -59,7 +59,7 @@ class Recipe:
         half: bool = False,
         allow_extra: bool = False,
     ) -> Request:
-        """The request with defaults filled in; `ExportError` for what this network cannot be."""
+        """Return the request with defaults filled in; `ExportError` for what this network cannot be."""
         height, width = height or self.size[0], width or self.size[1]
         self._check_size(height, width)
         if variant is not None and variant not in self.variants:
@@ -116,7 +116,7 @@ RECIPES = {
 
 
 def recipe_of(network: str) -> Recipe:
-    """The recipe of `network`; `ExportError` with the names there are."""
+    """Return the recipe of `network`; `ExportError` with the names there are."""
     if network not in RECIPES:
         raise ExportError(f"`NAME` is {network!r}, expected one of {', '.join(RECIPES)}")
     return RECIPES[network]

@@ -36,7 +36,7 @@ class Request:
     seed: int = 0
 
     def random_images(self, low: float, high: float, count: int = 1) -> np.ndarray:
-        """float32 [count, 3, height, width], uniform in [low, high]: the input on which PyTorch is repeated."""
+        """Return float32 [count, 3, height, width], uniform in [low, high]: the input on which PyTorch is repeated."""
         draw = np.random.default_rng(self.seed).uniform(low, high, (count, 3, self.height, self.width))
         return draw.astype(np.float32)
 

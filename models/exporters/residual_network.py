@@ -16,7 +16,7 @@ _EXPANSION = 4
 
 
 def residual_network(name: str, norm: Callable[[int], Any]) -> Any:
-    """The torch module: `layer1` .. `layer4` after a stem, with `norm(channels)` as the norm, random weights."""
+    """Return the torch module: `layer1` .. `layer4` after a stem, with `norm(channels)` as the norm, random weights."""
     nn = load("torch").nn
     base: Any = nn.Module
 
@@ -52,7 +52,7 @@ def residual_network(name: str, norm: Callable[[int], Any]) -> Any:
 
 
 def layer_getter() -> Any:
-    """A class like torchvision's: runs a network's children in order and gives those named in `return_layers`."""
+    """Return a class like torchvision's, which runs children in order and returns those in `return_layers`."""
     base: Any = load("torch").nn.ModuleDict
 
     class LayerGetter(base):

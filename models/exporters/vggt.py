@@ -35,7 +35,7 @@ _HINT = "install einops and huggingface-hub"
 
 
 def build(request: Request) -> Graph:
-    """The network for `request.views` images of the request's size."""
+    """Return the network for `request.views` images of the request's size."""
     torch = load("torch")
     require_random(request, ("test",))
     with CHECKOUT.importable(request.source):
@@ -60,7 +60,7 @@ def _published(request: Request) -> Any:
 
 
 def _small(request: Request) -> Any:
-    """The same network from its published parts, with one block of each kind in the place of eight."""
+    """Return the same network from its published parts, with one block of each kind in the place of eight."""
     model = import_from(request.source, "vggt.models.vggt", _HINT)
     base: Any = model.VGGT
 

@@ -20,7 +20,7 @@ _STATES = ("model", "state_dict", "teacher")
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The content of a PyTorch checkpoint, read without running code from it, mapped rather than copied.
+    """Return the content of a PyTorch checkpoint, read without running code from it, mapped rather than copied.
 
     Raises `ExportError` if it is not one.
     """
@@ -43,7 +43,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def weights_of(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The dictionary of weights in a checkpoint's content."""
+    """Return the dictionary of weights in a checkpoint's content."""
     inner = next((content[key] for key in _STATES if isinstance(content.get(key), Mapping)), content)
     return {name.removeprefix("module."): value for name, value in inner.items()}
 

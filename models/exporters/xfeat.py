@@ -19,7 +19,7 @@ _BLOCK = 8
 
 
 def build(request: Request) -> Graph:
-    """The network for one image of the request's size."""
+    """Return the network for one image of the request's size."""
     torch = load("torch")
     with CHECKOUT.importable(request.source):
         seed(request)

@@ -50,7 +50,7 @@ class Refusals:
     refused: int = 0
 
     def note(self, values: int, refused: int, left: bool) -> None:
-        """One answer."""
+        """Count one answer."""
         self.asked += 1
         self.values += values
         self.refused += refused

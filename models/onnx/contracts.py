@@ -70,7 +70,7 @@ class Normalisation:
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """float32 [3, H, W] of `image` (uint8 [H, W, 3], RGB)."""
+        """Return float32 [3, H, W] of `image` (uint8 [H, W, 3], RGB)."""
         scaled = image.astype(np.float32) / np.float32(255.0)
         normal = (scaled - np.array(self.mean, np.float32)) / np.array(self.std, np.float32)
         return np.ascontiguousarray(normal.transpose(2, 0, 1))

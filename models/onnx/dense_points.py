@@ -35,7 +35,7 @@ class DensePointMatcher(PixelMatcher):
     score: float = 0.02
 
     def describe(self, image: np.ndarray) -> Features:
-        """Key points and unit vectors of `image` (uint8 [H, W, 3]); none where no score is high enough."""
+        """Return key points and unit vectors of `image` (uint8 [H, W, 3]); none where no score is high enough."""
         check_image("image", image)
         settings = ("key points", self.count, self.score)
         found = self.cache.get((self.session,), settings, (image,), lambda: self._run(image))
@@ -79,7 +79,8 @@ def peaks(scores: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def vectors_at(descriptors: np.ndarray, places: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Unit vectors float32 [M, C] of a map float [C, h, w] at `places` (x, y), float [M, 2], between its pixels linear.
+    """Return unit vectors float32 [M, C] of a map float [C, h, w] at `places` (x, y), float [M, 2], between its pixels
+    linear.
 
     size: (height, width) of the network's input, which `places` are pixels of; the map may be coarser.
     """

@@ -25,7 +25,9 @@ class DescriptorGrid:
     patch: int
 
     def at(self, pixels: np.ndarray) -> np.ndarray:
-        """Descriptors float32 [n, C], of unit length, at image pixels float [n, 2]: bilinear between patch centres."""
+        """Return descriptors float32 [n, C], of unit length, at image pixels float [n, 2]: bilinear between patch
+        centres.
+        """
         place = (self.fit.to_network(np.asarray(pixels, np.float64)) + 0.5) / self.patch - 0.5
         height, width = self.grid.shape[:2]
         place = np.clip(place, 0.0, [width - 1, height - 1])
@@ -58,7 +60,7 @@ class DinoFeatures:
         return fit.map_to_image(fine)
 
     def describe(self, image: np.ndarray) -> DescriptorGrid:
-        """Descriptors of the patches of `image`, less their mean, which all patches of an image share."""
+        """Return descriptors of the patches of `image`, less their mean, which all patches of an image share."""
         outputs, fit = self._outputs(image)
         rows, columns = (side // DINOV3.multiple for side in fit.network_size)
         grid = outputs["patch_descriptors"].astype(np.float32)
@@ -87,7 +89,7 @@ class DinoFeatures:
 
 
 def saliency(attention: np.ndarray) -> np.ndarray:
-    """Omega of each patch, float32 [P], of the class token's attention float [heads, 5 + P]."""
+    """Return omega of each patch, float32 [P], of the class token's attention float [heads, 5 + P]."""
     patches = attention[:, PREFIX:].astype(np.float32).mean(axis=0)
     relative = patches / np.maximum(patches.mean(), np.float32(1e-12))
     return relative / (1.0 + relative)

@@ -67,12 +67,12 @@ def check_signature(path: Path, contract: Contract, inputs: Signatures, outputs:
 
 
 def recognise(inputs: Signatures, outputs: Signatures) -> list[str]:
-    """Names of the networks whose contract a file with this signature keeps."""
+    """Return names of the networks whose contract a file with this signature keeps."""
     return [name for name, contract in CONTRACTS.items() if not disagreements(contract, inputs, outputs)]
 
 
 def disagreements(contract: Contract, inputs: Signatures, outputs: Signatures) -> list[str]:
-    """Where a file's signature departs from the contract, each with what was expected and what was found."""
+    """Return where a file's signature departs from the contract, each with what was expected and what was found."""
     wrong = _names("inputs", contract.inputs, inputs, others=False) + _names("outputs", contract.outputs, outputs)
     if wrong:
         return wrong
@@ -86,8 +86,8 @@ def disagreements(contract: Contract, inputs: Signatures, outputs: Signatures) -
 
 
 def wrong_sizes(contract: Contract, given: Mapping[str, Sizes], found: Mapping[str, Sizes]) -> list[str]:
-    """Where the sizes of an answer depart from the contract, for inputs of the sizes `given`: what a file leaves open
-    shows only then. An image may have no line; of all else an answer has something.
+    """Return where the sizes of an answer depart from the contract, for inputs of the sizes `given`: what a file leaves
+    open shows only then. An image may have no line; of all else an answer has something.
     """
     sizes = {**given, **found}
     tensors = [tensor for tensor in (*contract.inputs, *contract.outputs) if tensor.name in sizes]
@@ -102,7 +102,7 @@ def wrong_sizes(contract: Contract, given: Mapping[str, Sizes], found: Mapping[s
 
 
 def _names(kind: str, expected: Sequence[Tensor], found: Signatures, others: bool = True) -> list[str]:
-    """Whether all tensors are there that must be and, unless `others` may be, none beside them."""
+    """Return whether all tensors are there that must be and, unless `others` may be, none beside them."""
     missing = [tensor for tensor in expected if not tensor.optional and tensor.name not in found]
     strange = set(found) - {tensor.name for tensor in expected}
     if not missing and (others or not strange):

@@ -36,16 +36,16 @@ class Fit:
 
     @property
     def scale(self) -> np.ndarray:
-        """float64 [2] (x, y): network pixels an image pixel."""
+        """Return float64 [2] (x, y): network pixels an image pixel."""
         return np.array(self.content_size[::-1]) / np.array(self.image_size[::-1])
 
     @property
     def offset(self) -> np.ndarray:
-        """int64 [2] (x, y): where the image begins in the network's input."""
+        """Return int64 [2] (x, y): where the image begins in the network's input."""
         return (np.array(self.network_size[::-1]) - np.array(self.content_size[::-1])) // 2
 
     def resize(self, image: np.ndarray) -> np.ndarray:
-        """uint8 [*network_size, 3] of `image` (uint8 [*image_size, 3])."""
+        """Return uint8 [*network_size, 3] of `image` (uint8 [*image_size, 3])."""
         shrinks = self.content_size[0] <= self.image_size[0]
         way = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
         content = cv2.resize(image, self.content_size[::-1], interpolation=way)
@@ -57,15 +57,15 @@ class Fit:
         return cv2.copyMakeBorder(content, top, bottom, left, right, cv2.BORDER_CONSTANT, value=_BORDER)
 
     def to_network(self, pixels: np.ndarray) -> np.ndarray:
-        """Where image pixels float [..., 2] lie in the network's input."""
+        """Return where image pixels float [..., 2] lie in the network's input."""
         return self.scale * (pixels + 0.5) - 0.5 + self.offset
 
     def to_image(self, pixels: np.ndarray) -> np.ndarray:
-        """Where pixels float [..., 2] of the network's input lie in the image."""
+        """Return where pixels float [..., 2] of the network's input lie in the image."""
         return (pixels - self.offset + 0.5) / self.scale - 0.5
 
     def map_to_image(self, values: np.ndarray, nearest: bool = False) -> np.ndarray:
-        """float32 [*image_size, ...] of a map float [*network_size, ...], interpolated; the border is left out."""
+        """Return a map [*network_size, ...] as float32 [*image_size, ...], interpolated, without the border."""
         left, top = (int(value) for value in self.offset)
         content = values[top : top + self.content_size[0], left : left + self.content_size[1]]
         way = cv2.INTER_NEAREST_EXACT if nearest else cv2.INTER_LINEAR

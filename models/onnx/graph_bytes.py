@@ -13,7 +13,7 @@ from vggtgeo.models.onnx.contracts import METADATA_WEIGHTS, RANDOM_WEIGHTS
 
 
 def external_files(path: Path) -> list[Path]:
-    """The files of external data that the graph in `path` names and that are there, in the order of their names."""
+    """Return the existing files of external data that the graph in `path` names, sorted by name."""
     files = [path.parent / name for name in sorted(set(_values(path, "location")))]
     return [file for file in files if file.parent == path.parent and _is_there(file)]
 
@@ -26,12 +26,12 @@ def _is_there(file: Path) -> bool:
 
 
 def has_random_weights(path: Path) -> bool:
-    """Whether the file says that its weights were drawn at random, as an export for tests does."""
+    """Return whether the file says that its weights were drawn at random, as an export for tests does."""
     return RANDOM_WEIGHTS in _values(path, METADATA_WEIGHTS)
 
 
 def _values(path: Path, key: str) -> list[str]:
-    """The values of all entries with this key. A value is shorter than 128 bytes: its length is one byte."""
+    """Return the values of all entries with this key. A value is shorter than 128 bytes: its length is one byte."""
     mark = b"\x0a" + bytes([len(key)]) + key.encode() + b"\x12"
     if not path.stat().st_size:
         return []

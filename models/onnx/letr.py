@@ -28,7 +28,7 @@ class LetrDetector:
     count: int = 200
 
     def detect(self, image: np.ndarray) -> Segments:
-        """Segments of `image` (uint8 [H, W, 3]), most probable first."""
+        """Return segments of `image` (uint8 [H, W, 3]), most probable first."""
         check_image("image", image)
         factor = SHORT_SIDE / min(image.shape[:2])
         wanted = tuple(round(factor * side) for side in image.shape[:2])

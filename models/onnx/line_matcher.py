@@ -33,7 +33,7 @@ class DenseLineMatcher:
         check_fields(self, samples="[2, inf)", ratio="(0, 1]")
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
-        """Descriptors float16 [L, samples, C] along `segments` of `image` (uint8 [H, W, 3])."""
+        """Return descriptors float16 [L, samples, C] along `segments` of `image` (uint8 [H, W, 3])."""
         if not len(segments):
             return LineFeatures(segments, np.zeros((0, self.samples, 1), np.float16))
         place = ((np.arange(self.samples) + 0.5) / self.samples)[:, None]
@@ -45,7 +45,7 @@ class DenseLineMatcher:
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
-        """Matches from view i to view j; see `LineMatcher.match`."""
+        """Return the matches from view i to view j; see `LineMatcher.match`."""
         ends_i, ends_j = features_i.segments.endpoints, features_j.segments.endpoints
         allowed = allowed_pairs(ends_i, ends_j, relative, self.angle, self.distance, self.overlap)
         similarity = np.where(allowed, segment_similarity(features_i.descriptors, features_j.descriptors), -np.inf)
@@ -54,7 +54,7 @@ class DenseLineMatcher:
 
 
 def segment_similarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """float32 [I, J] in [-1, 1] of unit descriptors [I, n, C] and [J, m, C] along two sets of segments."""
+    """Return float32 [I, J] in [-1, 1] of unit descriptors [I, n, C] and [J, m, C] along two sets of segments."""
     if not len(first) or not len(second):
         return np.zeros((len(first), len(second)), np.float32)
     flat = first.reshape(-1, first.shape[2]).astype(np.float32)

@@ -69,7 +69,7 @@ class Mast3rMatcher:
         return height, width
 
     def describe(self, image: np.ndarray) -> Features:
-        """Key points of `image` (uint8 [H, W, 3]); the network runs when they are matched."""
+        """Return key points of `image` (uint8 [H, W, 3]); the network runs when they are matched."""
         check_image("image", image)
         fit = Fit.of(image.shape[:2], self.size)
         starts, strength = corners(fit.resize(image), self.spacing, self.corner)
@@ -78,7 +78,7 @@ class Mast3rMatcher:
         return Features(pixels[inside], strength[inside], Mast3rView(image, fit, starts[inside]))
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """Verified matches from view i to view j; see `PointMatcher.match`. `predicted` is not used."""
+        """Return verified matches from view i to view j; see `PointMatcher.match`. `predicted` is not used."""
         first: Mast3rView = features_i.descriptors
         second: Mast3rView = features_j.descriptors
         settings = ("matches", self.spacing, self.corner, self.stride)
@@ -141,7 +141,8 @@ class Mast3rMatcher:
 
 
 def corners(image: np.ndarray, spacing: int, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """The strongest corner, int64 [M, 2] (x, y), of each cell of `spacing` pixels, and its strength, float64 [M].
+    """Return the strongest corner, int64 [M, 2] (x, y), of each cell of `spacing` pixels, and its strength, float64
+    [M].
 
     image: uint8 [H, W, 3]. Cells whose strongest corner is below `least` have none.
     """

@@ -33,7 +33,7 @@ class MlsdDetector:
     count: int = 200
 
     def detect(self, image: np.ndarray) -> Segments:
-        """Segments of `image` (uint8 [H, W, 3]), best first."""
+        """Return segments of `image` (uint8 [H, W, 3]), best first."""
         check_image("image", image)
         outputs = self.cache.get((self.session,), ("lines",), (image,), lambda: self._run(image))
         ends, scores = decode_maps(outputs["maps"], self.score, self.least_length, self.count)
@@ -47,7 +47,7 @@ class MlsdDetector:
 
 
 def prepare(image: np.ndarray) -> np.ndarray:
-    """The network's input, float32 [4, 512, 512], of `image` (uint8 [H, W, 3])."""
+    """Return the network's input, float32 [4, 512, 512], of `image` (uint8 [H, W, 3])."""
     colours = MLSD.normalisation.apply(cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA))
     return np.concatenate([colours, np.full((1, _SIDE, _SIDE), 1.0 / 127.5 - 1.0, np.float32)])
 

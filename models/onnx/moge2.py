@@ -41,7 +41,7 @@ class MogeDepth:
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        """Metric depth; with `intrinsics` only the shift is recovered, without them the focal length too."""
+        """Return metric depth; with `intrinsics` only the shift is recovered, without them the focal length too."""
         check_image("image", image)
         size = image.shape[:2]
         rows, columns = self.session.inputs["image"].shape[2:]
@@ -100,7 +100,7 @@ def recover_focal_shift(
 
 
 def _closed_form_shift(x: np.ndarray, y: np.ndarray, z: np.ndarray, rays: np.ndarray, known: bool) -> float:
-    """The shift of the equations multiplied out, f (x, y) = (z + s) (u, v): linear in f and s."""
+    """Return the shift of the equations multiplied out, f (x, y) = (z + s) (u, v): linear in f and s."""
     ahead = np.tile(z, 2)
     image = np.concatenate([x, y])
     if known:

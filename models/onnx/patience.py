@@ -36,7 +36,7 @@ class Call:
 
     @property
     def seconds(self) -> float:
-        """How long it goes on."""
+        """Return how long it goes on."""
         return time.monotonic() - self.began
 
     def run(self, work: Callable[[], None]) -> None:
@@ -60,7 +60,9 @@ _watching: list[threading.Thread] = []
 
 @contextmanager
 def watched(path: Path) -> Iterator[Call]:
-    """A call of the network in `path`, which is ended where it takes longer than `LONGEST`, whichever thread waits."""
+    """Return a call of the network in `path`, which is ended where it takes longer than `LONGEST`, whichever thread
+    waits.
+    """
     options = onnxruntime.RunOptions()
     options.log_severity_level = 4  # the exception reports what is wrong, once
     call = Call(path, options)
@@ -78,7 +80,7 @@ def watched(path: Path) -> Iterator[Call]:
 
 @cache
 def _beside() -> ThreadPoolExecutor:
-    """The one thread of the calls of the main thread: CUDA keeps memory for each thread that calls."""
+    """Return the one thread of the calls of the main thread: CUDA keeps memory for each thread that calls."""
     return ThreadPoolExecutor(1, thread_name_prefix="network")
 
 

@@ -27,7 +27,7 @@ _FATAL, _WARNING = 4, 2
 
 
 def choose_provider(provider: Provider) -> str:
-    """The device, "cuda" or "cpu"; raises `NetworkFileError` if CUDA is asked for and this onnxruntime has none.
+    """Return the device, "cuda" or "cpu"; raises `NetworkFileError` if CUDA is asked for and this onnxruntime has none.
 
     Warns where the package for CUDA is installed and out of use.
     """
@@ -43,7 +43,7 @@ def choose_provider(provider: Provider) -> str:
 
 
 def _covered() -> str:
-    """A sentence where `onnxruntime` was installed after `onnxruntime-gpu`; nothing elsewhere.
+    """Return a sentence where `onnxruntime` was installed after `onnxruntime-gpu`; nothing elsewhere.
 
     Both hold the module of that name, and pip puts one over the other in an order of its own.
     """
@@ -99,5 +99,5 @@ def check_started(provider: Provider, device: str, used: str) -> None:
 
 @cache
 def warn_once(text: str) -> None:
-    """A UserWarning, the first time."""
+    """Issue a UserWarning, only the first time."""
     warnings.warn(text, stacklevel=3)

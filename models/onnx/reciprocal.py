@@ -25,7 +25,7 @@ def reciprocal(
 
 
 def nearest(queries: np.ndarray, grid: np.ndarray, stride: int = 1) -> np.ndarray:
-    """The pixel (x, y) of `grid` [H, W, D] with the largest inner product with each query [m, D], int64 [m, 2].
+    """Return the pixel (x, y) of `grid` [H, W, D] with the largest inner product with each query [m, D], int64 [m, 2].
 
     Exact for stride 1; otherwise exact where the coarse search ends within `stride` pixels of the best.
     """
@@ -42,7 +42,7 @@ def nearest(queries: np.ndarray, grid: np.ndarray, stride: int = 1) -> np.ndarra
 
 
 def _around(queries: np.ndarray, grid: np.ndarray, found: np.ndarray, reach: int) -> np.ndarray:
-    """The best pixel within `reach` of each found one."""
+    """Return the best pixel within `reach` of each found one."""
     steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
     places = np.clip(found[:, None] + steps, 0, [grid.shape[1] - 1, grid.shape[0] - 1])
     products = np.einsum("md,mkd->mk", queries, grid[places[..., 1], places[..., 0]])

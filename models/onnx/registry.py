@@ -51,7 +51,7 @@ class Network:
 
     @property
     def choice(self) -> str:
-        """The name by which it is chosen for a role."""
+        """Return the name by which it is chosen for a role."""
         return self.part_of or self.name
 
     @property
@@ -68,7 +68,7 @@ class Network:
 
     @property
     def export_command(self) -> str:
-        """How to make the file from the published code and weights."""
+        """Return how to make the file from the published code and weights."""
         variant = f" --variant {self.variant}" if self.variant else ""
         return f"vggtgeo models export {self.contract_name}{variant} --source CHECKOUT --checkpoint FILE -o {self.file}"
 
@@ -145,10 +145,10 @@ NETWORKS = {network.name: network for network in _ALL}
 
 
 def files_of(choice: str) -> tuple[str, ...]:
-    """Names of the networks that are chosen by one name."""
+    """Return names of the networks that are chosen by one name."""
     return tuple(network.name for network in _ALL if network.choice == choice)
 
 
 def players(role: str) -> tuple[str, ...]:
-    """The names that can be chosen for a role, a field of `vggtgeo.Roles`."""
+    """Return the names that can be chosen for a role, a field of `vggtgeo.Roles`."""
     return tuple(dict.fromkeys(network.choice for network in _ALL if role in network.contract.plays))

@@ -8,7 +8,7 @@ from vggtgeo.models.roles import Segments
 
 
 def tidy(image: np.ndarray, endpoints: np.ndarray, scores: np.ndarray, shortest: float, count: int) -> Segments:
-    """Segments cut off at the border of `image` (uint8 [H, W, 3]), directed by their brighter side, best first.
+    """Return segments cut off at the border of `image` (uint8 [H, W, 3]), directed by their brighter side, best first.
 
     endpoints: float [L, 2, 2], pixels. scores: float [L]. Those of which less than `shortest` pixels are inside are
     dropped, and all but the best `count`.
@@ -22,7 +22,8 @@ def tidy(image: np.ndarray, endpoints: np.ndarray, scores: np.ndarray, shortest:
 
 
 def cut_off(endpoints: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The parts of segments float64 [L, 2, 2] inside an image of `size` (width, height), along the segments themselves.
+    """Return the parts of segments float64 [L, 2, 2] inside an image of `size` (width, height), along the segments
+    themselves.
 
     Clipping x and y apart would turn a segment. Both ends are one point where nothing of a segment is inside (Liang and
     Barsky, "A new concept and method for line clipping", ACM TOG 3(1), 1984).

@@ -118,7 +118,7 @@ class Session:
 
     @property
     def random_weights(self) -> bool:
-        """Whether the metadata declare random weights, whose results are meaningless."""
+        """Return whether the metadata declare random weights, whose results are meaningless."""
         return self.metadata.get(METADATA_WEIGHTS) == RANDOM_WEIGHTS
 
     @cached_property

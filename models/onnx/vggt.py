@@ -84,7 +84,8 @@ class VggtWindow:
 
 
 def decode_cameras(encoding: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses float64 [n, 4, 4] (world -> camera), intrinsics float64 [n, 4] in pixels, and which are usable, bool [n].
+    """Return poses float64 [n, 4, 4] (world -> camera), intrinsics float64 [n, 4] in pixels, and which are usable, bool
+    [n].
 
     encoding: float [n, 9], translation, quaternion x y z w, vertical and horizontal field of view in radians. size:
     (height, width) of the network's images, whose centre is the principal point. A view that is not usable repeats
@@ -110,13 +111,15 @@ def decode_cameras(encoding: np.ndarray, size: tuple[int, int]) -> tuple[np.ndar
 
 
 def shared_intrinsics(cameras: np.ndarray) -> np.ndarray:
-    """One camera, float64 [4], of those of all views, float [n, 4]: robust means, of the focal lengths' logarithms."""
+    """Return one camera, float64 [4], of those of all views, float [n, 4]: robust means, of the focal lengths'
+    logarithms.
+    """
     focal = [np.exp(robust_mean(np.log(column))) for column in cameras[:, :2].T]
     return np.array([*focal, *(robust_mean(column) for column in cameras[:, 2:].T)])
 
 
 def robust_mean(values: np.ndarray, reach: float = 3.0) -> float:
-    """The mean of the values within `reach` standard deviations of the median, by the median absolute deviation."""
+    """Return the mean of the values within `reach` robust standard deviations of the median."""
     middle = np.median(values)
     off = np.abs(values - middle)
     # 1.4826 times the median absolute deviation estimates a normal standard deviation.

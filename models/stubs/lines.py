@@ -61,7 +61,7 @@ class SimulatedLetr:
 
 
 def _noisy(ends: np.ndarray, across: float, along: float, rng: np.random.Generator) -> np.ndarray:
-    """Segments [L, 2, 2] with independent normal errors of their ends."""
+    """Return segments [L, 2, 2] with independent normal errors of their ends."""
     way = ends[:, 1] - ends[:, 0]
     way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
     normal = np.stack([-way[:, 1], way[:, 0]], axis=1)

@@ -27,7 +27,7 @@ class Oracle(Protocol):
         ...
 
     def index_of(self, image: np.ndarray) -> int:
-        """The frame whose image this is; raises ValueError for any other image."""
+        """Return the frame whose image this is; raises ValueError for any other image."""
         ...
 
     def timestamp(self, index: int) -> float:
@@ -35,19 +35,19 @@ class Oracle(Protocol):
         ...
 
     def pose(self, index: int) -> np.ndarray:
-        """World -> camera, float [4, 4]."""
+        """Return world -> camera, float [4, 4]."""
         ...
 
     def depth(self, index: int) -> np.ndarray:
-        """Float [H, W], metres, NaN = none."""
+        """Return float [H, W], metres, NaN = none."""
         ...
 
     def glass(self, index: int) -> np.ndarray:
-        """Bool [H, W], pixels seen through glass."""
+        """Return bool [H, W], pixels seen through glass."""
         ...
 
     def texture(self, index: int) -> np.ndarray:
-        """Float [H, W] in [0, 1), strength of texture."""
+        """Return float [H, W] in [0, 1), strength of texture."""
         ...
 
     def edges(self, index: int) -> Any:
@@ -55,5 +55,7 @@ class Oracle(Protocol):
         ...
 
     def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where pixels [n, 2] of frame i are in frame j, float [n, 2], and whether they are seen there, bool [n]."""
+        """Return where pixels [n, 2] of frame i are in frame j, float [n, 2], and whether they are seen there, bool
+        [n].
+        """
         ...

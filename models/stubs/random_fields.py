@@ -14,7 +14,7 @@ _FULL_TEXTURE = 0.25  # strength from which a region counts as well textured
 
 
 def stream(seed: int, role: str, *indices: int) -> np.random.Generator:
-    """The random stream of one answer."""
+    """Return the random stream of one answer."""
     return np.random.default_rng([seed, zlib.crc32(role.encode()), *indices])
 
 
@@ -32,7 +32,7 @@ class SmoothField:
     memory: float
 
     def sample(self, shape: tuple[int, int], time: float) -> np.ndarray:
-        """The field at `time` (seconds) for a picture of `shape` (H, W), float32 [H, W]."""
+        """Return the field at `time` (seconds) for a picture of `shape` (H, W), float32 [H, W]."""
         rng = stream(self.seed, self.role)
         across, down = rng.normal(0, self.cycles, (2, _WAVES))
         phase = rng.uniform(0, 2 * np.pi, _WAVES) + time * rng.normal(0, 1 / self.memory, _WAVES)
@@ -50,7 +50,7 @@ def weakness(oracle: Oracle, index: int) -> np.ndarray:
 
 
 def at_pixels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Values of `image` [H, W] at the pixels nearest to `pixels` [n, 2] (x, y), clipped to the picture."""
+    """Return values of `image` [H, W] at the pixels nearest to `pixels` [n, 2] (x, y), clipped to the picture."""
     height, width = image.shape
     columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
     rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
@@ -58,7 +58,7 @@ def at_pixels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def check_settings(stub: object, **lowest: float) -> None:
-    """Raises ValueError for the first setting of `stub` that is not finite or below its `lowest` value."""
+    """Raise ValueError for the first setting of `stub` that is not finite or below its `lowest` value."""
     for name, low in lowest.items():
         value = getattr(stub, name)
         if not np.isfinite(value) or value < low:

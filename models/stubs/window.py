@@ -78,7 +78,7 @@ class SimulatedVggt:
     def _poses(
         self, indices: list[int], lacking: np.ndarray, middle: float, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Poses float64 [n, 4, 4] in metres, first camera = world, and which were found, bool [n]."""
+        """Return poses float64 [n, 4, 4] in metres, first camera = world, and which were found, bool [n]."""
         count = len(indices)
         truth = np.stack([self.oracle.pose(index) for index in indices])
         poses = np.tile(np.eye(4), (count, 1, 1))
@@ -116,7 +116,7 @@ class SimulatedVggt:
 
 
 def _tree(overlap: np.ndarray, least: float) -> list[tuple[int, int, float]]:
-    """The tree of largest overlaps from view 0: (view, parent, overlap) in the order in which views are added."""
+    """Return the tree of largest overlaps from view 0 as (view, parent, overlap), in order of addition."""
     placed, waiting = [0], set(range(1, len(overlap)))
     branches = []
     while waiting:

@@ -29,7 +29,7 @@ _RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)", re.IGNORECASE)
 
 
 def is_beside(info: str, images: str) -> bool:
-    """Whether a topic of `CameraInfo` lies in the folder of a topic of images."""
+    """Return whether a topic of `CameraInfo` lies in the folder of a topic of images."""
     return images.startswith(info.rpartition("/")[0] + "/")
 
 
@@ -100,12 +100,12 @@ def _size(message: Any) -> tuple[int, int]:
 
 
 def _projection(message: Any) -> np.ndarray:
-    """The matrix of images whose lens was undone; zeros where the message does not tell."""
+    """Return the matrix of images whose lens was undone; zeros where the message does not tell."""
     return np.reshape(message.P if hasattr(message, "P") else message.p, (3, 4))[:, :3]
 
 
 def _of_images(message: Any, matrix: np.ndarray) -> np.ndarray:
-    """The matrix of the images, of that of the whole sensor."""
+    """Return the matrix of the images, of that of the whole sensor."""
     matrix = np.array(matrix, float)
     matrix[:2, 2] -= _shift(message)
     matrix[:2] /= _binning(message)[:, None]
@@ -127,7 +127,7 @@ def _camera(where: str, message: Any, size: tuple[int, int], whole: bool, rectif
 
 
 def _without_zeros(lens: list[float], counts: Sequence[int]) -> list[float]:
-    """Coefficients that are a lens by their number, without zeros behind them: drivers write some of any kind."""
+    """Return coefficients without trailing zeros, which drivers append, in a number that a lens has."""
     if len(lens) in counts and any(lens):
         return lens
     return next((lens[:count] for count in counts if count <= len(lens) and not any(lens[count:])), lens)

@@ -37,7 +37,7 @@ def depth_camera_of(
     transforms: Callable[[], Iterable[Any]],
     extrinsics: np.ndarray | None,
 ) -> DepthCamera | None:
-    """The camera of the depth; None where it is that of the images, or nothing says otherwise.
+    """Return the camera of the depth; None where it is that of the images, or nothing says otherwise.
 
     first: messages of the two topics. infos: of `CameraInfo`, by topic. cameras: of the images, and width and height of
     the depth. transforms: reads the messages of tf. extrinsics: [4, 4], depth -> colour, as RealSense publishes it.
@@ -67,7 +67,7 @@ def depth_camera_of(
 
 
 def _may_be_of_depth(info: str, messages: Sequence[Any], chosen: Chosen, frame: str) -> bool:
-    """One beside both topics is that of the depth if it states its frame, or none."""
+    """Return one beside both topics is that of the depth if it states its frame, or none."""
     if not messages or not is_beside(info, chosen.depth):
         return False
     return not is_beside(info, chosen.colour) or frame_name(messages[0].header.frame_id) in ("", frame)

@@ -65,7 +65,7 @@ class Unread:
 
 
 def encoding_of(message: Any) -> str:
-    """The name of an image's encoding, or of what it was before it was compressed."""
+    """Return the name of an image's encoding, or of what it was before it was compressed."""
     return str(message.encoding if hasattr(message, "encoding") else message.format.split(";")[0].strip())
 
 
@@ -79,7 +79,7 @@ def kind_of(message: Any) -> str:
 
 
 def image_of(message: Any, place: Path, min_bits: int = 8) -> ImageFile:
-    """The image in a message, see `read_image_file`; InputError where there is none. place: for that."""
+    """Return the image in a message, see `read_image_file`; InputError where there is none. place: for that."""
     if isinstance(message, Unread):
         raise InputError(f"`{place}` is damaged: {message.reason}")
     if not hasattr(message, "encoding"):
@@ -149,8 +149,8 @@ def _of_codes(codes: np.ndarray, unit: float) -> np.ndarray:
 
 
 def _compressed_metres(message: Any, place: Path) -> np.ndarray:
-    """A PNG of 16 bits, millimetres, with or without the head of `compressedDepth`; or, of floats, inverse depth:
-    depth = a / (code - b), with the two numbers of the head (package compressed_depth_image_transport).
+    """Return a PNG of 16 bits, millimetres, with or without the head of `compressedDepth`; or, of floats, inverse
+    depth: depth = a / (code - b), with the two numbers of the head (package compressed_depth_image_transport).
     """
     content = np.asarray(message.data, np.uint8).tobytes()
     headed = not content.startswith(_PNG)

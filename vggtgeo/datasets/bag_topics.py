@@ -45,13 +45,13 @@ def chosen_topics(first: Mapping[str, Any]) -> Chosen:
 
 
 def truth_topic(topics: Mapping[str, str]) -> str:
-    """The first topic of poses whose name says that they are the truth; topics: types by name."""
+    """Return the first topic of poses whose name says that they are the truth; topics: types by name."""
     named = (name for name, kind in topics.items() if kind in POSES and any(word in name.lower() for word in _TRUTH))
     return next(named, "")
 
 
 def is_registered(topic: str) -> bool:
-    """Whether the name of a topic of depth says that it belongs to the colour camera pixel by pixel."""
+    """Return whether the name of a topic of depth says that it belongs to the colour camera pixel by pixel."""
     return bool(_REGISTERED.search(topic))
 
 

@@ -15,13 +15,13 @@ _STEADY = 1e-6
 
 
 def frame_name(name: str) -> str:
-    """A frame without the slash that tf wrote before its name until 2013."""
+    """Return a frame without the slash that tf wrote before its name until 2013."""
     return name.strip().lstrip("/")
 
 
 def motion_between(messages: Iterable[Any], source: str, target: str) -> Float[np.ndarray, "4 4"] | None:
-    """float64 [4, 4], coordinates of the frame `source` -> those of `target`; None where the transforms do not join the
-    two, or those that do change with time, as between two bodies that move.
+    """Return float64 [4, 4], coordinates of the frame `source` -> those of `target`; None where the transforms do not
+    join the two, or those that do change with time, as between two bodies that move.
     """
     steps: dict[str, dict[str, np.ndarray]] = {}
     moving = set()

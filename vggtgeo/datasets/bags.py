@@ -43,13 +43,15 @@ ROS_2 = (".db3", ".mcap")
 
 
 def is_bag(path: Path) -> bool:
-    """Whether `path` is a ROS 1 bag (a file `.bag`) or a ROS 2 bag (a folder with `metadata.yaml`, `.db3`, `.mcap`)."""
+    """Return whether `path` is a ROS 1 bag (a file `.bag`) or a ROS 2 bag (a folder with `metadata.yaml`, `.db3`,
+    `.mcap`).
+    """
     return path.suffix in (".bag", *ROS_2) or (path / METADATA).is_file()
 
 
 def no_whole_bag(folder: Path) -> str | None:
-    """A sentence about several bags of ROS 1, and one about the files of a ROS 2 bag that were copied without the one
-    that tells what they hold; None where there are none such.
+    """Return a sentence about several bags of ROS 1, and one about the files of a ROS 2 bag that were copied without
+    the one that tells what they hold; None where there are none such.
     """
     if not folder.is_dir() or (folder / METADATA).is_file():
         return None
@@ -125,7 +127,9 @@ class RosBag:
         return self._read(range(len(self))[start:end:stride])
 
     def ground_truth(self) -> Trajectory | None:
-        """The poses of a topic that is called truth; they are those of what was tracked, markers on the camera, say."""
+        """Return the poses of a topic that is called truth; they are those of what was tracked, markers on the camera,
+        say.
+        """
         if not self.poses:
             return None
         with _reader(self.path) as reader:
@@ -193,7 +197,7 @@ class RosBag:
 
 
 def _tell_of_parts(path: Path) -> None:
-    """An InputWarning for files of a ROS 2 bag that its metadata does not name: they are not read."""
+    """Warn of files of a ROS 2 bag that its metadata does not list, which are not read."""
     folder = path.parent if path.suffix in ROS_2 else path
     if not (folder / METADATA).is_file():
         return
@@ -207,7 +211,7 @@ def _tell_of_parts(path: Path) -> None:
 
 
 def _place(path: Path, topic: str, number: int) -> Path:
-    """How messages call one of a bag."""
+    """Return how messages call one of a bag."""
     return Path(f"{path}, {topic}, {number}")
 
 
@@ -237,7 +241,9 @@ def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, .
 
 
 def _depth_is_usable(reader: Any, path: Path, topic: str, images: tuple[float, ...], size: tuple[int, int]) -> bool:
-    """Whether depth of the images' size has a valid pixel, and is of their times; an InputWarning for what is not."""
+    """Return whether depth of the images' size has a valid pixel, and is of their times; an InputWarning for what is
+    not.
+    """
     times, valid, wrong = [], False, ""
     for number, (time, message) in enumerate(_messages(reader, topic)):
         times.append(time)
@@ -269,7 +275,7 @@ def _depth_is_usable(reader: Any, path: Path, topic: str, images: tuple[float, .
 
 
 def _infos(reader: Any, topics: Mapping[str, str]) -> dict[str, list[Any]]:
-    """The whole messages of the topics of `CameraInfo`."""
+    """Return the whole messages of the topics of `CameraInfo`."""
     kinds = [name for name, kind in topics.items() if kind == CAMERA_INFO]
     messages = {name: [message for _, message in _messages(reader, name)] for name in kinds}
     return {name: [one for one in found if not isinstance(one, Unread)] for name, found in messages.items()}
@@ -296,12 +302,12 @@ def _depth_camera(
 
 
 def _transforms(reader: Any) -> Iterator[Any]:
-    """The messages of tf that are whole."""
+    """Return the messages of tf that are whole."""
     return _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
 
 
 def _extrinsics(reader: Any) -> np.ndarray | None:
-    """Depth -> colour as RealSense's driver publishes it, the rotation by columns; None where it does not."""
+    """Return depth -> colour as RealSense's driver publishes it, the rotation by columns; None where it does not."""
     named = [one for one in reader.connections if one.topic.endswith("depth_to_color")]
     message = next(_whole(reader, [one for one in named if one.msgtype.endswith("/Extrinsics")]), None)
     if message is None:
@@ -358,8 +364,8 @@ def _reader(path: Path) -> Iterator[Any]:
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
-    """Time of each message's header, seconds, and the message; the recorder's time where the header has none, and
-    `Unread` for a message that is damaged.
+    """Return time of each message's header, seconds, and the message; the recorder's time where the header has none,
+    and `Unread` for a message that is damaged.
     """
     connections = [connection for connection in reader.connections if connection.topic == topic]
     for connection, stamp, raw in reader.messages(connections=connections):
@@ -374,7 +380,7 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
 
 
 def _first(reader: Any, topic: str) -> Any:
-    """The first message of a topic that is whole; a damaged one, or None, where it has no other."""
+    """Return the first message of a topic that is whole; a damaged one, or None, where it has no other."""
     damaged = None
     for _, message in _messages(reader, topic):
         if not isinstance(message, Unread):
@@ -394,7 +400,7 @@ def _pose(message: Any) -> tuple[float, ...]:
 def _around(
     time: float, waiting: list[tuple[float, Any]], later: Iterator[tuple[float, Any]]
 ) -> list[tuple[float, Any]]:
-    """The depth messages near `time`, read on as far as needed."""
+    """Return the depth messages near `time`, read on as far as needed."""
     kept = [entry for entry in waiting if entry[0] >= time - _DELAY]
     while not kept or kept[-1][0] <= time + _DELAY:
         entry = next(later, None)

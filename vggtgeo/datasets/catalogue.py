@@ -20,6 +20,6 @@ class Entry:
 
 
 def catalogue() -> tuple[Entry, ...]:
-    """All entries."""
+    """Return all entries."""
     text = (files("vggtgeo.datasets") / "catalogue.toml").read_text("utf-8")
     return tuple(Entry(**entry) for entry in tomllib.loads(text)["entry"])

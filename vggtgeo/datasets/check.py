@@ -128,7 +128,7 @@ def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) ->
 
 
 def _of_numbers(sequence: Sequence) -> list[str]:
-    """Images missing by the numbers of the others: nearly all steps are the usual one, and a few are larger."""
+    """Return images missing by the numbers of the others: nearly all steps are the usual one, and a few are larger."""
     images = [file.image for file in sequence.files] if isinstance(sequence, FolderSequence) else []
     steps = np.diff(rows_of(images, None))
     if len(steps) < _MIN_STEPS:

@@ -40,12 +40,12 @@ class Euroc(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder`, or `mav0` in it, has `cam0/data.csv`."""
+        """Return whether `folder`, or `mav0` in it, has `cam0/data.csv`."""
         return _base(folder) is not None
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Reads the list of the left camera's images; the IMU's file is left out with an InputWarning."""
+        """Read the list of the left camera's images; the IMU's file is left out with an InputWarning."""
         base = _base(folder)
         if base is None:
             raise InputError(f"`{folder}` has no `mav0/cam0/data.csv`; expected a sequence of EuRoC")
@@ -62,7 +62,7 @@ class Euroc(FolderSequence):
         return replace(whole, folder=base)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses of the left camera, at their own times."""
+        """Return the true poses of the left camera, at their own times."""
         file = self.folder / _TRUTH[0] / "data.csv"
         if not file.is_file():
             return None
@@ -75,8 +75,8 @@ class Euroc(FolderSequence):
 
 
 def _camera(sensor: Path, width: int, height: int) -> Camera:
-    """The camera of a `sensor.yaml` for images of this size. EuRoC's lenses are "radial-tangential", those of TUM VI
-    "equidistant".
+    """Return the camera of a `sensor.yaml` for images of this size. EuRoC's lenses are "radial-tangential", those of
+    TUM VI "equidistant".
     """
     if states_list(sensor, "resolution"):
         check_size(sensor, yaml_numbers(sensor, "resolution", 2), (width, height))

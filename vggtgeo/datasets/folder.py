@@ -122,7 +122,7 @@ class FolderSequence:
 
     @property
     def truth_in_metres(self) -> bool:
-        """Whether lengths of `ground_truth` are metres."""
+        """Return whether lengths of `ground_truth` are metres."""
         return True
 
     def holds(self, path: Path) -> bool:
@@ -251,7 +251,7 @@ MAX_ENLARGEMENT = 32
 def depth_is_usable(
     name: str, files: Sequence[FrameFile], coding: DepthFormat, width: int, height: int, of_fewer_pixels: bool = False
 ) -> bool:
-    """Whether the sequence has depth to work with: files, of the images' size, with a valid pixel in one of
+    """Return whether the sequence has depth to work with: files, of the images' size, with a valid pixel in one of
     them.
 
     Looks at the first, middle and last file, and at the others only while no valid pixel has been seen.
@@ -308,7 +308,7 @@ def warn_of_no_depth(folder: Path, files: Sequence[FrameFile]) -> None:
 
 
 def enlarged(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
-    """Depth of another number of pixels in the same view, float32 [height, width]: each pixel takes the nearest.
+    """Return depth of another number of pixels in the same view, float32 [height, width]: each pixel takes the nearest.
 
     Raises:
         InputError: it has another shape than the images, so that it is of another view, or hardly any pixels.
@@ -326,12 +326,14 @@ def enlarged(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray
 
 
 def _is_of_fewer_pixels(depth: np.ndarray, width: int, height: int) -> bool:
-    """Whether depth [h, w] has the shape of images of this size, to a pixel, in fewer: that of a phone's LiDAR."""
+    """Return whether depth [h, w] has the aspect of images of this size but fewer pixels, as a phone's LiDAR."""
     return depth.shape[1] < width and _has_the_shape(depth, width, height)
 
 
 def _has_the_shape(depth: np.ndarray, width: int, height: int) -> bool:
-    """Whether depth [h, w] has the shape of images of this size, to a row or a hundredth, and not hardly any pixels."""
+    """Return whether depth [h, w] has the shape of images of this size, to a row or a hundredth, and not hardly any
+    pixels.
+    """
     rows, columns = depth.shape
     alike = abs(columns * height / width - rows) < max(1.0, _SAME_SHAPE * rows)
     return alike and columns * MAX_ENLARGEMENT >= width

@@ -55,7 +55,7 @@ class Sequence(Protocol):
 
     @property
     def camera(self) -> Camera:
-        """The camera of all frames; `camera.known` is False where its intrinsics are a guess."""
+        """Return the camera of all frames; `camera.known` is False where its intrinsics are a guess."""
         ...
 
     @property
@@ -64,11 +64,11 @@ class Sequence(Protocol):
         ...
 
     def __len__(self) -> int:
-        """Frames listed; unreadable ones count. A video gives its container's estimate."""
+        """Return frames listed; unreadable ones count. A video gives its container's estimate."""
         ...
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """The frames at positions start, start + stride, ... below end, read one by one as they are asked
+        """Return the frames at positions start, start + stride, ... below end, read one by one as they are asked
         for.
 
         What cannot be read is skipped with an InputWarning that names it. InputError for a selection that is
@@ -77,12 +77,12 @@ class Sequence(Protocol):
         ...
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses, camera -> world; None where there is no truth."""
+        """Return the true poses, camera -> world; None where there is no truth."""
         ...
 
 
 def check_selection(name: str, count: int, start: int, end: int | None, stride: int) -> None:
-    """Raises InputError unless `start`, `end`, `stride` select at least one of `count` frames of sequence `name`."""
+    """Raise InputError unless `start`, `end`, `stride` select at least one of `count` frames of sequence `name`."""
     for argument, given in (("start", start), ("stride", stride), ("end", 0 if end is None else end)):
         check_kind(argument, given, numbers.Integral, "a whole number")
     if stride < 1:
@@ -94,7 +94,7 @@ def check_selection(name: str, count: int, start: int, end: int | None, stride: 
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:
-    """Raises InputError for a frame whose image or depth is none, whose size is not that of the camera's images, or
+    """Raise InputError for a frame whose image or depth is none, whose size is not that of the camera's images, or
     whose time is none.
     """
     given: Any = frame  # of a caller: annotations promise what nobody has checked
@@ -115,7 +115,7 @@ def check_frame(frame: Frame, camera: Camera) -> None:
 
 
 def check_depth(name: str, depth: Any, image: np.ndarray) -> None:
-    """Raises InputError for depth that is no array of metres of the size of its image."""
+    """Raise InputError for depth that is no array of metres of the size of its image."""
     if isinstance(depth, np.ma.MaskedArray):
         raise InputError(f"{name} is masked; give an array with NaN where there is none: `depth.filled(np.nan)`")
     if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f":

@@ -33,9 +33,9 @@ class IclNuim(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `associations.txt` and no `rgb.txt`, and this is ICL-NUIM's: beside its truth, or a list
-        that counts frames, depth first; or pairs of numbered images beside its truth. Lists of times are anybody's, as
-        ORB-SLAM2 takes them.
+        """Return whether `folder` has `associations.txt` and no `rgb.txt`, and this is ICL-NUIM's: beside its truth, or
+        a list that counts frames, depth first; or pairs of numbered images beside its truth. Lists of times are
+        anybody's, as ORB-SLAM2 takes them.
         """
         file, truth = folder / _LIST, bool(files_like(folder, "*.gt.freiburg"))
         if (folder / "rgb.txt").is_file():
@@ -50,7 +50,7 @@ class IclNuim(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Reads the list of pairs, or pairs the images by their numbers where there is none."""
+        """Read the list of pairs, or pairs the images by their numbers where there is none."""
         pairs = read_pairs(folder / _LIST, "N") if (folder / _LIST).is_file() else _numbered(folder)
         if not pairs:
             raise InputError(f"`{folder}` has neither `{_LIST}` nor images `rgb/N.png` with `depth/N.png`")
@@ -60,19 +60,19 @@ class IclNuim(FolderSequence):
         return cls.listed(folder, frames, lambda *size: icl_camera(folder, *size), FIVE_THOUSANDTHS)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses of the mirrored world."""
+        """Return the true poses of the mirrored world."""
         return icl_truth(self.folder)
 
 
 def icl_camera(folder: Path, width: int, height: int) -> Camera:
-    """The published camera, fy positive; a guess, with an InputWarning, for images of another size."""
+    """Return the published camera, fy positive; a guess, with an InputWarning, for images of another size."""
     if (width, height) != _SIZE:
         return guess_with_warning(str(folder), width, height)
     return Camera(_CAMERA, width, height)
 
 
 def icl_truth(folder: Path) -> Trajectory | None:
-    """The poses of `*.gt.freiburg` or `groundtruth.txt`, of the mirrored world; None where neither is there."""
+    """Return the poses of `*.gt.freiburg` or `groundtruth.txt`, of the mirrored world; None where neither is there."""
     there = [*files_like(folder, "*.gt.freiburg"), folder / "groundtruth.txt"]
     file = next((file for file in there if file.is_file()), None)
     if file is None:

@@ -37,13 +37,13 @@ class IclNuimRaw(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has a `scene_00_0000.png` and its depth or camera beside."""
+        """Return whether `folder` has a `scene_00_0000.png` and its depth or camera beside."""
         beside = (path.with_suffix(end) for path in _images(folder) for end in (".depth", ".txt"))
         return any(file.is_file() for file in beside)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images."""
+        """List the images."""
         images = list(_images(folder))
         if not images:
             raise InputError(f"`{folder}` has no images `scene_00_0000.png`; expected ICL-NUIM as POV-Ray rendered it")
@@ -56,7 +56,7 @@ class IclNuimRaw(FolderSequence):
         return cls.listed(folder, frames, lambda *size: icl_camera(folder, *size), as_images=False)
 
     def load_depth(self, path: Path) -> Float[np.ndarray, "h w"]:
-        """The depth along the optical axis, float32, NaN for none; InputError for another count of numbers."""
+        """Return the depth along the optical axis, float32, NaN for none; InputError for another count of numbers."""
         width, height = self.camera.width, self.camera.height
         try:
             distances = np.array(read_text(path).split(), np.float32)
@@ -71,7 +71,7 @@ class IclNuimRaw(FolderSequence):
         return np.where(known, depth, np.nan).astype(np.float32)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses of the mirrored world."""
+        """Return the true poses of the mirrored world."""
         there = [file for file in self.files if file.image.with_suffix(".txt").is_file()]
         if not there:
             return icl_truth(self.folder)
@@ -84,7 +84,7 @@ def _images(folder: Path) -> Iterable[Path]:
 
 
 def _pose(file: Path) -> Float[np.ndarray, "4 4"]:
-    """Camera -> world, the camera's y up."""
+    """Return camera -> world, the camera's y up."""
     text = read_text(file)
     place, ahead, up = (_vector(file, text, name) for name in ("cam_pos", "cam_dir", "cam_up"))
     pose = np.eye(4)

@@ -112,7 +112,7 @@ def _without_doubles(folder: Path, images: list[Path]) -> list[Path]:
 
 
 def _show_the_same(one: Path, other: Path) -> bool:
-    """Whether two files are of one image, whatever their size, tone and compression."""
+    """Return whether two files are of one image, whatever their size, tone and compression."""
     try:
         small = [cv2.resize(read_image(path), _SMALL, interpolation=cv2.INTER_AREA) for path in (one, other)]
     except InputError:
@@ -218,17 +218,17 @@ def times_by_name(images: list[Path]) -> list[float]:
 
 
 def _are_counted(stems: list[str]) -> bool:
-    """Whether names like 1.9, 1.10 count: a time is written with as many decimals each time, or without zeros at its
-    end.
+    """Return whether names like 1.9, 1.10 count: a time is written with as many decimals each time, or without zeros at
+    its end.
     """
     decimals = {len(stem.partition(".")[2]) for stem in stems}
     return len(decimals) > 1 and any(_COUNTED.fullmatch(stem) for stem in stems)
 
 
 def rows_of(images: list[Path], lines: int | None) -> tuple[int, ...]:
-    """The line of each image in a list of a whole recording: the number that its name ends with, so that a part of the
-    recording, or one with holes, keeps its times and its truth; those beyond the last line have none. Its place where
-    names have no numbers, or others: each image has its line, then.
+    """Return the line of each image in a list of a whole recording: the number that its name ends with, so that a part
+    of the recording, or one with holes, keeps its times and its truth; those beyond the last line have none. Its place
+    where names have no numbers, or others: each image has its line, then.
     """
     found = [_NUMBERED.fullmatch(image.stem) for image in images]
     numbers = [int(match.group(1)) for match in found if match]

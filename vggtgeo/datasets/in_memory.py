@@ -31,13 +31,13 @@ class FrameStream:
     source: Iterator[Frame]
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """Every `stride`-th frame from `start` to before `end`."""
+        """Return every `stride`-th frame from `start` to before `end`."""
         check_selection("frames", sys.maxsize, start, end, stride)
         return itertools.islice(self.source, start, end, stride)
 
 
 def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: float = 30.0) -> FrameStream:
-    """Frames from any iterable, which is asked for one frame more than is needed at once.
+    """Return frames from any iterable, which is asked for one frame more than is needed at once.
 
     Args:
         frames: of `Frame`; or images, uint8 [H, W, 3] RGB; or pairs of an image and depth, float [H, W] metres with NaN
@@ -61,7 +61,7 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: floa
 
 
 def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
-    """All frames, with indices that grow; depth that comes after a frame without is told, since it is not used."""
+    """Yield all frames; indices must increase, and depth after a first frame without depth is warned about."""
     last, told, doubtful = first, first.depth is not None, _tell_of_depth(first)
     check_whole(f"the index of {first.name}", first.index, 0, _LAST)
     yield first
@@ -86,7 +86,7 @@ def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
 
 
 def _tell_of_depth(frame: Frame) -> bool:
-    """Whether a frame has depth and none of it is one, which is told: NaN is none, as it should be."""
+    """Return whether a frame has depth and none of it is one, which is told: NaN is none, as it should be."""
     depth = frame.depth
     if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or np.isnan(depth).all():
         return False
@@ -119,12 +119,12 @@ def _frame(item: Any, index: int, rate: float) -> Frame:
 
 
 def copied(frame: Frame) -> Frame:
-    """The frame with arrays of its own; InputError for one that is too large."""
+    """Return the frame with arrays of its own; InputError for one that is too large."""
     return replace(frame, image=_own(frame.name, frame.image), depth=_own(frame.name, frame.depth))
 
 
 def _own(name: str, given: Any) -> Any:
-    """A copy of an image or of depth; InputError for one that is too large."""
+    """Return a copy of an image or of depth; InputError for one that is too large."""
     if not isinstance(given, np.ndarray) or given.ndim < 2:
         return given
     height, width = given.shape[:2]

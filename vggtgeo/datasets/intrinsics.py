@@ -71,7 +71,7 @@ def pinhole_of(matrix: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def is_fisheye(where: str, model: str) -> bool:
-    """Whether the word for a lens is that of a fisheye; InputError for one of neither kind. where: it stands."""
+    """Return whether the word for a lens is that of a fisheye; InputError for one of neither kind. where: it stands."""
     if model.lower() not in (*_OPENCV, *_FISHEYES):
         known = ", ".join((*_OPENCV[1:], *_FISHEYES))
         raise InputError(f"{where} is {model[:40]}; read are {known}: undistort the images")
@@ -79,7 +79,7 @@ def is_fisheye(where: str, model: str) -> bool:
 
 
 def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
-    """The camera of `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, or `fx fy cx cy k1 k2 k3 k4
+    """Return the camera of `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, or `fx fy cx cy k1 k2 k3 k4
     fisheye`), else of
     `camera-intrinsics.txt` (3 x 3), else of a JSON file as Open3D's and RealSense's recorders write it, in `folder`,
     else None. InputError where such a file is there but wrong.
@@ -101,8 +101,8 @@ def camera_or_guess(folder: Path, width: int, height: int) -> Camera:
 
 
 def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
-    """The camera of `metadata.json` beside the images of an export of Record3D; None where that is another's file, or
-    with an InputWarning one that cannot be read or has no camera where it should.
+    """Return the camera of `metadata.json` beside the images of an export of Record3D; None where that is another's
+    file, or with an InputWarning one that cannot be read or has no camera where it should.
     """
     file = folder / "metadata.json"
     try:
@@ -137,9 +137,9 @@ def record3d_intrinsics(content: Mapping[str, Any]) -> tuple[float, ...] | None:
 
 
 def _camera_of_another_name(folder: Path, width: int, height: int) -> Camera | None:
-    """The camera of a text file whose name says that it is one (`intrinsics.K.txt`, `cam_K.txt`), and which holds the
-    four numbers or the matrix of a pinhole and nothing else, with an InputWarning; None where no file, or more than
-    one, is like that.
+    """Return the camera of a text file whose name says that it is one (`intrinsics.K.txt`, `cam_K.txt`), and which
+    holds the four numbers or the matrix of a pinhole and nothing else, with an InputWarning; None where no file, or
+    more than one, is like that.
     """
     named = sorted(path for path in folder.iterdir() if _SAYS_CAMERA.search(path.name) and path.is_file())
     cameras = {path: found for path in named if (found := _bare_pinhole(path, width, height)) is not None}
@@ -206,7 +206,7 @@ def check_plausible(where: str, camera: Camera) -> None:
 
 
 def published_camera(name: str, width: int, height: int) -> Camera | None:
-    """The published camera, with its distortion, where `name` says freiburg1, 2, 3 or Bonn, of 640 x 480 pixels."""
+    """Return the published camera if `name` contains freiburg1, 2, 3 or Bonn, for 640 x 480 pixels."""
     match = _FREIBURG_NAME.search(name)
     if (width, height) != (640, 480):
         return None
@@ -219,7 +219,7 @@ def published_camera(name: str, width: int, height: int) -> Camera | None:
 
 
 def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float = 1.0) -> Camera:
-    """A guessed camera, `known` False, and a GuessedCameraWarning that says so."""
+    """Return a guessed camera, `known` False, and a GuessedCameraWarning that says so."""
     camera = Camera.guess(width, height, pixel_aspect)
     focal = " and ".join(dict.fromkeys(f"{value:.0f}" for value in camera.intrinsics[:2]))
     warnings.warn(
@@ -322,7 +322,7 @@ def _without_comments(file: Path) -> str:
 
 
 def warn_of_other_size(where: str, camera: Camera) -> None:
-    """An InputWarning for a principal point and a field of view that are odd for images of this size."""
+    """Warn of a principal point or a field of view that is implausible for images of this size."""
     fx, fy, cx, cy = camera.intrinsics
     near = lambda x, y: abs(cx - x) < 0.05 * camera.width and abs(cy - y) < 0.05 * camera.height
     middle = 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)

@@ -37,12 +37,12 @@ class Kitti(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has one of the folders of images."""
+        """Return whether `folder` has one of the folders of images."""
         return any((folder / name).is_dir() for name in _FOLDERS)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images."""
+        """List the images."""
         places = [folder / name for name in _FOLDERS if (folder / name).is_dir()]
         images = {place: image_files(place) for place in places}
         place = max(places, key=lambda each: len(images[each]), default=None)  # colour, where both have as many
@@ -73,7 +73,7 @@ class Kitti(FolderSequence):
         return replace(whole, baseline=baseline)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses of the camera that is read."""
+        """Return the true poses of the camera that is read."""
         name = f"{self.folder.resolve().name}.txt"
         places = (self.folder / "poses.txt", self.folder.resolve().parent.parent / "poses" / name)
         file = next((file for file in places if file.is_file()), None)
@@ -102,7 +102,7 @@ def _times(folder: Path, place: Path) -> list[float]:
 
 
 def _moments(file: Path) -> list[float]:
-    """Seconds since the first line's time."""
+    """Return seconds since the first line's time."""
     text = whole_text(file)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     try:
@@ -113,7 +113,7 @@ def _moments(file: Path) -> list[float]:
 
 
 def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, float]:
-    """The camera, and its distance from the left grey one: the fourth number of `P` is `-fx b`."""
+    """Return the camera, and its distance from the left grey one: the fourth number of `P` is `-fx b`."""
     for file in (
         folder / "calib.txt",
         folder / "calib_cam_to_cam.txt",
@@ -141,7 +141,7 @@ def _calibration(file: Path) -> dict[str, str]:
 
 
 def _is_unrectified(file: Path, values: Mapping[str, str], name: str, width: int, height: int) -> bool:
-    """Whether images have the size before the rectification, as in the drives `_extract`."""
+    """Return whether images have the size before the rectification, as in the drives `_extract`."""
     original, rectified = (
         tuple(numbers_of(values.get(key, "").split(), f"`{file}`: `{key}`"))
         for key in (f"S_{name[-2:]}", f"S_rect_{name[-2:]}")

@@ -21,7 +21,7 @@ _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://.+", re.IGNORECASE)
 
 
 def is_live(text: str) -> bool:
-    """Whether `text` names a webcam or a stream, no file."""
+    """Return whether `text` names a webcam or a stream, no file."""
     return _WEBCAM.fullmatch(text) is not None or _ADDRESS.fullmatch(text) is not None
 
 
@@ -37,7 +37,7 @@ class LiveCamera:
 
     @classmethod
     def open(cls, source: str) -> Self:
-        """Takes one frame for the size of the images; InputError where no camera answers."""
+        """Take one frame for the size of the images; InputError where no camera answers."""
         capture = _capture(source)
         try:
             there, image = capture.read()
@@ -65,14 +65,16 @@ class LiveCamera:
 
     @property
     def name(self) -> str:
-        """The source, without a password in it."""
+        """Return the source, without a password in it."""
         return _public(self.source)
 
     def __len__(self) -> int:
         return 0
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """The frames start, start + stride, ... below end, as they come. What arrives while nobody asks may be lost."""
+        """Return the frames start, start + stride, ... below end, as they come. What arrives while nobody asks may be
+        lost.
+        """
         if stride < 1 or start < 0 or (end is not None and end <= start):
             raise InputError(f"`start` is {start}, `end` {end}, `stride` {stride}; they must select a frame")
         return self._read(start, end, stride)
@@ -101,7 +103,7 @@ class LiveCamera:
 
 
 def _public(source: str) -> str:
-    """An address without the user's name and password."""
+    """Return an address without the user's name and password."""
     return re.sub(r"//[^/?#]*@", "//", source)
 
 

@@ -49,12 +49,12 @@ class Nerfstudio(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `transforms.json`."""
+        """Return whether `folder` has `transforms.json`."""
         return (folder / FILE).is_file()
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the frames by the numbers in the names of their images: the file has them in any order."""
+        """List the frames by the numbers in the names of their images: the file has them in any order."""
         file = folder / FILE
         content = _object(read_json(file), f"`{file}`")
         frames = [
@@ -76,11 +76,11 @@ class Nerfstudio(FolderSequence):
         return cls.listed(folder, rows, camera, coding, as_images=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """The depth, enlarged to the images where it is smaller, as a phone's is."""
+        """Return the depth, enlarged to the images where it is smaller, as a phone's is."""
         return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
-        """The poses of the file, camera -> world."""
+        """Return the poses of the file, camera -> world."""
         file = self.folder / FILE
         frames = {_image(self.folder, file, frame): frame for frame in read_json(file)["frames"]}
         poses = [_pose(file, frames[one.image]) for one in self.files if one.image in frames]
@@ -90,7 +90,7 @@ class Nerfstudio(FolderSequence):
 
     @property
     def truth_in_metres(self) -> bool:
-        """Where depth in metres belongs to the poses (phones); those of COLMAP have no unit."""
+        """Return where depth in metres belongs to the poses (phones); those of COLMAP have no unit."""
         return any(one.depth is not None for one in self.files)
 
 
@@ -107,7 +107,7 @@ def _listed(value: object, what: str) -> list[Any]:
 
 
 def _image(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path:
-    """The image of a frame; some writers leave its ending out, and some images were converted since."""
+    """Return the image of a frame; some writers leave its ending out, and some images were converted since."""
     return _below(folder, file, "file_path", frame.get("file_path"), sorted(IMAGE_SUFFIXES))
 
 
@@ -119,7 +119,7 @@ def _depth(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path | None:
 
 
 def _below(folder: Path, file: Path, key: str, name: object, endings: Collection[str] = ()) -> Path:
-    """A file below the folder: a list from a stranger opens nothing else. One that was listed elsewhere, before
+    """Return a file below the folder: a list from a stranger opens nothing else. One that was listed elsewhere, before
     somebody copied the folder, is searched by its name, here and in `images`; one that is nowhere, with other endings.
     """
     path = Path(name.replace("\\", "/")) if isinstance(name, str) else Path()
@@ -140,7 +140,7 @@ def _below(folder: Path, file: Path, key: str, name: object, endings: Collection
 
 
 def _pose(file: Path, frame: Mapping[str, Any]) -> np.ndarray:
-    """float64 [4, 4] with OpenGL's axes; a last row may be missing."""
+    """Return float64 [4, 4] with OpenGL's axes; a last row may be missing."""
     try:
         pose = np.array(frame.get("transform_matrix"), np.float64)
     except (TypeError, ValueError):
@@ -153,7 +153,7 @@ def _pose(file: Path, frame: Mapping[str, Any]) -> np.ndarray:
 
 
 def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], width: int, height: int) -> Camera:
-    """The camera of the file, or the middle of those of its frames, for images of this size."""
+    """Return the camera of the file, or the middle of those of its frames, for images of this size."""
     fisheye = _is_fisheye(file, content)
     across, down = (
         float(size) if stated is None else _positive(file, key, stated)
@@ -183,7 +183,7 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
 
 
 def _warn_of_unread(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], fisheye: bool) -> None:
-    """Coefficients of the lens beyond those that are read."""
+    """Warn of distortion coefficients that are not read."""
     unread = [key for key in ("k4", "k5", "k6") if not (fisheye and key == "k4")]
     if unread := [key for key in unread if _number(file, content, frames, key)]:
         text = (

@@ -50,5 +50,5 @@ def _is_part_of_raw_kitti(place: Path) -> bool:
 
 
 def _is_archive(file: Path) -> bool:
-    """Whether a file is an archive by its name, or a zip by its content, in which FFmpeg may find an image."""
+    """Return whether a file is an archive by its name, or a zip by its content, in which FFmpeg may find an image."""
     return file.suffix.lower() in _ARCHIVES or zipfile.is_zipfile(file)

@@ -77,7 +77,8 @@ KINDS = (*FOLDER_KINDS, "video", "bag", "camera")
 def open_sequence(
     path: str | os.PathLike[str], kind: str | None = None, rate: float | None = None, depth: bool = True
 ) -> Sequence:
-    """Open a folder of a benchmark or of images, a video file, a ROS bag, a webcam (`webcam:0`) or a stream (`rtsp://`).
+    """Open a folder of a benchmark or of images, a video file, a ROS bag, a webcam (`webcam:0`) or a stream
+    (`rtsp://`).
 
     Args:
         path: the folder or file, or the name of a camera.

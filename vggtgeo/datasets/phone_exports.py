@@ -71,7 +71,7 @@ class PhoneExport(FolderSequence):
     confidence: Mapping[Path, Path] = field(default_factory=dict, compare=False, repr=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """The depth, enlarged to the images; what the phone does not trust is none."""
+        """Return the depth, enlarged to the images; what the phone does not trust is none."""
         depth = read_depth(path, self.depth_format)
         if path in self.confidence:
             leave_out_doubtful(depth, self.confidence[path])
@@ -106,12 +106,12 @@ class Scanner3d(PhoneExport):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has an image `frame_N` beside its JSON."""
+        """Return whether `folder` has an image `frame_N` beside its JSON."""
         return any(image.with_suffix(".json").is_file() for image in _frames(folder).values())
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images by their numbers; InputError where none has a camera."""
+        """List the images by their numbers; InputError where none has a camera."""
         parts = [
             _Part(image, *(image.with_name(f"{what}_{number}{end}") for what, end in _SCANNER_PARTS))
             for number, image in _frames(folder).items()
@@ -125,12 +125,12 @@ class Polycam(PhoneExport):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder`, or `keyframes` in it, has images beside their cameras."""
+        """Return whether `folder`, or `keyframes` in it, has images beside their cameras."""
         return _keyframes(folder) is not None
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images by their times; InputError where none has a camera."""
+        """List the images by their times; InputError where none has a camera."""
         place = _keyframes(folder)
         if place is None:
             raise InputError(
@@ -231,7 +231,7 @@ def _numbers(file: Path, content: Mapping[str, Any], key: str, count: int) -> np
 
 
 def _times(folder: Path, stated: list[float]) -> list[float]:
-    """Those of the files where they rise, else 30 frames a second."""
+    """Return those of the files where they rise, else 30 frames a second."""
     if np.isfinite(stated).all() and all(before < after for before, after in pairwise(stated)):
         return stated
     _warn(f"`{folder}`: the times of its images do not rise; {FRAMES_PER_SECOND:g} frames a second are taken")
@@ -239,7 +239,7 @@ def _times(folder: Path, stated: list[float]) -> list[float]:
 
 
 def _camera(folder: Path, stated: list[_Stated], width: int, height: int) -> Camera:
-    """The middle of the intrinsics of all frames: autofocus changes them by a few tenths of a per cent."""
+    """Return the middle of the intrinsics of all frames: autofocus changes them by a few tenths of a per cent."""
     rows = np.array([one.camera for one in stated])
     middle = np.median(rows, axis=0)
     low, high = rows[:, 0].min(), rows[:, 0].max()

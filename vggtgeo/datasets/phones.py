@@ -56,12 +56,12 @@ class StrayScanner:
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `rgb.mp4` and one of the two lists; without the other it is a damaged recording."""
+        """Return whether `folder` has `rgb.mp4` and one of the two lists (a recording without the other is damaged)."""
         return (folder / "rgb.mp4").is_file() and any((folder / name).is_file() for name in _LISTS)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Opens the video; images are reduced to at most 960 pixels, by a whole number."""
+        """Open the video; images are reduced to at most 960 pixels, by a whole number."""
         absent = [folder / name for name in _LISTS if not (folder / name).is_file()]
         if absent:
             raise InputError(
@@ -130,7 +130,7 @@ class StrayScanner:
 
 
 def leave_out_doubtful(depth: np.ndarray, file: Path) -> None:
-    """Makes NaN of depth that the phone does not trust; where that is not known all stays, with an InputWarning."""
+    """Make NaN of depth that the phone does not trust; where that is not known all stays, with an InputWarning."""
     try:
         trust = read_codes(file)
         if trust.shape != depth.shape:
@@ -147,12 +147,12 @@ class ArkitScenes(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `lowres_wide`."""
+        """Return whether `folder` has `lowres_wide`."""
         return (folder / "lowres_wide").is_dir()
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images and pairs each with the depth nearest in time."""
+        """List the images and pairs each with the depth nearest in time."""
         images = _timed(folder / "lowres_wide")
         if not images:
             raise InputError(f"`{folder}/lowres_wide` has no images named `..._SECONDS.png`")
@@ -161,7 +161,7 @@ class ArkitScenes(FolderSequence):
         return cls.listed(folder, frames, lambda *size: _pincam(folder, *size), as_images=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """The depth, enlarged to the images where it is smaller."""
+        """Return the depth, enlarged to the images where it is smaller."""
         return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
@@ -205,7 +205,7 @@ def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
 
 
 def _pincam(folder: Path, width: int, height: int) -> Camera:
-    """The middle of the intrinsics of all frames: autofocus changes them by a few tenths of a per cent."""
+    """Return the middle of the intrinsics of all frames: autofocus changes them by a few tenths of a per cent."""
     files = files_like(folder / "lowres_wide_intrinsics", "*.pincam")
     if not files:
         raise InputError(f"`{folder}/lowres_wide_intrinsics` has no `.pincam` file: width height fx fy cx cy")

@@ -20,7 +20,7 @@ _MOST_STRETCH = 0.1
 
 
 def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
-    """Lines of `columns` numbers, blanks or commas in between; InputError with the line of one that is not so."""
+    """Return lines of `columns` numbers, separated by blanks or commas; raise InputError naming an invalid line."""
     rows = []
     for number, line in enumerate(read_text(file).splitlines(), start=1):
         words = line.split(skip, 1)[0].replace(",", " ").split()
@@ -37,7 +37,7 @@ def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray
 
 
 def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
-    """One matrix; InputError where the file is not there, or holds another count of numbers."""
+    """Return one matrix; InputError where the file is not there, or holds another count of numbers."""
     text = read_text(file)
     try:
         return np.array(text.replace(",", " ").split(), np.float64).reshape(shape)
@@ -48,9 +48,9 @@ def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
 def trajectory_of(
     times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path, of: str = "truth"
 ) -> Trajectory | None:
-    """Camera -> world at `times`; poses with NaN or infinity, or without a rotation, as files have them where tracking
-    was lost, are left out with an InputWarning; so are those of a time that was there, and lines out of order are
-    sorted, as those of a file of TUM. of: what they are, for that.
+    """Return camera -> world at `times`; poses with NaN or infinity, or without a rotation, as files have them where
+    tracking was lost, are left out with an InputWarning; so are those of a time that was there, and lines out of order
+    are sorted, as those of a file of TUM. of: what they are, for that.
 
     None where no pose is left.
     """
@@ -79,7 +79,7 @@ def trajectory_of(
 def trajectory_of_rows(
     times: Sequence[float], rows: Sequence[int], poses: np.ndarray, where: Path
 ) -> Trajectory | None:
-    """The same of images whose poses are those lines of a file. Those beyond its end have none: an InputWarning."""
+    """Return `trajectory_of` images whose poses are these lines of a file; warn of lines beyond its end."""
     there = [place for place, row in enumerate(rows) if row < len(poses)]
     beyond = len(rows) - len(there)
     if beyond and len(poses):
@@ -110,7 +110,7 @@ def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray
 
 
 def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
-    """The list of numbers after `key:` in a YAML file as the benchmarks write them: `key: [1, 2, 3]`.
+    """Return the list of numbers after `key:` in a YAML file as the benchmarks write them: `key: [1, 2, 3]`.
 
     InputError where it is not there, or has not `count` of them (None: any count will do).
     """
@@ -124,7 +124,7 @@ def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
 
 
 def states_list(file: Path, key: str) -> bool:
-    """Whether the YAML file has a list `key: [...]`."""
+    """Return whether the YAML file has a list `key: [...]`."""
     return re.search(rf"^\s*{re.escape(key)}\s*:\s*\[", read_text(file), re.MULTILINE) is not None
 
 
@@ -137,7 +137,7 @@ def numbers_of(words: Sequence[str], what: str) -> list[float]:
 
 
 def read_text(file: Path) -> str:
-    """The text of a file, other letters than those of UTF-8 replaced; InputError where it cannot be read."""
+    """Return the text of a file, other letters than those of UTF-8 replaced; InputError where it cannot be read."""
     try:
         if file.exists() and not file.is_file():  # a pipe has no end
             raise InputError(f"`{file}` is no regular file")
@@ -147,7 +147,7 @@ def read_text(file: Path) -> str:
 
 
 def read_json(file: Path) -> Any:
-    """The content of a JSON file; InputError where it is none."""
+    """Return the content of a JSON file; InputError where it is none."""
     return json_in(read_text(file), file)
 
 
@@ -160,7 +160,7 @@ def json_in(content: str | bytes, where: Path) -> Any:
 
 
 def same_size(stated: Sequence[object], size: tuple[int, int]) -> bool:
-    """Whether a width and a height of JSON are these: scripts write `640`, `640.0` and `"640"`."""
+    """Return whether a width and a height of JSON are these: scripts write `640`, `640.0` and `"640"`."""
     try:
         return tuple(float(str(side)) for side in stated) == size
     except ValueError:
@@ -181,14 +181,14 @@ _MOST_DIGITS = 300
 
 
 def _whole(digits: str) -> float:
-    """A whole number; as a float, infinite at last, where it has so many digits that none can be made of it later:
-    readers look for what is not finite, and not for an overflow.
+    """Return a whole number; as a float, infinite at last, where it has so many digits that none can be made of it
+    later: readers look for what is not finite, and not for an overflow.
     """
     return int(digits) if len(digits) <= _MOST_DIGITS else float(digits)
 
 
 def have_rotations(poses: np.ndarray) -> np.ndarray:
-    """Whether the axes of each pose have nearly unit length and are no mirror image, above a last row 0 0 0 1."""
+    """Return whether the axes of each pose have nearly unit length and are right-handed, with last row 0 0 0 1."""
     last = (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) < _MOST_STRETCH).all(axis=1)
     with np.errstate(over="ignore", invalid="ignore"):  # what is no rotation may be of any size
         lengths = np.linalg.norm(poses[:, :3, :3], axis=1)
@@ -197,6 +197,6 @@ def have_rotations(poses: np.ndarray) -> np.ndarray:
 
 
 def _orthonormal(poses: np.ndarray) -> np.ndarray:
-    """The nearest rotations: files with few digits, or with a scale of 1 +- 1e-3, are no exact ones."""
+    """Return the nearest rotations: files with few digits, or with a scale of 1 +- 1e-3, are no exact ones."""
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     return np.concatenate([np.concatenate([u @ vt, poses[:, :3, 3:]], axis=2), poses[:, 3:]], axis=1)

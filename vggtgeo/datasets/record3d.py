@@ -64,8 +64,8 @@ class Record3d(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether there is `metadata` beside `rgbd`, in a folder or a zip archive, or `metadata.json` beside EXR; or it
-        is a file that ends with `.r3d`.
+        """Return whether there is `metadata` beside `rgbd`, in a folder or a zip archive, or `metadata.json` beside
+        EXR; or it is a file that ends with `.r3d`.
         """
         if folder.is_dir():
             exported = (folder / EXPORTED).is_file() and next((folder / "depth").glob("*.exr"), None) is not None
@@ -82,7 +82,7 @@ class Record3d(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images; InputError where there is none. Depth that cannot be read is told, and left out."""
+        """List the images; InputError where there is none. Depth that cannot be read is told, and left out."""
         try:
             names = _names(folder)
         except UNREADABLE as error:
@@ -120,17 +120,17 @@ class Record3d(FolderSequence):
         return content
 
     def holds(self, path: Path) -> bool:
-        """Whether the archive, or the folder, has such a part."""
+        """Return whether the archive, or the folder, has such a part."""
         if self.folder.is_dir():
             return path.is_file()
         return path.relative_to(self.folder).as_posix() in self._archive.NameToInfo
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """The image in a part of the archive."""
+        """Return the image in a part of the archive."""
         return image_in(self._content(path), path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """The depth in a part of the archive, enlarged to the images; what is not trusted is none."""
+        """Return the depth in a part of the archive, enlarged to the images; what is not trusted is none."""
         if path.suffix == ".exr":
             return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
         shape = self.camera.height, self.camera.width
@@ -157,7 +157,9 @@ class Record3d(FolderSequence):
         return trajectory_of([self.files[row].timestamp for row in there], found, where)
 
     def _content(self, path: Path, most: int = MAX_BYTES) -> bytes:
-        """All bytes of a part, by its path in the folder or, as if it were one, in the archive; no more than `most`."""
+        """Return all bytes of a part, by its path in the folder or, as if it were one, in the archive; no more than
+        `most`.
+        """
         if self.folder.is_dir():
             return file_content(path, most)
         try:
@@ -176,7 +178,7 @@ class Record3d(FolderSequence):
         return zipfile.ZipFile(self.folder)
 
     def _unpacked(self, path: Path, item_bytes: int) -> bytes:
-        """The bytes that LZFSE made smaller: at most one of these items for each pixel of the image."""
+        """Return the bytes that LZFSE made smaller: at most one of these items for each pixel of the image."""
         most = item_bytes * self.camera.width * self.camera.height
         packed = self._content(path)
         try:
@@ -199,7 +201,7 @@ def _names(place: Path) -> frozenset[str]:
 
 
 def _depth_of(image: Path) -> Path:
-    """Where the depth of an image would be."""
+    """Return where the depth of an image would be."""
     if image.parent.name == "rgbd":
         return image.with_suffix(".depth")
     return image.parent.parent / "depth" / f"{image.stem}.exr"
@@ -215,7 +217,7 @@ def _decoder() -> Callable[..., Any]:
 
 
 def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image: tuple[int, int]) -> np.ndarray:
-    """An array of that size, rows and columns, or, where it is (0, 0), in the shape of an image."""
+    """Return an array of that size, rows and columns, or, where it is (0, 0), in the shape of an image."""
     each = np.dtype(kind).itemsize
     rows, columns = size
     if not all(size):
@@ -229,7 +231,7 @@ def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image
 
 
 def _depth_size(metadata: Mapping[str, Any]) -> tuple[int, int]:
-    """Width and height; (0, 0) where older versions of the app do not say."""
+    """Return width and height; (0, 0) where older versions of the app do not say."""
     width, height = metadata.get("dw"), metadata.get("dh")
     if isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
         return width, height
@@ -237,7 +239,7 @@ def _depth_size(metadata: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _times(metadata: Mapping[str, Any], numbers: list[int]) -> list[float]:
-    """Seconds of each image: those of the file, where they rise, else by its frames a second."""
+    """Return seconds of each image: those of the file, where they rise, else by its frames a second."""
     stamps = metadata.get("frameTimestamps")
     if isinstance(stamps, list) and len(stamps) > numbers[-1]:
         times = [stamps[number] for number in numbers]

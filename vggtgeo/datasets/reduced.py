@@ -1,9 +1,8 @@
-"""Large images are reduced on the way in: the pipeline looks for corners, and judges them, in pixels.
+"""Reduction of large images: the pipeline detects and judges corners in pixels.
 
-What is a pixel of noise, a radius to search, a fold of a curve is the same everywhere in the pipeline, and was measured
-on images of 540 x 360 to 752 x 480. Phones record 1920 x 1080 and 3840 x 2160: corners are blurred there over several
-pixels, and the same error is many of them. Forty frames of building-walk, without intrinsics, start and are 1.9 cm off
-as they are (540 x 360); enlarged to 3840 x 2160 they never started.
+Pixel noise and search radii are constants of the pipeline, measured on images of 540 x 360 to 752 x 480. Phones record
+1920 x 1080 and 3840 x 2160, where corners are blurred over several pixels and the same error is many pixels: a sequence
+without intrinsics that initializes at 540 x 360 does not when it is enlarged to 3840 x 2160.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ class ReducedSequence:
 
     @property
     def name(self) -> str:
-        """The name of the source."""
+        """Return the name of the source."""
         return self.source.name
 
     @property
     def has_depth(self) -> bool:
-        """Whether the source has depth."""
+        """Return whether the source has depth."""
         return self.source.has_depth
 
     def __len__(self) -> int:
@@ -47,7 +46,7 @@ class ReducedSequence:
         return _reduced_frames(self.source.frames(start, end, stride), self.source.camera, self.camera)
 
     def ground_truth(self) -> Trajectory | None:
-        """The truth of the source."""
+        """Return the truth of the source."""
         return self.source.ground_truth()
 
 
@@ -60,8 +59,8 @@ def reduced(source: FrameStream, max_pixels: int) -> FrameStream: ...
 
 
 def reduced(source: Sequence | FrameStream, max_pixels: int) -> Sequence | FrameStream:
-    """The same frames with at most about `max_pixels` pixels each, their camera with them; the source itself, where
-    its images have no more, or where `max_pixels` is 0.
+    """Return the same frames with at most about `max_pixels` pixels each, their camera with them; the source itself,
+    where its images have no more, or where `max_pixels` is 0.
     """
     camera = reduced_camera(source.camera, max_pixels)
     if camera == source.camera:
@@ -72,7 +71,7 @@ def reduced(source: Sequence | FrameStream, max_pixels: int) -> Sequence | Frame
 
 
 def reduced_camera(camera: Camera, max_pixels: int) -> Camera:
-    """The camera of images that were reduced to about `max_pixels` pixels; 0: of the images as they are."""
+    """Return the camera of images that were reduced to about `max_pixels` pixels; 0: of the images as they are."""
     factor = math.sqrt(max_pixels / (camera.width * camera.height))
     if factor >= 1 or not max_pixels:
         return camera

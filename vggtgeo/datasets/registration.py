@@ -37,14 +37,14 @@ class DepthRegistration:
 
     @classmethod
     def of(cls, source: Camera, target: Camera, motion: Float[np.ndarray, "4 4"]) -> Self:
-        """Prepares the rays: make it once for a recording."""
+        """Prepare the rays: make it once for a recording."""
         pixels = np.stack(np.meshgrid(np.arange(source.width), np.arange(source.height)), axis=-1)
         rays = pinhole.rays(source.undistorted(pixels.astype(np.float64)), source.intrinsics)
         x, y = 0.5 * np.array(target.intrinsics[:2]) / source.intrinsics[:2]
         return cls(rays, target, motion, (float(x), float(y)))
 
     def __call__(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h2 w2"]:
-        """The depth map of `target`, float32, metres, NaN for none.
+        """Return the depth map of `target`, float32, metres, NaN for none.
 
         depth: of `source`, metres, NaN for none. Of several points on a pixel the nearest stays; what the source did
         not see has no depth.

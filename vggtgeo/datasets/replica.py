@@ -33,12 +33,12 @@ class Replica(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `traj.txt` and `results/frame...`."""
+        """Return whether `folder` has `traj.txt` and `results/frame...`."""
         return (folder / "traj.txt").is_file() and any((folder / "results").glob("frame*"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the frames."""
+        """List the frames."""
         images = sorted((folder / "results").glob("frame*"), key=lambda path: natural_key(path.name))
         if not images:
             raise InputError(f"`{folder}` has no `results/frameXXXXXX.jpg`; expected a room of Replica")
@@ -54,14 +54,14 @@ class Replica(FolderSequence):
         return cls.listed(folder, frames, lambda *size: _camera(folder, stated, *size), coding, rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses."""
+        """Return the true poses."""
         file = self.folder / "traj.txt"
         poses = read_matrices(file, 16)
         return trajectory_of_rows([one.timestamp for one in self.files], self.rows, poses, file)
 
 
 def _poses_in(file: Path) -> int | None:
-    """How many poses there are; None where the file cannot be read, which is told where its poses are asked for."""
+    """Return the number of poses; None if the file is invalid, which `ground_truth` reports."""
     try:
         return len(read_matrices(file, 16))
     except InputError:

@@ -50,8 +50,8 @@ class RgbdFolders(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has images in a folder named as one of `COLOUR`, and hardly any of its own; or names of its
-        own images say which are depth.
+        """Return whether `folder` has images in a folder named as one of `COLOUR`, and hardly any of its own; or names
+        of its own images say which are depth.
         """
         colour = _folder(folder, COLOUR)
         if colour is None:
@@ -62,7 +62,7 @@ class RgbdFolders(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images and finds their depths; InputError where the two cannot be paired."""
+        """List the images and finds their depths; InputError where the two cannot be paired."""
         colour, (images, depths) = _listed(folder)
         if (file := list_of(folder)) and lists_no_times(file):
             _warn(
@@ -92,13 +92,13 @@ class RgbdFolders(FolderSequence):
         return cls.listed(folder, rows, camera)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses, if the folder has them."""
+        """Return the true poses, if the folder has them."""
         file = self.folder / "groundtruth.txt"
         return Trajectory.load_tum(file) if file.exists() else None
 
 
 def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
-    """The folder of the images, and the files of images and of depths."""
+    """Return the folder of the images, and the files of images and of depths."""
     colour = _folder(folder, COLOUR)
     if colour is None:
         both = _told_apart(folder)
@@ -120,7 +120,7 @@ def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
 
 
 def _told_apart(folder: Path) -> tuple[list[Path], list[Path]] | None:
-    """Images and depths of one folder, by the words of their names; None where hardly any name says depth."""
+    """Return images and depths of one folder, by the words of their names; None where hardly any name says depth."""
     inverse = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_inverse(path)]
     depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_depth(path) and path not in inverse]
     others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *INVERSE, *CONFIDENCE}]
@@ -145,13 +145,13 @@ def _folders(folder: Path) -> list[Path]:
 
 
 def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str] = IMAGE_SUFFIXES) -> Path | None:
-    """The first of the folders `names` that has images; see `_there`."""
+    """Return the first of the folders `names` that has images; see `_there`."""
     return next((found for name in names if (found := _there(folder, [name])) and image_files(found, suffixes)), None)
 
 
 def _there(folder: Path, names: Sequence[str]) -> Path | None:
-    """The first of the folders `names`, in small or capital letters, that is there; `rgb_png` is `rgb`, too, and depth
-    is what says so: `aligned_depth_to_color`.
+    """Return the first of the folders `names`, in small or capital letters, that is there; `rgb_png` is `rgb`, too, and
+    depth is what says so: `aligned_depth_to_color`.
     """
     folders = _folders(folder)
     there = {_SAYS_NOTHING.sub("", path.name.lower()): path for path in folders}
@@ -164,7 +164,7 @@ def _there(folder: Path, names: Sequence[str]) -> Path | None:
 
 
 def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path | None]:
-    """The depth of each image, None where it has none."""
+    """Return the depth of each image, None where it has none."""
     if shift := _shift(images, depths):
         _warn(
             f"`{folder}`: there are as many depths as images, and their numbers are {abs(shift)} "
@@ -225,7 +225,7 @@ def _tell_of_others(folder: Path, colour: Path) -> None:
 
 
 def _tell_of_no_image(folder: Path, depths: list[Path], partners: Sequence[Path | None]) -> None:
-    """How many depths have no image, unless every second or third has one, as where the colour camera is slower."""
+    """Warn of depths without an image, unless every second or third has one (a slower colour camera)."""
     paired = {partner for partner in partners if partner is not None}
     alone = len(depths) - len(paired)
     if not (alone and paired):
@@ -240,13 +240,13 @@ def _stem(path: Path) -> str:
 
 
 def _number(path: Path) -> str | None:
-    """The last number in a name that is no time."""
+    """Return the last number in a name that is no time."""
     numbers = re.findall(r"\d+", path.stem)
     return str(int(numbers[-1])) if numbers and _seconds([path]) is None else None
 
 
 def _seconds(paths: list[Path]) -> list[float] | None:
-    """Times of files named `1305031102.175304.png`."""
+    """Return times of files named `1305031102.175304.png`."""
     if not all(re.fullmatch(r"\d+\.\d+", path.stem) for path in paths):
         return None
     return [float(path.stem) for path in paths]

@@ -48,14 +48,14 @@ class ScanNet(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has `color`, `depth`, `pose` and `intrinsic`, or images beside `_info.txt`."""
+        """Return whether `folder` has `color`, `depth`, `pose` and `intrinsic`, or images beside `_info.txt`."""
         if all((folder / name).is_dir() for name in ("color", "depth", "pose", "intrinsic")):
             return True
         return _info(folder) is not None and bool(files_like(folder, "frame-*.color.*"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the frames that have an image."""
+        """List the frames that have an image."""
         place = folder / "color"
         images = image_files(place, _COLOUR) if place.is_dir() else files_like(folder, "frame-*.color.*")
         if not images:
@@ -77,7 +77,7 @@ class ScanNet(FolderSequence):
         return cls.listed(folder, frames, camera, as_images=False, colour=colour, motion=motion)
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """The image as the depth camera would see it: an affine change of pixels, reduced with an average."""
+        """Return the image as the depth camera would see it: an affine change of pixels, reduced with an average."""
         read = read_image_file(path, min_bits)
         image = read.image
         fx, fy, cx, cy = self.camera.intrinsics
@@ -92,7 +92,7 @@ class ScanNet(FolderSequence):
         return replace(read, image=np.asarray(seen, np.uint8))
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """The depth where the colour camera is, with the intrinsics of the depth camera."""
+        """Return the depth where the colour camera is, with the intrinsics of the depth camera."""
         depth = super().load_depth(path)
         if depth.shape != (self.camera.height, self.camera.width) or self._at_one_place:
             return depth
@@ -107,7 +107,7 @@ class ScanNet(FolderSequence):
         return DepthRegistration.of(self.camera, self.camera, self.motion)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses."""
+        """Return the true poses."""
         there = [(one.timestamp, _beside(self.folder, one.image, "pose", ".txt")) for one in self.files]
         there = [(time, file) for time, file in there if file.is_file()]
         if not there:
@@ -125,7 +125,7 @@ def _number(image: Path, index: int) -> int:
 
 
 def _beside(folder: Path, image: Path, what: str, suffix: str) -> Path:
-    """The file of an image's depth or pose, in either layout."""
+    """Return the file of an image's depth or pose, in either layout."""
     if image.parent == folder:
         return folder / (image.stem.removesuffix(".color") + f".{what}{suffix}")
     return folder / what / f"{image.stem}{suffix}"
@@ -136,7 +136,7 @@ def _depth(folder: Path, image: Path) -> Path | None:
 
 
 def _info(folder: Path) -> Path | None:
-    """The file of both cameras that SensReader in C++ writes; another program's `info.txt` is none."""
+    """Return the file of both cameras that SensReader in C++ writes; another program's `info.txt` is none."""
     own, other = folder / "_info.txt", folder / "info.txt"
     if own.is_file():
         return own
@@ -150,7 +150,7 @@ def _intrinsics(folder: Path, camera: str) -> tuple[float, float, float, float]:
 
 
 def _extrinsics(folder: Path, camera: str) -> np.ndarray:
-    """The rig -> the camera; the identity where nothing is stated."""
+    """Return the rig -> the camera; the identity where nothing is stated."""
     file, matrix = _calibration(folder, "extrinsic", camera, np.eye(4))
     if not have_rotations(matrix[None])[0] or not np.isfinite(matrix).all():
         raise InputError(f"`{file}`: the extrinsics of the {camera} camera are {matrix.tolist()}; expected a motion")
@@ -158,7 +158,7 @@ def _extrinsics(folder: Path, camera: str) -> np.ndarray:
 
 
 def _calibration(folder: Path, what: str, camera: str, unstated: np.ndarray | None = None) -> tuple[Path, np.ndarray]:
-    """A matrix [4, 4] of either layout, and the file where it stands. unstated: for one that is not there."""
+    """Return a matrix [4, 4] of either layout, and the file where it stands. unstated: for one that is not there."""
     file, info = folder / "intrinsic" / f"{what}_{camera}.txt", _info(folder)
     if file.is_file() or info is None:
         return file, unstated if unstated is not None and not file.is_file() else read_matrix(file, (4, 4))

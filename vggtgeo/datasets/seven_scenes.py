@@ -55,12 +55,12 @@ class SevenScenes(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has colour frames of this layout, or sequences `seq-XX` that have."""
+        """Return whether `folder` has colour frames of this layout, or sequences `seq-XX` that have."""
         return bool(_colour_files(folder)) or bool(_sequences(folder))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the frames; of a folder of sequences, those of the first, with an InputWarning where it has more."""
+        """List the frames; of a folder of sequences, those of the first, with an InputWarning where it has more."""
         if not _colour_files(folder):
             folder = _first_sequence(folder)
         numbered = _colour_files(folder)
@@ -72,7 +72,7 @@ class SevenScenes(FolderSequence):
         return replace(whole, as_published=whole.camera is _AS_PUBLISHED)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """The depth in the colour camera."""
+        """Return the depth in the colour camera."""
         depth = super().load_depth(path)
         return self._registration(depth) if self.as_published else depth
 
@@ -82,7 +82,7 @@ class SevenScenes(FolderSequence):
         return DepthRegistration.of(source, self.camera, _TO_COLOUR)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses; pose files with NaN or infinity (tracking was lost) are left out with an InputWarning."""
+        """Return the true poses; warn of pose files with NaN or infinity (lost tracking), which are left out."""
         if (self.folder / COLOUR_TRUTH).exists():
             return Trajectory.load_tum(self.folder / COLOUR_TRUTH)
         times, poses = [], []

@@ -34,12 +34,12 @@ class TanksAndTemples(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has a `*_COLMAP_SfM.log`."""
+        """Return whether `folder` has a `*_COLMAP_SfM.log`."""
         return bool(files_like(folder, f"*{_LOG}"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Lists the images, in the folder itself, in `images`, or in a folder of the scene's name."""
+        """List the images, in the folder itself, in `images`, or in a folder of the scene's name."""
         places = [folder, folder / "images", folder / folder.resolve().name]
         images = next((found for place in places if place.is_dir() and (found := image_files(place))), [])
         if not images:
@@ -63,12 +63,12 @@ class TanksAndTemples(FolderSequence):
 
     @property
     def truth_in_metres(self) -> bool:
-        """Those of COLMAP alone have no unit."""
+        """Return those of COLMAP alone have no unit."""
         return (self.folder / f"{self._scene()}_trans.txt").is_file()
 
     def scanned_points(self) -> Float[np.ndarray, "n 3"] | None:
-        """The laser scan within its volume (`SCENE.ply`, `SCENE.json`), metres, in the world of `ground_truth`; None
-        where a file is missing, or `SCENE_trans.txt`, without which the poses are not in the scanner's frame.
+        """Return the laser scan within its volume (`SCENE.ply`, `SCENE.json`), metres, in the world of `ground_truth`;
+        None where a file is missing, or `SCENE_trans.txt`, without which the poses are not in the scanner's frame.
         """
         scene = self._scene()
         if scene is None or not all((self.folder / f"{scene}{end}").is_file() for end in ("_trans.txt", ".ply")):
@@ -84,19 +84,19 @@ class TanksAndTemples(FolderSequence):
         return inside
 
     def judged(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points lie in the volume that the scan is compared in; all where no `SCENE.json` tells."""
+        """Return which points lie in the volume that the scan is compared in; all where no `SCENE.json` tells."""
         file = self.folder / f"{self._scene()}.json"
         return inside_crop(file, points) if file.is_file() else np.ones(len(points), bool)
 
     def _scene(self) -> str | None:
-        """The name that the files begin with."""
+        """Return the name that the files begin with."""
         file = next(iter(files_like(self.folder, f"*{_LOG}")), None)
         return None if file is None else file.name.removesuffix(_LOG)
 
 
 def _similarity(file: Path) -> Float[np.ndarray, "4 4"]:
-    """The matrix of a file; InputError where it is no scale, rotation and translation: what it makes of the poses would
-    be no poses, and the log would get the blame.
+    """Return the matrix of a file; InputError where it is no scale, rotation and translation: what it makes of the
+    poses would be no poses, and the log would get the blame.
     """
     matrix = read_matrix(file, (4, 4))
     turn = matrix[:3, :3]
@@ -110,7 +110,7 @@ def _similarity(file: Path) -> Float[np.ndarray, "4 4"]:
 
 
 def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 4 4"]:
-    """Camera -> world after a similarity `[s R, t]` of the world; rotations stay rotations."""
+    """Return camera -> world after a similarity `[s R, t]` of the world; rotations stay rotations."""
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
     result = poses.copy()
     result[:, :3, :3] = similarity[:3, :3] / scale @ poses[:, :3, :3]
@@ -119,7 +119,9 @@ def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"
 
 
 def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Which points lie in the volume of a scene's `SCENE.json`: a polygon across an axis, between two bounds on it."""
+    """Return which points lie in the volume of a scene's `SCENE.json`: a polygon across an axis, between two bounds on
+    it.
+    """
     crop = read_json(file)
     try:
         axis = _AXES.index(str(crop["orthogonal_axis"]).upper())
@@ -150,7 +152,7 @@ def _in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:
-    """Number of the image, and camera -> world, of each pose."""
+    """Return number of the image, and camera -> world, of each pose."""
     lines = [(place, line) for place, line in enumerate(read_text(file).splitlines(), start=1) if line.strip()]
     numbers, rows = [], []
     for count, (place, line) in enumerate(lines):
@@ -173,7 +175,7 @@ def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:
 
 
 def _floats(words: list[str]) -> list[float]:
-    """The words as numbers; none where one is no number."""
+    """Return the words as numbers; none where one is no number."""
     try:
         return [float(word) for word in words]
     except ValueError:

@@ -20,7 +20,7 @@ _NANOSECONDS = 1e17
 
 
 def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = None) -> Trajectory:
-    """The trajectory in a file of
+    """Return the trajectory in a file of
 
     - 8 columns, `timestamp tx ty tz qx qy qz qw` (TUM); times in nanoseconds, as ORB-SLAM3 writes them of EuRoC, are
       taken for what they are, with an InputWarning,

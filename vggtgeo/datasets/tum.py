@@ -49,13 +49,13 @@ class TumRgbd(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Whether `folder` has an `rgb.txt` of times, or a list of pairs of such."""
+        """Return whether `folder` has an `rgb.txt` of times, or a list of pairs of such."""
         file = list_of(folder)
         return file is not None and not lists_no_times(file)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Reads the lists and pairs them; without `depth.txt` the sequence has no depth."""
+        """Read the lists and pairs them; without `depth.txt` the sequence has no depth."""
         pairs = list_of(folder)
         if pairs is None or pairs.name == "rgb.txt":
             frames, coding = _of_lists(folder), FIVE_THOUSANDTHS
@@ -64,7 +64,7 @@ class TumRgbd(FolderSequence):
         return cls.listed(folder, frames, lambda *size: _camera(folder, *size), coding)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses at their own times (100 Hz in the benchmark), not those of the images."""
+        """Return the true poses at their own times (100 Hz in the benchmark), not those of the images."""
         file = self.folder / _TRUTH
         return Trajectory.load_tum(file) if file.exists() else None
 
@@ -79,13 +79,16 @@ def _camera(folder: Path, width: int, height: int) -> Camera:
 
 
 def list_of(folder: Path) -> Path | None:
-    """The list of images in a folder, with those of depth where `rgb.txt` is not there; None where there is none."""
+    """Return the list of images in a folder, with those of depth where `rgb.txt` is not there; None where there is
+    none.
+    """
     return next((file for name in ("rgb.txt", *_PAIRS) if (file := folder / name).is_file()), None)
 
 
 def lists_no_times(file: Path) -> bool:
-    """Whether the first column of a list is no time: it falls again and again, while the files are numbered in the
-    order of the list. Scripts write what each frame took in place of when it came; sorted by that, frames are shuffled.
+    """Return whether the first column of a list is no time: it falls again and again, while the files are numbered in
+    the order of the list. Scripts write what each frame took in place of when it came; sorted by that, frames are
+    shuffled.
     """
     try:
         lines = [line.split("#", 1)[0].split() for line in whole_text(file).splitlines()]
@@ -125,7 +128,7 @@ def _of_lists(folder: Path) -> list[_Frame]:
 
 
 def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
-    """The frames, and the unit of their depth: who counts frames is no benchmark, and has millimetres."""
+    """Return the frames, and the unit of their depth: who counts frames is no benchmark, and has millimetres."""
     pairs = read_pairs(file, "TIME")
     counted = all(time.is_integer() and abs(time) < MOST_FRAMES for time, *_ in pairs)
     if counted:
@@ -142,8 +145,8 @@ def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
 
 
 def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
-    """Time and name of the image, and name of its depth, of each line of a list of pairs, in either order; InputError
-    with the line of one that is none. time: how the message calls it.
+    """Return time and name of the image, and name of its depth, of each line of a list of pairs, in either order;
+    InputError with the line of one that is none. time: how the message calls it.
     """
     expected = f"expected `{time} rgb/{time}.png {time} depth/{time}.png`"
     pairs = []
@@ -163,7 +166,7 @@ def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
 
 
 def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
-    """The entries by time; `frames` where each of them is a frame, which counts when it is left out."""
+    """Return the entries by time; `frames` where each of them is a frame, which counts when it is left out."""
     if not file.is_file():
         raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
     entries = []

@@ -138,7 +138,7 @@ class VideoFile:
 
     @contextmanager
     def _streams(self) -> Iterator[tuple[VideoStream, DepthStream | None]]:
-        """The images, and the depth where it is read."""
+        """Return the images, and the depth where it is read."""
         with open_stream(self.path, None if self.tracks is None else self.tracks.images.index) as images:
             if self.tracks is None or self.tracks.depth is None or not self.has_depth:
                 yield images, None
@@ -147,18 +147,20 @@ class VideoFile:
                 yield images, DepthStream(depth, images.start)
 
     def _depth(self, depths: DepthStream, time: float) -> np.ndarray:
-        """Depth at a time of the stream, metres, NaN for none."""
+        """Return depth at a time of the stream, metres, NaN for none."""
         codes = depths.at(time)
         shape = self.camera.height, self.camera.width
         return np.full(shape, np.nan, np.float32) if codes is None else metres_of_codes(codes, MILLIMETRES)
 
     def _missed(self, failed: int, seconds: float, index: int) -> int:
-        """Frames that are missing before one: those that failed, or those that the time since the last one holds."""
+        """Return frames that are missing before one: those that failed, or those that the time since the last one
+        holds.
+        """
         passed = round(seconds * self.rate) - 1 if math.isfinite(seconds) else 0
         return max(failed, min(passed, self.count - index - 1))
 
     def _time(self, index: int, previous: float, stated: float) -> float:
-        """The container's time where it increases (the rate of phones varies), else by the rate."""
+        """Return the container's time where it increases (the rate of phones varies), else by the rate."""
         if index == 0:
             return 0.0
         if self.given_rate is not None:
@@ -166,7 +168,7 @@ class VideoFile:
         return stated if stated > previous else previous + 1.0 / self.rate
 
     def _warn_of_jump(self, index: int, previous: float, stated: float) -> bool:
-        """Whether the time goes back; 0 is that of frames without one."""
+        """Return whether the time goes back; 0 is that of frames without one."""
         back = self.given_rate is None and 0 < stated < previous - 1.0 / self.rate
         if back:
             _warn(
@@ -198,7 +200,7 @@ class _Selection:
         return index >= self.start and not self.is_behind(index) and (index - self.start) % self.stride == 0
 
     def count(self, first: int, behind: int) -> int:
-        """How many lie from `first` to before `behind`."""
+        """Return how many lie from `first` to before `behind`."""
         return sum(self.has(index) for index in range(first, behind))
 
 
@@ -211,7 +213,7 @@ class _Sizes:
     others: dict[bool, list[tuple[int, Size]]] = field(default_factory=lambda: {True: [], False: []})
 
     def fit(self, index: int, frame: Any) -> bool:
-        """Whether a frame can be used."""
+        """Return whether a frame can be used."""
         width, height = shown_size(frame)
         if (width, height) == self.first:
             return True
@@ -237,7 +239,7 @@ class _Sizes:
 
 
 def _pixel_aspect(stream: VideoStream, frame: Any) -> float:
-    """Width of a shown pixel over its height (1440 x 1080 are shown as 16:9); 1 if not stated, or impossible."""
+    """Return width of a shown pixel over its height (1440 x 1080 are shown as 16:9); 1 if not stated, or impossible."""
     aspect = stream.pixel_aspect
     if not 1 / MOST_ASPECT <= aspect <= MOST_ASPECT:
         return 1.0
@@ -245,7 +247,7 @@ def _pixel_aspect(stream: VideoStream, frame: Any) -> float:
 
 
 def _tracks(path: Path, depth: bool) -> ChosenTracks | None:
-    """The tracks that are read, with a note; None if the first is all that there is to be read."""
+    """Return the tracks that are read, with a note; None if the first is all that there is to be read."""
     with open_container(path) as container:
         tracks = tracks_of(container)
     if len(tracks) < 2:

@@ -46,22 +46,22 @@ class VideoStream:
 
     @property
     def rate(self) -> float:
-        """Frames a second as stated; 0 for none."""
+        """Return frames a second as stated; 0 for none."""
         return float(self._stream.guessed_rate or self._stream.average_rate or 0)
 
     @property
     def count(self) -> int:
-        """Frames as stated, or by the stated duration; 0 for none."""
+        """Return frames as stated, or by the stated duration; 0 for none."""
         return int(self._stream.frames or round(self._seconds() * self.rate))
 
     @property
     def pixel_aspect(self) -> float:
-        """Width of a stored pixel over its height as stated; 0 for none."""
+        """Return width of a stored pixel over its height as stated; 0 for none."""
         return float(self._stream.sample_aspect_ratio or 0)
 
     @property
     def has_times(self) -> bool:
-        """Whether the file has a container, which states the time of each frame."""
+        """Return whether the file has a container, which states the time of each frame."""
         return not int(self._container.format.flags) & _NO_TIMESTAMPS
 
     def frames(self) -> Iterator[tuple[int, Any]]:
@@ -85,7 +85,7 @@ class VideoStream:
                 failed = 0
 
     def time(self, frame: Any) -> float:
-        """Seconds of a frame since the stream's start; NaN if it has no time."""
+        """Return seconds of a frame since the stream's start; NaN if it has no time."""
         return float(frame.time) - self.start if frame.time is not None and self.has_times else math.nan
 
     def rgb(self, frame: Any, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:

@@ -39,12 +39,12 @@ class Track:
 
     @property
     def has_16_bits_of_grey(self) -> bool:
-        """Whether its pixels may be depth in millimetres."""
+        """Return whether its pixels may be depth in millimetres."""
         return self.pixels.startswith("gray16")
 
     @property
     def is_depth(self) -> bool:
-        """Whether its title says so."""
+        """Return whether its title says so."""
         return bool(_DEPTH.search(self.title))
 
 

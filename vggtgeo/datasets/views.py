@@ -33,7 +33,7 @@ class SequenceView:
 
     @property
     def name(self) -> str:
-        """The name of the source."""
+        """Return the name of the source."""
         return self.source.name
 
     def __len__(self) -> int:
@@ -48,14 +48,14 @@ class SequenceView:
         return frames if type(self.source).__module__.startswith("vggtgeo.") else map(copied, frames)
 
     def ground_truth(self) -> Trajectory | None:
-        """The truth of the source, unless it is hidden."""
+        """Return the truth of the source, unless it is hidden."""
         return self.source.ground_truth() if self.has_truth else None
 
 
 def with_intrinsics(
     sequence: Sequence, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
 ) -> Sequence:
-    """The sequence with the given, known intrinsics (pixels) in place of whatever its folder says."""
+    """Return the sequence with the given, known intrinsics (pixels) in place of whatever its folder says."""
     camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height, distortion)
     check_plausible("`intrinsics`", camera)
     source = replace(sequence, camera=camera) if isinstance(sequence, RosBag) else sequence  # depth is registered to it
@@ -63,7 +63,7 @@ def with_intrinsics(
 
 
 def with_rate(sequence: Sequence, rate: float) -> Sequence:
-    """The sequence with `rate` frames a second, in place of the times that are assumed or that a video states.
+    """Return the sequence with `rate` frames a second, in place of the times that are assumed or that a video states.
 
     Raises:
         InputError: `rate` is no positive number, or the sequence knows its times.
@@ -80,7 +80,7 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
 
 
 def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
-    """The sequence whose depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
+    """Return the sequence whose depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
 
     Raises:
         InputError: it is no positive number, no scale of a depth, or the depth comes from no such files.
@@ -107,7 +107,7 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
 
 
 def without_depth(sequence: Sequence) -> Sequence:
-    """The colour images alone; depth files are not even decoded."""
+    """Return the colour images alone; depth files are not even decoded."""
     known = isinstance(sequence, FolderSequence | RosBag | VideoFile)
     source = replace(sequence, has_depth=False) if known else sequence  # type: ignore[type-var]
     return SequenceView(source, sequence.camera, has_depth=False)

@@ -75,7 +75,7 @@ class Camera:
 
     @classmethod
     def guess(cls, width: int, height: int, pixel_aspect: float = 1.0) -> Self:
-        """A starting guess for an unknown lens: 60 degrees across the longer side, as it is shown, and centred.
+        """Return a starting guess for an unknown lens: 60 degrees across the longer side, as it is shown, and centred.
 
         pixel_aspect: width of a pixel over its height.
         """
@@ -86,21 +86,23 @@ class Camera:
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """The calibration matrix K, float64, pixels."""
+        """Return the calibration matrix K, float64, pixels."""
         return pinhole.matrix(self.intrinsics)
 
     @property
     def distorts(self) -> bool:
-        """Whether its images are not those of `pinhole`."""
+        """Return whether its images are not those of `pinhole`."""
         return self.fisheye or any(self.distortion)
 
     @property
     def pinhole(self) -> Self:
-        """The ideal camera that undistorted images belong to: the same intrinsics, no distortion."""
+        """Return the ideal camera that undistorted images belong to: the same intrinsics, no distortion."""
         return replace(self, distortion=(), fisheye=False)
 
     def resized(self, width: int, height: int) -> Self:
-        """The same camera of its images resized to `width` x `height` pixels; a pixel's middle is a whole number."""
+        """Return the same camera of its images resized to `width` x `height` pixels; a pixel's middle is a whole
+        number.
+        """
         check_sides(width, height)
         across, down = width / self.width, height / self.height
         fx, fy, cx, cy = self.intrinsics
@@ -108,7 +110,9 @@ class Camera:
         return replace(self, intrinsics=(across * fx, down * fy, *centre), width=width, height=height)
 
     def undistorted(self, pixels: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
-        """Where pixels of this camera's images are in those of `pinhole`, float64; any may lie outside the image."""
+        """Return where pixels of this camera's images are in those of `pinhole`, float64; any may lie outside the
+        image.
+        """
         flat = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
         if not self.distorts or not len(flat):
             return flat.reshape(np.shape(pixels))
@@ -118,7 +122,7 @@ class Camera:
         return np.asarray(found, np.float64).reshape(np.shape(pixels))
 
     def distorted(self, pixels: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
-        """Where pixels of `pinhole`'s images are in those of this camera, float64: the inverse of `undistorted`."""
+        """Return pixels of the ideal `pinhole` as pixels of this camera, float64: the inverse of `undistorted`."""
         flat = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
         if not self.distorts or not len(flat):
             return flat.reshape(np.shape(pixels))
@@ -132,7 +136,7 @@ class Camera:
         return np.asarray(found, np.float64).reshape(np.shape(pixels))
 
     def undistorter(self) -> "Undistorter":
-        """Prepares the maps from this camera's images to those of `pinhole`: make it once (40 ms for 640 x 480)."""
+        """Prepare the maps from this camera's images to those of `pinhole`: make it once (40 ms for 640 x 480)."""
         return Undistorter.of(self)
 
 
@@ -158,7 +162,7 @@ class Undistorter:
 
     @classmethod
     def of(cls, camera: Camera) -> Self:
-        """The undistorter of `camera`."""
+        """Return the undistorter of `camera`."""
         if not camera.distorts:
             return cls(camera.pinhole)
         maps_of = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
@@ -177,14 +181,14 @@ class Undistorter:
         return cls(camera.pinhole, None if inside.all() else inside, (maps[0], maps[1]), nearest)
 
     def image(self, image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w *c"]:
-        """The undistorted image, RGB or grey, bilinear."""
+        """Return the undistorted image, RGB or grey, bilinear."""
         if self.maps is None:
             return image
         self._check_size(image)
         return cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        """The undistorted depth (metres, NaN = none), nearest neighbour: no depth is made up between surfaces."""
+        """Return the undistorted depth (metres, NaN = none), by nearest neighbour: no depth between surfaces."""
         if self.nearest is None:
             return depth
         self._check_size(depth)

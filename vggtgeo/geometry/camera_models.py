@@ -45,11 +45,11 @@ class AbstractCamera(eqx.Module):
 
     @abc.abstractmethod
     def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Pixel of a point in camera coordinates (any positive multiple of it), pixels."""
+        """Return pixel of a point in camera coordinates (any positive multiple of it), pixels."""
 
     @abc.abstractmethod
     def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Viewing ray of a pixel, with `z = 1`."""
+        """Return viewing ray of a pixel, with `z = 1`."""
 
 
 class Pinhole(AbstractCamera):
@@ -156,7 +156,7 @@ class KannalaBrandt(AbstractCamera):
 
 
 def _drawn_radius(camera: KannalaBrandt, angle: Float[Array, ""]) -> Float[Array, ""]:
-    """Where a fisheye draws a ray at this angle from its axis, in focal lengths."""
+    """Return where a fisheye draws a ray at this angle from its axis, in focal lengths."""
     return angle * camera._stretch(angle)
 
 
@@ -256,18 +256,18 @@ class Cameras(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Number of parameters of one camera, `k`."""
+        """Return number of parameters of one camera, `k`."""
         return self.parameters.shape[-1]
 
     @property
     def seen(self) -> int:
-        """Number of parameters that an edge sees: those of the target's camera and of the host's, once if all keyframes
-        share one.
+        """Return number of parameters that an edge sees: those of the target's camera and of the host's, once if all
+        keyframes share one.
         """
         return self.size if self.group is None else 2 * self.size
 
     def of(self, keyframe: Int[Array, ""] | int, step: Float[Array, " k"] | None = None) -> AbstractCamera:
-        """The camera that took a keyframe, after a step of its parameters."""
+        """Return the camera that took a keyframe, after a step of its parameters."""
         own = self.parameters if self.group is None else self.parameters[self.group[keyframe]]
         return self.kind(own if step is None else own + step)
 
@@ -312,7 +312,7 @@ def _inverted(
 def _inverted_jvp(
     function: Callable[[Any, Array], Array], at: tuple[Any, Array], along: tuple[Any, Array]
 ) -> tuple[Array, Array]:
-    """The implicit function theorem, in which `x` is again an inverse: exact to any order."""
+    """Return the implicit function theorem, in which `x` is again an inverse: exact to any order."""
     camera, value = at
     x = _inverted(function, camera, value)
     _, moved = jax.jvp(lambda camera: function(camera, x), (camera,), along[:1])

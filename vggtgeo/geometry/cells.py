@@ -8,7 +8,8 @@ _LARGEST = 2**62
 
 
 def cell_numbers(cells: np.ndarray) -> np.ndarray:
-    """One number int64 [n] for each cell int [n, 3]: the same for the same cell, in the order of x, then y, then z.
+    """Return one number int64 [n] for each cell int [n, 3]: the same for the same cell, in the order of x, then y, then
+    z.
 
     `np.unique` of rows takes ten times as long as of these. Where the box around the cells has more of them than there
     are numbers (a mesh of 50 m at a thousandth of 2 cm), places in the order stand for coordinates.
@@ -26,6 +27,6 @@ def cell_numbers(cells: np.ndarray) -> np.ndarray:
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:
-    """The place of each value among the different ones, int64 [n], fewer than n."""
+    """Return the place of each value among the different ones, int64 [n], fewer than n."""
     places: np.ndarray = np.unique(values, return_inverse=True)[1].astype(np.int64)
     return places

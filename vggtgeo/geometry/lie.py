@@ -20,12 +20,12 @@ TANGENT = 6
 
 
 def cast(pose: jaxlie.SE3, dtype: DTypeLike) -> jaxlie.SE3:
-    """The same motion with parameters of `dtype`."""
+    """Return the same motion with parameters of `dtype`."""
     return jaxlie.SE3(pose.wxyz_xyz.astype(dtype))
 
 
 def exp(tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
-    """The motion of a tangent, accurate to second order in its derivatives.
+    """Return the motion of a tangent, accurate to second order in its derivatives.
 
     jaxlie's own exponential takes `V = R` for tiny angles, whose second derivative at zero is wrong by a factor of two
     in the product of rotation and translation; exact Hessians need it right.
@@ -66,7 +66,8 @@ def move_at_zero(pose: jaxlie.SE3, tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
 
 
 def log(pose: jaxlie.SE3) -> Float[Array, "*n 6"]:
-    """The tangent of a motion, the inverse of `exp` up to a rotation of pi; all its derivatives are finite at identity.
+    """Return the tangent of a motion, the inverse of `exp` up to a rotation of pi; all its derivatives are finite at
+    identity.
 
     jaxlie's own logarithm has NaN second derivatives there, where a prior is linearised and usually evaluated.
     """
@@ -100,7 +101,7 @@ def boxminus(pose: jaxlie.SE3, base: jaxlie.SE3) -> Float[Array, "*n 6"]:
 
 
 def steps(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The tangents that move poses [n, 4, 4] to others, float64 [n, 6]: `boxminus` of NumPy's matrices."""
+    """Return the tangents that move poses [n, 4, 4] to others, float64 [n, 6]: `boxminus` of NumPy's matrices."""
     motions = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(second @ rigid.invert(first))))
     return np.asarray(_log_jit(motions), np.float64)
 

@@ -29,7 +29,7 @@ class SegmentSlots:
 
 
 def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
-    """Number the samples of each segment, and the segments of each host, in the order in which they are given.
+    """Return number the samples of each segment, and the segments of each host, in the order in which they are given.
 
     Args:
         host: int `[B]`, keyframe of each line sample.
@@ -65,7 +65,7 @@ def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
 
 
 def fractions(pixels: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Position of each sample along its segment, 0 at the first and 1 at the last one; 0 where absent.
+    """Return position of each sample along its segment, 0 at the first and 1 at the last one; 0 where absent.
 
     Args:
         pixels: `[n, g, q, 2]`.
@@ -82,7 +82,7 @@ def fractions(pixels: np.ndarray, present: np.ndarray) -> np.ndarray:
 
 
 def straightened(inverse_depth: np.ndarray, fraction: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """The affine functions of `fraction` nearest to the inverse depths, all `[n, g, q]`.
+    """Return the affine functions of `fraction` nearest to the inverse depths, all `[n, g, q]`.
 
     Where the least-squares line is not positive all along, the mean.
     """

@@ -54,7 +54,7 @@ class Mesh:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
-        """Writes binary little-endian PLY, atomically: float32 x y z nx ny nz, uint8 RGB, and the faces."""
+        """Write binary little-endian PLY, atomically: float32 x y z nx ny nz, uint8 RGB, and the faces."""
         names = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
         vertices = np.empty(len(self.vertices), names + [(name, "u1") for name in ("red", "green", "blue")])
         columns = [*self.vertices.T, *self.normals.T, *self.colours.T]
@@ -68,7 +68,7 @@ class Mesh:
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> Mesh:
-        """Reads what `save_ply` wrote."""
+        """Read what `save_ply` wrote."""
         path = path_of("path", path)
         try:
             head = check_head(path)
@@ -88,7 +88,7 @@ class Mesh:
 
 
 def _triangles(listed: np.ndarray) -> np.ndarray:
-    """int64 [m, 3] of the lists of a file, which come one by one where it is text; ValueError for other lists."""
+    """Return the faces of a file, int64 [m, 3]; raise ValueError for faces that are not triangles."""
     if listed.dtype == object:
         corners = sorted({len(one) for one in listed} - {3})
         if corners:

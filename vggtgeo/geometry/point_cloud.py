@@ -62,7 +62,7 @@ class PointCloud:
         return len(self.points)
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
-        """Writes binary little-endian PLY, atomically: float32 x y z, uint8 RGB, float32 confidence, nx ny nz."""
+        """Write binary little-endian PLY, atomically: float32 x y z, uint8 RGB, float32 confidence, nx ny nz."""
         fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
         columns = [*self.points.T, *self.colours.T]
         if self.confidence is not None:
@@ -83,7 +83,7 @@ class PointCloud:
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> "PointCloud":
-        """Reads the points, colours (black where there are none), confidence and normals of a PLY file; InputError for
+        """Read the points, colours (black where there are none), confidence and normals of a PLY file; InputError for
         any file that holds no such points.
         """
         path = path_of("path", path)
@@ -117,7 +117,7 @@ def columns_of(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:
 
 
 def check_places(points: np.ndarray) -> np.ndarray:
-    """The same points; ValueError for places of nowhere, as bytes in the wrong order give."""
+    """Return the same points; ValueError for places of nowhere, as bytes in the wrong order give."""
     sizes = np.abs(points[np.isfinite(points)])
     if ((sizes > _FARTHEST) | ((sizes > 0) & (sizes < _NEAREST))).any():
         raise ValueError(
@@ -128,7 +128,7 @@ def check_places(points: np.ndarray) -> np.ndarray:
 
 
 def bytes_of_colours(values: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
-    """Colours as bytes, of bytes, of 16 bits, or of floats up to 1 or 255; black where there is none."""
+    """Return colours as bytes, of bytes, of 16 bits, or of floats up to 1 or 255; black where there is none."""
     if values.dtype == np.uint8:
         return values
     known = np.nan_to_num(values.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
@@ -152,7 +152,7 @@ def check_end(path: str | os.PathLike[str], head: bytes, data: PlyData) -> None:
 
 
 def _size_of(element: PlyElement) -> int:
-    """Bytes of an element in a binary file."""
+    """Return bytes of an element in a binary file."""
     lists = [entry for entry in element.properties if isinstance(entry, PlyListProperty)]
     own = {entry.name for entry in lists}
     plain = sum(element.data.dtype[name].itemsize for name in element.data.dtype.names or () if name not in own)
@@ -165,8 +165,8 @@ def _size_of(element: PlyElement) -> int:
 
 
 def check_head(path: str | os.PathLike[str]) -> bytes:
-    """The header of a PLY file; ValueError for a long file without one, which would be read to its end as one line, and
-    where it declares more than a byte each could hold: space for lists is taken before they are read.
+    """Return the header of a PLY file; ValueError for a long file without one, which would be read to its end as one
+    line, and where it declares more than a byte each could hold: space for lists is taken before they are read.
     """
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe has no end
         raise ValueError("it is no regular file")

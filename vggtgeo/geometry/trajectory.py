@@ -57,12 +57,12 @@ class Trajectory:
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"]:
-        """Camera centres in the world, metres."""
+        """Return camera centres in the world, metres."""
         return self.poses[:, :3, 3]
 
     @property
     def rotations(self) -> Float[np.ndarray, "n 3 3"]:
-        """Camera -> world rotations."""
+        """Return camera -> world rotations."""
         return self.poses[:, :3, :3]
 
     @property
@@ -84,14 +84,14 @@ class Trajectory:
         return f"Trajectory({len(self)} pose{'s' * (len(self) != 1)}, {seconds:.2f} s, path {self.length:.2f} m)"
 
     def select(self, rows: np.ndarray | slice) -> Self:
-        """The poses at `rows` (indices in increasing order, a boolean mask, or a slice)."""
+        """Return the poses at `rows` (indices in increasing order, a boolean mask, or a slice)."""
         try:
             return type(self)(self.timestamps[rows], self.poses[rows])
         except IndexError as error:
             raise InputError(f"`rows` cannot be rows of {len(self)} poses: {error}") from None
 
     def save_tum(self, path: str | os.PathLike[str]) -> None:
-        """Writes the TUM format, nine decimals, atomically."""
+        """Write the TUM format, nine decimals, atomically."""
         quaternions = Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
         rows = np.column_stack([self.timestamps, self.positions, quaternions])
         lines = (" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows.tolist())
@@ -99,7 +99,7 @@ class Trajectory:
 
     @classmethod
     def load_tum(cls, path: str | os.PathLike[str]) -> Self:
-        """Reads the TUM format (blanks or commas; `#` begins a comment).
+        """Read the TUM format (blanks or commas; `#` begins a comment).
 
         Quaternions are normalised. Lines out of order are sorted, and of lines with one time the first is
         kept, both with an InputWarning. InputError names the file and line for a missing file, a wrong number
@@ -182,8 +182,8 @@ def _parse_row(where: str, text: str) -> list[float]:
 
 
 def rising(path: str | os.PathLike[str], times: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    """Which poses of a file make a trajectory, and in which order: sorted, and of each time the first; both with an
-    InputWarning that names the file.
+    """Return which poses of a file make a trajectory, and in which order: sorted, and of each time the first; both with
+    an InputWarning that names the file.
     """
     order = np.argsort(times, kind="stable")
     if (np.diff(times) < 0).any():

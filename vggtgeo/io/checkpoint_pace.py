@@ -1,6 +1,6 @@
-"""How often a run keeps its state. By itself, so that `vggtgeo run --help` can tell it without what writes states."""
+"""How often a run writes checkpoints; apart, so that `vggtgeo run --help` need not import what writes them."""
 
 EVERY = 10.0
-"""Seconds between two states that are kept."""
+"""Seconds between two checkpoints."""
 SHARE = 0.025
-"""Most of a run's time that keeping its state may take."""
+"""Maximum share of a run's time for checkpoints."""

@@ -1,10 +1,10 @@
-"""What the library says about input that it cannot use: one exception, one warning."""
+"""Exception and warnings about invalid input."""
 
 from vggtgeo.io.one_line import shortened
 
 
 class InputError(ValueError):
-    """Something the user gave (a path, a file, a number) is wrong; the message says what, and what to do.
+    """The user's input (a path, a file, a number) is invalid; the message says what is wrong and what to do.
 
     Example:
         >>> import vggtgeo as vg
@@ -20,26 +20,26 @@ class InputError(ValueError):
 
 
 class InputWarning(UserWarning):
-    """Something the user gave was left out or assumed, and the work goes on; the message names it."""
+    """A part of the user's input is left out or assumed; the message names it, and the work continues."""
 
     def __str__(self) -> str:
         return shortened(super().__str__())
 
 
 class NoteWarning(InputWarning):
-    """What a reader did as its layout wants it (an IMU left out, the better of two depths taken): nothing is wrong."""
+    """A reader did what its layout requires (ignored an IMU, chose the better of two depths); nothing is wrong."""
 
 
 class GuessedCameraWarning(InputWarning):
-    """Nobody gave the camera: a guess is where the run starts."""
+    """The camera is unknown; the run starts from a guess."""
 
 
 class UnusableDepthWarning(InputWarning):
-    """None of the depth that is there is from where a room's can be, in the unit that its files have by convention."""
+    """No depth is in the range of a room in the usual unit of its files."""
 
 
 class LeftOutWarning(InputWarning):
-    """Frames of the input were left out; `frames` counts them."""
+    """Frames of the input are left out; `frames` is their number."""
 
     def __init__(self, message: str, frames: int = 1) -> None:
         super().__init__(message)

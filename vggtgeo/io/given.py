@@ -1,4 +1,4 @@
-"""What a caller gave, where its kind alone says that it cannot be used: refused in a sentence that names it."""
+"""Argument validation. Each function raises `InputError` naming the argument."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vggtgeo.io.errors import InputError
 
 
 def check_kind(name: str, given: Any, kind: Any, expected: str) -> None:
-    """InputError unless `given` is of this type, or one of these; `expected` says what is, and how to come by one."""
+    """Raise InputError unless `given` has this type, or one of these; expected: the type, and how to obtain it."""
     if not isinstance(given, kind):
         raise InputError(f"`{name}` is of the type `{type(given).__name__}`; expected {expected}")
 
@@ -26,12 +26,11 @@ _LONGEST_NAME, _LONGEST_PATH = 255, 4095
 
 
 def path_of(name: str, given: Any) -> Path:
-    """The path that was given, as a text or an `os.PathLike`, `~` being the home folder, as in a shell: else what is
-    saved there would go into a folder of that name. Whether anything is there is for the caller to ask.
+    """Return the path of a text or an `os.PathLike`, with `~` expanded to the home folder; it need not exist.
 
     Raises:
-        InputError: it is of another kind, bytes among them; or empty, which would mean the working folder; or no file
-            system has such a name, for a zero byte or its length.
+        InputError: another type (bytes, for example), an empty path, or one that no file system accepts (a zero byte,
+            or too long).
 
     """
     found = os.fspath(given) if isinstance(given, str | os.PathLike) else given
@@ -44,16 +43,16 @@ def path_of(name: str, given: Any) -> Path:
     try:
         whole = os.fsencode(found)
     except UnicodeEncodeError:
-        raise InputError(f"`{name}` is {given!r:.60}, which has a letter that no file's name can have") from None
+        raise InputError(f"`{name}` is {given!r:.60}, which has a character that a file name cannot have") from None
     longest = max(map(len, whole.split(os.fsencode(os.sep))))
     if longest > _LONGEST_NAME or len(whole) > _LONGEST_PATH:
         text = f"{len(whole)} bytes, {longest} between two slashes; there can be {_LONGEST_PATH}, and {_LONGEST_NAME}"
         raise InputError(f"`{name}` is {given!r:.30}..., a path of {text}")
-    return Path(os.path.expanduser(found))  # of pathlib, it fails for a user that is not known
+    return Path(os.path.expanduser(found))  # `Path.expanduser` fails for an unknown user
 
 
 def check_whole(name: str, given: Any, least: int = 0, most: int | None = None) -> None:
-    """A whole number, of Python or of numpy; no truth value, which counts as one where it is asked as a number."""
+    """Raise InputError unless `given` is an integer of Python or numpy in the range; booleans are not integers."""
     whole = isinstance(given, numbers.Integral) and not isinstance(given, bool | np.bool_)
     if not whole or given < least or (most is not None and given > most):
         until = "" if most is None else f", at most {most}"
@@ -61,7 +60,7 @@ def check_whole(name: str, given: Any, least: int = 0, most: int | None = None) 
 
 
 def check_real(name: str, given: Any, must: str = "a number") -> None:
-    """One real number, infinity among them: what Python says of comparing a text or a list is nothing for a user."""
+    """Raise InputError unless `given` is one real number or infinity."""
     found = np.asarray(given)
     if found.ndim or found.dtype.kind not in "iuf" or np.isnan(found):
         what = str(given) if found.dtype.kind == "f" and not found.ndim else f"{given!r:.60}"
@@ -69,18 +68,18 @@ def check_real(name: str, given: Any, must: str = "a number") -> None:
 
 
 def check_positive(name: str, given: Any, unit: str) -> None:
-    """One number above zero; infinity is none."""
+    """Raise InputError unless `given` is a positive, finite number."""
     check_real(name, given, f"positive {unit}")
     if not 0 < given < math.inf:
         raise InputError(f"`{name}` is {given}; it must be positive {unit}")
 
 
 def real_numbers(name: str, given: Any) -> np.ndarray:
-    """An array of real numbers or truth values from whatever was given.
+    """Return an array of real numbers or booleans.
 
     Raises:
-        InputError: text, objects, dates, ragged lists; complex numbers, of which NumPy would take the real part; or
-            masked entries, whose mask NumPy would forget.
+        InputError: text, objects, dates, ragged lists, complex numbers (NumPy would take their real part), or masked
+            entries (NumPy would drop the mask).
 
     """
     try:
@@ -98,7 +97,7 @@ def real_numbers(name: str, given: Any) -> np.ndarray:
 
 
 def real_array(name: str, given: Any, shape: Sequence[int | None]) -> np.ndarray:
-    """Real numbers of this shape, None for any length; InputError as of `real_numbers`, and for another shape."""
+    """Return real numbers of this shape (None: any length); raise InputError as `real_numbers`."""
     found = real_numbers(name, given)
     if found.ndim != len(shape) or any(
         wanted not in (None, has) for wanted, has in zip(shape, found.shape, strict=True)
@@ -110,7 +109,7 @@ def real_array(name: str, given: Any, shape: Sequence[int | None]) -> np.ndarray
 
 
 def check_plain(name: str, given: Mapping[str, Any]) -> None:
-    """Values that JSON has: what is to be written at the end of hours must be known to be writable before."""
+    """Raise InputError for values that JSON cannot hold: before hours of work, not when they are written."""
     check_kind(name, given, Mapping, "a dictionary of plain values")
     try:
         json.JSONEncoder(allow_nan=False).encode(given)

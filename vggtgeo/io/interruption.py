@@ -1,8 +1,8 @@
-"""Ctrl-C, SIGTERM and SIGHUP as one wish to stop, which never leaves half of something behind.
+"""Ctrl-C, SIGTERM and SIGHUP as a request to stop that never leaves partial results.
 
-An exception that a signal raises may come up anywhere: between two files of one result, or inside a callback of a
-compiled library, which drops it. So where something must be finished, a first signal is only noted; a second one means
-it, and raises KeyboardInterrupt.
+An exception of a signal handler may be raised anywhere: between two files of one result, or inside a callback of a
+compiled library, which drops it. Where something must be completed, the first signal is only recorded; the second
+raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class Interruption:
-    """Whether somebody asked to stop."""
+    """Whether a signal has requested to stop."""
 
     def __init__(self) -> None:
         self.asked = False
         self._raises = False
 
     def on_signal(self, number: int, frame: Any) -> None:
-        """The handler of the signals: notes the first, raises KeyboardInterrupt at the next, or inside `at_once`."""
+        """Record the first signal; raise KeyboardInterrupt at the next, or inside `at_once`."""
         again, self.asked = self.asked, True
         if self._raises or again:
             raise KeyboardInterrupt
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Inside, the first signal raises: for long work of which nothing is lost."""
+        """Raise at the first signal inside this block: for long work that can be repeated."""
         if self.asked:
             raise KeyboardInterrupt
         outer, self._raises = self._raises, True
@@ -42,8 +42,8 @@ class Interruption:
 
 
 def end_on_signals() -> None:
-    """SIGTERM (`kill`, a shutdown, a batch system's limit) and SIGHUP (a closed terminal) raise KeyboardInterrupt, as
-    Ctrl-C does, unless somebody set them otherwise (`nohup`). For a program's entry, not for a library.
+    """Make SIGTERM (`kill`, a shutdown, a limit of a batch system) and SIGHUP (a closed terminal) raise
+    KeyboardInterrupt, as Ctrl-C does, unless they have other handlers (`nohup`). For a program's entry, not a library.
     """
     for number in _signals():
         if signal.getsignal(number) is signal.SIG_DFL:
@@ -51,7 +51,9 @@ def end_on_signals() -> None:
 
 
 def ignore_signals() -> None:
-    """The same signals change nothing any more: all is done, and what ends then (JAX's devices) is no error's place."""
+    """Ignore these signals: the work is done, and an error at the end of the process (JAX's devices) would be
+    confusing.
+    """
     for number in _signals():
         if signal.getsignal(number) is not signal.SIG_DFL:
             signal.signal(number, signal.SIG_IGN)
@@ -59,10 +61,10 @@ def ignore_signals() -> None:
 
 @contextmanager
 def interruption() -> Iterator[Interruption]:
-    """Notes the signals that would raise KeyboardInterrupt, in place of raising it; inside another, the same object.
+    """Record signals that would raise KeyboardInterrupt instead of raising it; yields the same object inside another.
 
-    A signal that ends the process, or that somebody ignores, goes on to do so. Outside the main thread, where Python
-    allows no handlers, nothing is noted.
+    Signals that end the process or are ignored keep doing so. Outside the main thread, where Python allows no handlers,
+    nothing is recorded.
     """
     if threading.current_thread() is not threading.main_thread():
         yield Interruption()
@@ -84,7 +86,7 @@ def interruption() -> Iterator[Interruption]:
 
 
 def _signals() -> list[signal.Signals]:
-    """Those that this system has."""
+    """Return the signals that this system has."""
     return [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 
 

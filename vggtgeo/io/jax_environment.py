@@ -4,16 +4,17 @@ import os
 from pathlib import Path
 
 SHORTEST_CACHED_COMPILATION = 0.0
-"""Seconds: what compiles faster is not kept. A run has a hundred small programs, 20 to 60 ms each: 3 s."""
+"""Seconds: faster compilations are not cached. A run has a hundred small programs of 20 to 60 ms: 3 s."""
 
 
 def jax_environment() -> dict[str, str]:
-    """64-bit numbers, compiled code kept between runs, and the processor: a run solves one window after the other,
-    which a GPU takes longer for (60 frames: 32 s on an H100, 22 s on its host), and not to the same last digit twice.
-    If the environment says otherwise, memory of the GPU is taken as needed, not three quarters at once: the networks of
-    onnxruntime share it. Matrix products in one thread: several are under way at once, and their
-    threads wait for each other (two at a time on two cores, 1500 x 128 x 1500: 3.5 ms each, 5.5 with two threads each).
-    A setting of the user's own environment is to win.
+    """Return settings: 64-bit numbers, a cache of compiled code, CPU, one thread per matrix product.
+
+    A run solves one window after the other, which takes longer on a GPU (60 frames: 32 s on an H100, 22 s on its host)
+    and is not reproducible to the last digit. If the environment selects a GPU, its memory is allocated as needed,
+    since onnxruntime shares it. Several matrix products run at once, whose threads would wait for each other (two at a
+    time on two cores, 1500 x 128 x 1500: 3.5 ms each, 5.5 with two threads each). Variables of the user take
+    precedence.
     """
     found = {
         "JAX_ENABLE_X64": "1",
@@ -29,7 +30,7 @@ def jax_environment() -> dict[str, str]:
 
 
 def own_cache() -> Path | None:
-    """`$XDG_CACHE_HOME/vggtgeo/jax` (`~/.cache/...` without that variable); None without a home folder."""
+    """Return `$XDG_CACHE_HOME/vggtgeo/jax` (by default in `~/.cache`); None without a home folder."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vggtgeo" / "jax"
     except RuntimeError:
@@ -37,7 +38,7 @@ def own_cache() -> Path | None:
 
 
 def cache_folder() -> Path | None:
-    """`own_cache`, made if need be; None where it cannot be written."""
+    """Return `own_cache`, created if missing; None if it is not writable."""
     folder = own_cache()
     try:
         if folder is not None:

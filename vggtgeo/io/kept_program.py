@@ -1,14 +1,13 @@
-"""Compiled functions whose traced program is kept between processes, beside JAX's compiled code.
+"""Compiled functions whose traced programs are cached on disk, beside JAX's compiled code.
 
-JAX keeps what it has compiled, and finds it by the program; so each process traces and lowers every function again to
-know what to look for. For a window's solve, its marginalisation, the solve of the whole map and its covariances that is
-6 s of Python on every run, during which nothing else of the process runs. Here the program itself (StableHLO,
-`jax.export`) is kept as well: 0.1 s each.
+JAX finds compiled code by the program, so each process traces and lowers every function again: 6 s of Python per run
+for the solve of a window, its marginalisation, the solve of the map and its covariances. Here the program itself
+(StableHLO, by `jax.export`) is cached as well, which takes 0.1 s each.
 
-A kept program is one of this very code: its file is named after the text of all sources of the package, the versions of
-what traces them, every static part and every shape. Where any of that has no lasting name (a function of a notebook, a
-kernel of a user's own), nothing is kept. What is read is a program for XLA, no Python: nothing in it is executed but by
-its call. `JAX_ENABLE_COMPILATION_CACHE=false` switches this off with JAX's own cache.
+The file name is a digest of all sources of the package, the versions of the packages that trace, every static part and
+every shape. A function or kernel without a lasting name (of a notebook, for example) is not cached. A cached program is
+code for XLA, not Python, and runs only when it is called. `JAX_ENABLE_COMPILATION_CACHE=false` disables this cache
+together with JAX's own.
 """
 
 from __future__ import annotations
@@ -33,20 +32,19 @@ from vggtgeo.io.files import atomic_open
 _Result = TypeVar("_Result")
 
 LASTING = ("vggtgeo", "optimistix", "equinox", "lineax", "jaxlie", "jax", "numpy", "builtins")
-"""Packages whose classes and functions are the same in another process, of the versions that the name holds."""
+"""Packages whose classes and functions are the same in other processes, given their versions."""
 VERSIONS = ("optimistix", "equinox", "lineax", "jaxlie", "jax", "jaxlib", "numpy")
 
 
 class KeptProgram(Generic[_Result]):
     """A pure function of pytrees, compiled for each structure and shape it is called with.
 
-    As `equinox.filter_jit`, which it falls back on: for traced arguments, for arrays that lie elsewhere than on the
-    first processor (a GPU, several devices), and where nothing can be kept. Only positional arguments.
+    Falls back on `equinox.filter_jit` for traced arguments, for arrays on other devices than the first CPU, and where
+    nothing can be cached. Only positional arguments.
 
     Args:
-        function: traceable; its name and module are those of its program.
-        result: of the same arguments, anything of the structure that `function` returns: what is in its arrays does not
-            count.
+        function: traceable; its name and module identify its program.
+        result: takes the same arguments, and returns any value with the structure of the function's result.
 
     """
 
@@ -63,18 +61,18 @@ class KeptProgram(Generic[_Result]):
         key = structure, _setting("enable_x64"), tuple(map(_kind_of, leaves))
         with self._lock:
             program = self._programs.setdefault(key, _Program())
-        with program.lock:  # one thread prepares, and others of the same key wait for it
+        with program.lock:  # one thread prepares, others with the same key wait
             if program.call is None:
                 program.call = self._kept(args) or self._plain
         return program.call(*args)
 
     @property
     def prepared(self) -> int:
-        """For how many structures and shapes it was called so far."""
+        """Return the number of structures and shapes of the calls so far."""
         return len(self._programs)
 
     def _kept(self, args: tuple[Any, ...]) -> Callable[..., _Result] | None:
-        """What runs the kept program for arguments like these; None where there is none and none can be made."""
+        """Return a call of the cached program for such arguments; None if there is none and it cannot be cached."""
         folder, named = _folder(), _lasting_name((self._function, args))
         if folder is None or named is None:
             return None
@@ -86,7 +84,7 @@ class KeptProgram(Generic[_Result]):
             exported = self._export(args, result, path)
         if exported is None or len(exported.in_avals) != len(arrays):
             return None
-        # Not by `jit`, which would compile once more for arrays that such a program returned: they name their device.
+        # Not `jit`, which would compile again for arrays that such a program returned: they name their device.
         run = jax.jit(exported.call).lower(*arrays).compile()
 
         def call(*given: Any) -> _Result:
@@ -97,7 +95,7 @@ class KeptProgram(Generic[_Result]):
         return call
 
     def _export(self, args: tuple[Any, ...], result: Any, path: Path) -> jax.export.Exported | None:
-        """The traced program, kept at `path`, as it is read from there; None where JAX cannot export it."""
+        """Trace the program and cache it at `path`; None if JAX cannot export it."""
         leaves, structure = jax.tree.flatten(args)
         arrays = [leaf for leaf in leaves if _is_array(leaf)]
 
@@ -111,18 +109,18 @@ class KeptProgram(Generic[_Result]):
 
         try:
             content = jax.export.export(jax.jit(flat))(*arrays).serialize()
-        except (NotImplementedError, ValueError):  # a part that has no lasting form, or a result of another one
+        except (NotImplementedError, ValueError):  # a part cannot be exported, or the structure differs
             return None
         try:
             with atomic_open(path, "wb") as file:
                 file.write(content)
-        except OSError:  # a full disk costs time alone
+        except OSError:  # a full disk costs only time
             return None
         return _read(path)
 
 
 class _Program:
-    """What is called for one key, once a thread has prepared it."""
+    """The function called for one key, once a thread has prepared it."""
 
     def __init__(self) -> None:
         self.lock = Lock()
@@ -134,7 +132,7 @@ def _is_array(leaf: Any) -> bool:
 
 
 def _elsewhere(leaf: Any) -> bool:
-    """Whether an array lies on another device than the one that a kept program is compiled for, or on several."""
+    """Return whether an array is on another device than the first, or on several."""
     return isinstance(leaf, jax.Array) and leaf.devices() != _first_device()
 
 
@@ -144,14 +142,14 @@ def _first_device() -> set[jax.Device]:
 
 
 def _kind_of(leaf: Any) -> Hashable:
-    """What a program depends on: of an array its type and shape, of any other leaf itself."""
+    """Return what a program depends on: type and shape of an array, any other leaf itself."""
     if _is_array(leaf):
         return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
     return type(leaf), leaf
 
 
 def _folder() -> Path | None:
-    """Where programs are kept: beside JAX's compiled code, where that is kept on this machine for its processor."""
+    """Return the folder of cached programs, beside JAX's compiled code on this machine; None without one."""
     place = _setting("compilation_cache_dir")
     if not _setting("enable_compilation_cache") or not place or "://" in place or jax.default_backend() != "cpu":
         return None
@@ -161,7 +159,7 @@ def _folder() -> Path | None:
 def _read(path: Path) -> jax.export.Exported | None:
     try:
         return jax.export.deserialize(bytearray(path.read_bytes()))
-    except Exception:  # noqa: BLE001 - whatever a damaged file brings about: it is made anew
+    except Exception:  # noqa: BLE001 - a damaged file may raise anything, and is written again
         return None
 
 
@@ -171,7 +169,7 @@ def _digest(named: str) -> str:
 
 
 def _switches() -> str:
-    """What JAX traces differently under, beside the types of the arguments."""
+    """Return the settings of JAX that change what is traced."""
     return str([_setting(name) for name in ("enable_x64", "default_matmul_precision", "numpy_dtype_promotion")])
 
 
@@ -181,7 +179,7 @@ def _setting(name: str) -> Any:
 
 @cache
 def _sources() -> str:
-    """Digest of the text of this package: a kept program is one of this code."""
+    """Return a digest of the sources of this package."""
     found = hashlib.sha256()
     for name in ("vggtgeo", "vggtgeo.solvers", "vggtgeo.models"):
         for folder in map(Path, import_module(name).__path__):
@@ -192,8 +190,8 @@ def _sources() -> str:
 
 
 def _lasting_name(value: Any) -> str | None:
-    """All of a value but the numbers in its arrays, as a text that means the same in another process; None where a part
-    of it has no such name.
+    """Return a value without the numbers in its arrays, as a text that means the same in other processes; None if a
+    part has no such name.
     """
     if _is_array(value):
         return f"{value.dtype}{list(value.shape)}{'weak' if getattr(value, 'weak_type', False) else ''}"
@@ -219,6 +217,6 @@ def _joined(head: str, values: Sequence[Any]) -> str | None:
 
 
 def _lasting_path(named: type | types.FunctionType) -> str | None:
-    """Module and name of a class or function of a package in `LASTING`; None of one made inside a function."""
+    """Return module and name of a class or function in `LASTING`; None if it was made inside a function."""
     module, name = named.__module__, named.__qualname__
     return f"{module}:{name}" if module.split(".")[0] in LASTING and "<" not in name else None

@@ -1,4 +1,4 @@
-"""What is wrong with a network's file is the user's input: one line, no traceback."""
+"""Errors of networks as input errors: one line, no traceback."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vggtgeo.models.onnx.session import NetworkRunError
 
 @contextmanager
 def as_input_errors() -> Iterator[None]:
-    """Raises `InputError` for a network that cannot be opened or that fails while it runs."""
+    """Raise `InputError` for a network that cannot be opened or fails while it runs."""
     try:
         yield
     except (NetworkFileError, NetworkRunError) as error:

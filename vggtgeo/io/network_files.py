@@ -1,4 +1,4 @@
-"""Where the networks' files lie, and the one way they are ever downloaded."""
+"""Files of networks: their folder and their download."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FOLDER_VARIABLE = "VGGTGEO_MODELS"
 
 
 def networks_folder(given: Path | None = None) -> Path:
-    """The folder given, else that of the environment variable VGGTGEO_MODELS, else one in the user's data."""
+    """Return the given folder, else that of the variable VGGTGEO_MODELS, else one in the user's data folder."""
     if given is not None:
         return given
     named = os.environ.get(FOLDER_VARIABLE)
@@ -26,17 +26,17 @@ def networks_folder(given: Path | None = None) -> Path:
 
 
 def network_named(name: str) -> Network:
-    """The entry of the registry; `InputError` for a name that is not there."""
+    """Return a network of the registry; raise `InputError` for an unknown name."""
     if name not in NETWORKS:
-        raise InputError(f"`{name}` is no network; it must be one of {', '.join(NETWORKS)}")
+        raise InputError(f"`{name}` is not a known network; it must be one of {', '.join(NETWORKS)}")
     return NETWORKS[name]
 
 
 def fetch_network(network: Network, folder: Path, endpoint: str | None = None) -> Path:
-    """Download a published ONNX file into `folder`; a download that was cut off goes on where it stopped.
+    """Download a published ONNX file into `folder`; an interrupted download is resumed.
 
-    The file takes its name only when its SHA-256 is that of the registry. endpoint: address of the hub, None for the
-    hub's own. Raises `InputError` where there is nothing to download, the server fails, or the content is another.
+    The file appears once its SHA-256 is that of the registry. endpoint: address of the hub; None for the default.
+    Raises `InputError` if the file is not published, the server fails, or the content differs.
     """
     source = network.hub
     target = folder / network.file
@@ -64,9 +64,9 @@ def fetch_network(network: Network, folder: Path, endpoint: str | None = None) -
 
 
 def _download(network: Network, source: HubFile, part: Path, endpoint: str | None) -> str | None:
-    """Append to `part` what it lacks; returns the SHA-256 that the server announced, if any.
+    """Append the missing part to `part`; return the SHA-256 that the server announced, if any.
 
-    The client's `hf_hub_download` keeps nothing of a download that is cut off.
+    The client's `hf_hub_download` discards interrupted downloads.
     """
     hub, http_get, broken = _hub_client()
     try:
@@ -89,7 +89,7 @@ def _download(network: Network, source: HubFile, part: Path, endpoint: str | Non
 
 
 def _instead(network: Network) -> str:
-    """What to do where the published file is another one."""
+    """Return what to do if the published file has changed."""
     return f"else make it from the weights: {network.export_command} (checkout of {network.publication.code})"
 
 
@@ -98,7 +98,7 @@ def _another(source: HubFile, found: str | None) -> str:
 
 
 def _hub_client() -> tuple[Any, Any, type[Exception]]:
-    """The hub's client, its download of one address into an open file, and what a broken connection raises there."""
+    """Return the hub's client, its download of an address into an open file, and its connection error."""
     try:
         import huggingface_hub
         from huggingface_hub.file_download import http_get
@@ -106,7 +106,7 @@ def _hub_client() -> tuple[Any, Any, type[Exception]]:
         raise InputError(
             f"fetching needs the package huggingface-hub, which is not installed; {install_hint('fetch')}"
         ) from None
-    # The client lets the errors of its HTTP library through, and which library that is depends on its version.
+    # The client passes on errors of its HTTP library, which depends on its version.
     library = type(huggingface_hub.get_session()).__module__.split(".")[0]
     return huggingface_hub, http_get, sys.modules[library].HTTPError
 

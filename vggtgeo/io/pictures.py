@@ -1,4 +1,4 @@
-"""Images as files."""
+"""Write image files."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from vggtgeo.io.files import atomic_open
 
 
 def write_picture(path: Path, image: np.ndarray, options: Sequence[int] = ()) -> None:
-    """Writes `image` [H, W] or, in the order blue, green, red, [H, W, 3], atomically, in the format that the suffix of
-    `path` names. options: OpenCV's.
-    """
-    # Encoded first: OpenCV's own writing of a file does not tell that a disk is full, and leaves a part of an image.
+    """Write `image` [H, W] or [H, W, 3] (BGR) atomically, in the format of the suffix of `path`; options: of OpenCV."""
+    # Encoded first: OpenCV does not report a full disk, and leaves a part of an image.
     with atomic_open(path, "wb") as file:
         file.write(cv2.imencode(path.suffix, image, options)[1].tobytes())

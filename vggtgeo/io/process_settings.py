@@ -1,4 +1,4 @@
-"""What the program sets for its whole process by environment variables, for the time of one call of the library."""
+"""Settings of JAX and BLAS during one call of the library, as environment variables set them for the program."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ FOLDER = "jax_compilation_cache_dir"
 SHORTEST = "jax_persistent_cache_min_compile_time_secs"
 ENABLED = "jax_enable_compilation_cache"
 _been_here: set[int] = set()
-"""Numbers of the processes that have entered `program_settings`: this one, and one that it was forked from."""
+"""Ids of the processes that entered `program_settings`, parents of a fork included."""
 
 
 @contextmanager
 def program_settings() -> Iterator[None]:
-    """Inside, compiled code is kept in the user's cache folder and matrix products take one thread, as in the program
-    (`jax_environment`). What somebody has set, for JAX or by `OPENBLAS_NUM_THREADS`, is left alone, and afterwards all
-    is as before: what other code of the process compiles is nothing for that folder.
+    """Cache compiled code in the user's cache folder, and use one thread for matrix products, as the program does
+    (`jax_environment`). Settings of the user, of JAX or `OPENBLAS_NUM_THREADS`, take precedence; afterwards all
+    settings are as before.
 
     Raises:
-        InputError: this process was forked from one that has been here.
+        InputError: this process was forked from one that was in this block.
 
     """
     _check_not_forked()
@@ -36,12 +36,12 @@ def program_settings() -> Iterator[None]:
 
 
 def _check_not_forked() -> None:
-    """What JAX computes by are threads, which a forked process lacks: it would wait for them for ever."""
+    """Raise InputError in a forked process: it lacks JAX's threads, and would wait for them forever."""
     _been_here.add(os.getpid())
     if len(_been_here) > 1:
         raise InputError(
-            "this process was forked from one that has computed, without its threads, and would wait for ever; start "
-            'processes anew: `multiprocessing.get_context("spawn")`, or `mp_context` of a `ProcessPoolExecutor`'
+            "this process was forked from one that uses JAX, and would wait forever for its threads; start new "
+            'processes: `multiprocessing.get_context("spawn")`, or `mp_context` of a `ProcessPoolExecutor`'
         )
 
 

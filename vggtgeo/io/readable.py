@@ -1,4 +1,4 @@
-"""Results that are pytrees and still read well at the end of a notebook's cell."""
+"""Results that are pytrees with a readable representation."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import equinox as eqx
 
 
 class Readable(eqx.Module):
-    """A pytree that reads as one line; inside `jit`, or for a batch, as its leaves."""
+    """A pytree whose representation is one line; inside `jit`, or for a batch, its leaves."""
 
     @abc.abstractmethod
     def _line(self) -> str:
-        """One result in a line; any error of a shape or a type where there is none, or there are many."""
+        """Return the line; may raise an error of shape or type for traced values and batches."""
 
     def __str__(self) -> str:
         try:
             return self._line()
-        except (TypeError, ValueError, IndexError):  # traced values and batches have no number to show
+        except (TypeError, ValueError, IndexError):  # traced values and batches have no single number
             return eqx.Module.__repr__(self)
 
     __repr__ = __str__

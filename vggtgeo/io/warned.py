@@ -1,4 +1,4 @@
-"""Warnings about the input, kept for the record while they are shown as before."""
+"""Collect warnings about the input while they are shown as usual."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _lock = Lock()
 
 
 class _Showing:
-    """A way to show warnings that notes those about the input in `lists`, too."""
+    """Shows warnings, and adds those about the input to `lists`."""
 
     def __init__(self, as_before: Callable[..., Any]) -> None:
         self.as_before = as_before
@@ -29,10 +29,10 @@ class _Showing:
 
 @contextmanager
 def collected_warnings() -> Iterator[list[Warning | str]]:
-    """The warnings about the input, in order, gathered while they are shown as before.
+    """Yield a list of the warnings about the input, in order, while they are shown as usual.
 
-    Python has one way to show warnings for all threads: what two gather at the same time, runs in threads say, each of
-    them gets, as a run that misses a warning would be trusted too much.
+    Python has one function to show warnings for all threads: if several threads collect at the same time, each gets the
+    warnings of all, since a run that misses a warning would be trusted too much.
     """
     collected: list[Warning | str] = []
     with _lock:

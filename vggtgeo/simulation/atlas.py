@@ -82,7 +82,7 @@ def look_up(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def build_atlas(textures: list[np.ndarray], wraps: list[bool]) -> Atlas:
-    """An atlas of square `textures` (sides: powers of two, at least 128), the large ones first, row by row.
+    """Return an atlas of square `textures` (sides: powers of two, at least 128), the large ones first, row by row.
 
     Raises InputError if they do not fit into one image.
     """
@@ -112,7 +112,7 @@ def _block_shape(size: int) -> tuple[int, int]:
 
 
 def _draw_levels(block: np.ndarray, texture: np.ndarray, wrap: bool) -> np.ndarray:
-    """Draws the mip levels into the corner of `block`; returns (x, y) of each level's first texel, [L, 2]."""
+    """Draw the mip levels into the corner of `block`; returns (x, y) of each level's first texel, [L, 2]."""
     border = cv2.BORDER_WRAP if wrap else cv2.BORDER_REPLICATE
     corners = np.zeros((_LEVELS, 2))
     x, y = 0, 0

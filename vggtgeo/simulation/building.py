@@ -112,7 +112,7 @@ def _dress(b: SceneBuilder, start: Vector, end: Vector, base: float, number: int
 
 
 def _with_opening(b: SceneBuilder, start: Vector, end: Vector, height: float, look: Look, base: float) -> None:
-    """A wall along x with the way between stairs and corridor left open."""
+    """Add a wall along x with the way between stairs and corridor left open."""
     width, top = _OPENING
     way = 1.0 if end[0] > start[0] else -1.0
     near, far = (_DOOR - 0.5 * way * width, start[1]), (_DOOR + 0.5 * way * width, start[1])
@@ -122,7 +122,7 @@ def _with_opening(b: SceneBuilder, start: Vector, end: Vector, height: float, lo
 
 
 def _stairs(b: SceneBuilder, floor: int) -> None:
-    """One storey of the well: walls, landing, both flights up to the next floor."""
+    """Add one storey of the well: walls, landing, both flights up to the next floor."""
     base, half = floor * STOREY, (floor + 0.5) * STOREY
     stone = Look("terrazzo", 1.3, tint=(0.9, 0.88, 0.85))
     corners = [(0.0, 0.0), (0.0, LENGTH), (WIDTH, LENGTH), (WIDTH, 0.0)]

@@ -29,7 +29,7 @@ ROUNDS = 2
 def motion_field(
     depth: np.ndarray, velocity: np.ndarray, intrinsics: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How pixels and their depth change with time.
+    """Return how pixels and their depth change with time.
 
     depth: float [H, W], metres; pixels without depth take the median. velocity: float64 [6], of world -> camera,
     translation first, metres and radians a second (`camera_velocities`). intrinsics: fx, fy, cx, cy, pixels.
@@ -48,7 +48,7 @@ def motion_field(
 
 
 def exposed(recording: Recording, readout: float = 0.0, exposure: float = 0.0) -> Recording:
-    """Images whose rows are read one after another, and whose shutter is open for a while.
+    """Return images whose rows are read one after another, and whose shutter is open for a while.
 
     readout: seconds from the first row to the last; timestamps name the middle one. exposure: seconds the shutter is
     open. Depth stays that of the frame's instant: depth cameras have a shutter of their own.
@@ -68,7 +68,7 @@ def exposed(recording: Recording, readout: float = 0.0, exposure: float = 0.0) -
 
 
 def late_depth(recording: Recording, seconds: float) -> Recording:
-    """Depth that was taken so many seconds before its image; negative: after.
+    """Return depth that was taken so many seconds before its image; negative: after.
 
     Raises InputError where frames have no depth.
     """
@@ -90,7 +90,7 @@ def late_truth(recording: Recording, seconds: float) -> Recording:
 
 
 def vignetted(recording: Recording, share: float) -> Recording:
-    """Corners that are darker by `share`, growing with the square of the distance from the middle."""
+    """Return corners that are darker by `share`, growing with the square of the distance from the middle."""
     height, width = recording.frames[0].image.shape[:2]
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     factor = (1 - share * (x**2 + y**2) / 2)[..., None]
@@ -98,7 +98,7 @@ def vignetted(recording: Recording, share: float) -> Recording:
 
 
 def auto_exposed(recording: Recording, strength: float, frames: float) -> Recording:
-    """Images of a camera that adapts its exposure to what it sees.
+    """Return images of a camera that adapts its exposure to what it sees.
 
     strength: share of the difference to the mean brightness of the recording that is taken away, 0 to 1.
     frames: frames that the control lags behind.
@@ -132,7 +132,9 @@ def _each(recording: Recording, change: Callable[[Frame, np.ndarray], Frame]) ->
 
 
 def _source(field: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where in the frame is what each pixel shows so many seconds later, float [H, 1]: p + seconds field(p) = pixel."""
+    """Return where in the frame is what each pixel shows so many seconds later, float [H, 1]: p + seconds field(p) =
+    pixel.
+    """
     rows, columns = np.mgrid[: field.shape[0], : field.shape[1]].astype(np.float32)
     late, at = seconds.astype(np.float32), field
     for _ in range(ROUNDS):

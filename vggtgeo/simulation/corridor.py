@@ -86,7 +86,7 @@ def _plain_wall(b: SceneBuilder, start: Vector, end: Vector, doors: bool = True)
 
 
 def _meeting_room(b: SceneBuilder, start: float) -> None:
-    """A dim room of 3 x 3 m south of the corridor behind one pane of glass in a frame."""
+    """Add a dim room of 3 x 3 m south of the corridor behind one pane of glass in a frame."""
     low, high = (start, -3.0), (start + _PANE, 0.0)
     floor_and_ceiling(b, low, high, _HEIGHT, Look("carpet", 1.3), WHITE)
     wall(b, low, (start, 0.0), _HEIGHT, WHITE)
@@ -102,7 +102,7 @@ def _meeting_room(b: SceneBuilder, start: float) -> None:
 
 
 def _landmarks(b: SceneBuilder) -> None:
-    """The few things that differ from place to place: extinguishers, boards, a bin, the ends."""
+    """Add the few things that differ from place to place: extinguishers, boards, a bin, the ends."""
     for x, y in ((6.1, 0.12), (18.6, _WIDTH - 0.12), (31.5, 0.12)):
         b.cylinder((x, y, 0.35), 0.08, 0.48, Look("fabric", 0.4, tint=(0.75, 0.05, 0.04)))
     north = ((0.0, _WIDTH), (_LONG - _WIDTH, _WIDTH))

@@ -26,7 +26,7 @@ def _upright(image: np.ndarray) -> np.ndarray:
 
 
 def poster(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A printed poster: a picture of overlapping shapes, a title, and small print."""
+    """Return a printed poster: a picture of overlapping shapes, a title, and small print."""
     image = _canvas(rng, size, random_colour(rng, 90, 250), random_colour(rng, 90, 250))
     for _ in range(34):
         x, y = (int(v) for v in rng.integers(0, size, 2))
@@ -52,7 +52,7 @@ def poster(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def painting(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A landscape in brush strokes, in a frame."""
+    """Return a landscape in brush strokes, in a frame."""
     y = np.linspace(0, 1, size, dtype=np.float32)[:, None]
     sky = blend(random_colour(rng, 120, 240), random_colour(rng, 150, 250), y + 0.15 * fractal(rng, size, 1.6))
     image = quantise(sky)
@@ -72,7 +72,7 @@ def painting(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def screen(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A monitor with windows of text."""
+    """Return a monitor with windows of text."""
     image = _canvas(rng, size, (26, 44, 74), (52, 84, 126))
     for _ in range(3):
         x0, y0 = (int(v) for v in rng.uniform(0.03, 0.40, 2) * size)
@@ -85,7 +85,7 @@ def screen(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def door(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A panelled door with a plate; the handle is on the right."""
+    """Return a panelled door with a plate; the handle is on the right."""
     image = _canvas(rng, size, (136, 104, 70), (168, 132, 92))
     grain = fractal(rng, size, 1.0, stretch=0.07)
     image = quantise(image * (1 + 0.05 * grain[..., None]))
@@ -106,7 +106,7 @@ def door(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def books(rng: np.random.Generator, size: int) -> np.ndarray:
-    """One shelf seen from the front: spines of random width, height and colour, with titles."""
+    """Return one shelf seen from the front: spines of random width, height and colour, with titles."""
     image = np.full((size, size, 3), 34, np.uint8)
     x = 2
     while x < size - 8:
@@ -127,7 +127,7 @@ def books(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def window(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A bright view outside: sky, facades, trees, and the bars of the window."""
+    """Return a bright view outside: sky, facades, trees, and the bars of the window."""
     y = np.linspace(0, 1, size, dtype=np.float32)[:, None]
     image = quantise(blend((150, 190, 236), (236, 242, 248), y + 0.25 * fractal(rng, size, 1.7, stretch=0.5)))
     x = 0
@@ -152,7 +152,7 @@ def window(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def board(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A cork board with pinned papers."""
+    """Return a cork board with pinned papers."""
     image = _canvas(rng, size, (150, 112, 68), (190, 150, 100))
     image = quantise(image * (1 + 0.14 * fractal(rng, size, 0.2)[..., None]))
     for _ in range(15):
@@ -169,7 +169,7 @@ def board(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def whiteboard(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A whiteboard with curves, boxes and writing in marker colours."""
+    """Return a whiteboard with curves, boxes and writing in marker colours."""
     image = quantise(244 + 1.5 * np.repeat(fractal(rng, size, 1.5)[..., None], 3, axis=2))
     inks = ((28, 52, 150), (170, 34, 40), (24, 24, 28), (26, 120, 62))
     for _ in range(9):
@@ -187,14 +187,14 @@ def whiteboard(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def lamp(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A ceiling light: bright panel in a rim."""
+    """Return a ceiling light: bright panel in a rim."""
     image = quantise(np.full((size, size, 3), 250.0) + fractal(rng, size, 1.0)[..., None])
     cv2.rectangle(image, (0, 0), (size - 1, size - 1), (196, 196, 198), max(3, size // 24))
     return image
 
 
 def sign(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A small sign with a number."""
+    """Return a small sign with a number."""
     image = _canvas(rng, size, (30, 60, 110), (40, 72, 126))
     text = str(int(rng.integers(100, 999)))
     cv2.putText(

@@ -27,7 +27,7 @@ Degradation = Callable[[Recording, np.random.Generator], Recording]
 
 
 def as_it_is(recording: Recording, rng: np.random.Generator) -> Recording:
-    """The recording undisturbed."""
+    """Return the recording undisturbed."""
     del rng
     return recording
 
@@ -57,7 +57,7 @@ def bars(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def text(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A time code, the name of the camera and an address, white, in three lines."""
+    """Return a time code, the name of the camera and an address, white, in three lines."""
     del rng
     height, width = recording.frames[0].image.shape[:2]
     size = width / 770
@@ -74,7 +74,7 @@ def text(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def board(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A coloured board that the camera carries before the lower 30 % of the picture, 0.45 m away, also in depth."""
+    """Add a coloured board, fixed to the camera 0.45 m ahead, in the lower 30 % of image and depth."""
     height, width = recording.frames[0].image.shape[:2]
     pattern = rng.integers(0, 255, (height // 8, width // 8, 3)).astype(np.uint8)
     pattern = cv2.resize(pattern, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -85,7 +85,7 @@ def board(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def person(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A patterned figure 1.2 m away walks through the picture, to and fro; depth sees it, too."""
+    """Return a patterned figure 1.2 m away walks through the picture, to and fro; depth sees it, too."""
     height, width = recording.frames[0].image.shape[:2]
     pattern = cv2.resize(rng.integers(0, 255, (30, 16, 3)).astype(np.uint8), (width // 4, height))
 
@@ -107,40 +107,40 @@ def person(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def dark(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A twelfth of the light, with the noise of a camera in it."""
+    """Return a twelfth of the light, with the noise of a camera in it."""
     change = lambda image, row: np.clip(image / 12.0 + rng.normal(0, 2.0, image.shape), 0, 255).astype(np.uint8)
     return with_images(recording, change)
 
 
 def centimetres(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Depth read in a unit ten times too small."""
+    """Return depth read in a unit ten times too small."""
     del rng
     return with_depths(recording, lambda depth, row: 0.1 * depth)
 
 
 def growing_depth(recording: Recording, rng: np.random.Generator, share: float = 0.4) -> Recording:
-    """A depth camera that warms up: its scale grows by 40 % over the recording, or another share."""
+    """Return a depth camera that warms up: its scale grows by 40 % over the recording, or another share."""
     del rng
     count = len(recording.frames)
     return with_depths(recording, lambda depth, row: depth * (1 + share * row / count))
 
 
 def jumping_depth(recording: Recording, rng: np.random.Generator, factor: float = 1.2) -> Recording:
-    """A depth camera that starts again in another mode: from the middle on its depth is `factor` times as long."""
+    """Scale the depth by `factor` from the middle on, as a depth camera that restarts in another mode."""
     del rng
     middle = len(recording.frames) // 2
     return with_depths(recording, lambda depth, row: depth * (factor if row >= middle else 1.0))
 
 
 def other_depth(recording: Recording, rng: np.random.Generator) -> Recording:
-    """The depth images in reverse order."""
+    """Return the depth images in reverse order."""
     del rng
     frames = recording.frames
     return replace(recording, frames=[replace(a, depth=b.depth) for a, b in zip(frames, frames[::-1], strict=True)])
 
 
 def shuffled(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Frames out of order (sorted by file name, say): 1, 10, 11, ..., 2, 20, ..."""
+    """Return frames out of order (sorted by file name, say): 1, 10, 11, ..., 2, 20, ..."""
     del rng
     frames, poses, times = recording.frames, recording.truth.poses, recording.truth.timestamps
     order = sorted(range(len(frames)), key=str)
@@ -149,7 +149,7 @@ def shuffled(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def barrel(recording: Recording, rng: np.random.Generator, k1: float = -0.3) -> Recording:
-    """A wide lens, k1 = -0.3 or another value, that the calibration does not state."""
+    """Return a wide lens, k1 = -0.3 or another value, that the calibration does not state."""
     del rng
     camera = recording.camera
     y, x = np.mgrid[: camera.height, : camera.width].astype(np.float64)
@@ -162,21 +162,23 @@ def barrel(recording: Recording, rng: np.random.Generator, k1: float = -0.3) -> 
 
 
 def zooming(recording: Recording, rng: np.random.Generator, share: float = 0.3) -> Recording:
-    """A lens that zooms while it films: the picture grows steadily, by 1.3 in the end, or 1 + share."""
+    """Return a lens that zooms while it films: the picture grows steadily, by 1.3 in the end, or 1 + share."""
     del rng
     last = max(len(recording.frames) - 1, 1)
     return _through_lens(recording, lambda row: 1.0 + share * row / last)
 
 
 def changed_lens(recording: Recording, rng: np.random.Generator, factor: float = 1.7) -> Recording:
-    """A phone that changes its lens in the middle, for one of `factor` times the focal length."""
+    """Return a phone that changes its lens in the middle, for one of `factor` times the focal length."""
     del rng
     middle = len(recording.frames) // 2
     return _through_lens(recording, lambda row: factor if row >= middle else 1.0)
 
 
 def rolling_shutter(recording: Recording, rng: np.random.Generator, seconds: float = 0.02) -> Recording:
-    """The rows of each picture read one by one, over 20 ms, as by the camera of a phone; drawn by depth and truth."""
+    """Return the rows of each picture read one by one, over 20 ms, as by the camera of a phone; drawn by depth and
+    truth.
+    """
     del rng
     frames, camera = recording.frames, recording.camera
     moving = camera_velocities(np.array([frame.timestamp for frame in frames]), recording.truth)
@@ -190,7 +192,9 @@ def wrong_focal(
     factor: float = 1.15,
     aside: tuple[float, float] = (0.0, 0.0),
 ) -> Recording:
-    """The calibration of a lens with 15 % more focal length, or `factor` times; its centre is `aside`, in pixels."""
+    """Return the calibration of a lens with 15 % more focal length, or `factor` times; its centre is `aside`, in
+    pixels.
+    """
     del rng
     fx, fy, cx, cy = recording.camera.intrinsics
     given = (factor * fx, factor * fy, cx + aside[0], cy + aside[1])
@@ -198,7 +202,7 @@ def wrong_focal(
 
 
 def covered(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A hand on the lens for a second in the middle."""
+    """Return a hand on the lens for a second in the middle."""
     middle = len(recording.frames) // 2
     noise = lambda image: rng.normal(12, 2.0, image.shape).clip(0, 255).astype(np.uint8)
     inside = lambda row: middle <= row < middle + 10
@@ -207,7 +211,7 @@ def covered(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def without_depth(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Colour alone."""
+    """Return colour alone."""
     del rng
     return replace(recording, frames=[replace(frame, depth=None) for frame in recording.frames])
 
@@ -222,7 +226,7 @@ DEGRADATIONS: dict[str, Degradation] = {
 
 
 def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recording:
-    """Images and depth of a lens of so many times the focal length."""
+    """Return images and depth of a lens of so many times the focal length."""
     cx, cy = recording.camera.intrinsics[2:]
     nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
 
@@ -238,27 +242,27 @@ def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recor
 
 
 def with_images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
-    """The recording with each image, uint8 [H, W, 3], changed, given its row too."""
+    """Return the recording with each image, uint8 [H, W, 3], changed, given its row too."""
     frames = [replace(frame, image=change(frame.image, row)) for row, frame in enumerate(recording.frames)]
     return replace(recording, frames=frames)
 
 
 def in_bands_of_light(image: np.ndarray, row: int, share: float, period: float, speed: float) -> np.ndarray:
-    """The image, uint8 [H, W, 3], under lamps that flicker while its rows are read one after another: `share` more and
-    less light in bands of `period` rows, which wander by `speed` rows from image to image; row: of this one.
+    """Return the image, uint8 [H, W, 3], under lamps that flicker while its rows are read one after another: `share`
+    more and less light in bands of `period` rows, which wander by `speed` rows from image to image; row: of this one.
     """
     phase = 2 * np.pi * (np.arange(len(image))[:, None, None] + speed * row) / period
     return np.clip(image * (1 + share * np.sin(phase)), 0, 255).astype(np.uint8)
 
 
 def compressed(image: np.ndarray, quality: int) -> np.ndarray:
-    """The image, uint8 [H, W, 3], RGB, as JPEG once more, with this quality."""
+    """Return the image, uint8 [H, W, 3], RGB, as JPEG once more, with this quality."""
     _, code = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.ascontiguousarray(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])
 
 
 def with_depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
-    """The recording with each depth image, float32 [H, W], changed, given its row too."""
+    """Return the recording with each depth image, float32 [H, W], changed, given its row too."""
     frames = [
         frame if frame.depth is None else replace(frame, depth=change(frame.depth, row).astype(np.float32))
         for row, frame in enumerate(recording.frames)

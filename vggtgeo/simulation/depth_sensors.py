@@ -75,7 +75,7 @@ STEREO = DisparitySensor(focal_baseline=30.0, noise=0.08, grain=7.0, step=0.0312
 
 
 def _hidden(disparity: np.ndarray) -> np.ndarray:
-    """Pixels that the second view does not see: one to their right is nearer, and covers their place in it."""
+    """Return pixels that the second view does not see: one to their right is nearer, and covers their place in it."""
     place = np.arange(disparity.shape[1]) - disparity
     beyond = np.minimum.accumulate(place[:, ::-1], axis=1)[:, ::-1]
     hidden = np.zeros(disparity.shape, bool)

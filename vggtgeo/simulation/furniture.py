@@ -32,7 +32,7 @@ class Place:
 def wall(
     b: SceneBuilder, start: Vector, end: Vector, height: float, look: Look, base: float = 0.0, edges: bool = True
 ) -> None:
-    """A wall from `start` to `end` (x, y); it faces the right-hand side of that way."""
+    """Add a wall from `start` to `end` (x, y); it faces the right-hand side of that way."""
     (x0, y0), (x1, y1) = start, end
     b.rectangle((x0, y0, base), (x1 - x0, y1 - y0, 0), (0, 0, height), look, edges=edges)
 
@@ -48,7 +48,7 @@ def hang(
     depth: float = 0.025,
     frame: Look = DARK,
 ) -> None:
-    """A flat thing of `size` (width, height) on the wall start -> end, its middle `along` metres from `start`."""
+    """Add a flat thing of `size` (width, height) on the wall start -> end, its middle `along` metres from `start`."""
     way = np.subtract(end, start)
     yaw = float(np.arctan2(way[1], way[0]))
     place = Place(start, yaw)
@@ -63,7 +63,7 @@ def hang(
 
 
 def desk(b: SceneBuilder, at: Vector, yaw: float, variant: int = 0, width: float = 1.5) -> None:
-    """A desk with a monitor, keyboard, mug, papers and a pile of books."""
+    """Add a desk with a monitor, keyboard, mug, papers and a pile of books."""
     p, depth, rng = Place(at, yaw), 0.75, b.rng
     b.box(p(0, 0, 0.70), (width, depth, 0.04), WOOD, yaw)
     for x in (-0.46 * width, 0.46 * width):
@@ -98,7 +98,7 @@ def stack_of_books(b: SceneBuilder, at: Vector, yaw: float, count: int) -> None:
 
 
 def chair(b: SceneBuilder, at: Vector, yaw: float, tint: Colour = (0.10, 0.16, 0.34)) -> None:
-    """An office chair; the sitter looks along local -y."""
+    """Add an office chair; the sitter looks along local -y."""
     p, cloth = Place(at, yaw), Look("fabric", 0.5, tint=tint)
     b.cylinder(p(0, 0, 0), 0.27, 0.05, DARK)
     b.cylinder(p(0, 0, 0.05), 0.03, 0.38, METAL)
@@ -108,7 +108,7 @@ def chair(b: SceneBuilder, at: Vector, yaw: float, tint: Colour = (0.10, 0.16, 0
 
 
 def shelf(b: SceneBuilder, at: Vector, yaw: float, width: float = 1.2, height: float = 2.0, variant: int = 0) -> None:
-    """An open bookcase: boards, a back, and rows of books a few centimetres behind the front."""
+    """Add an open bookcase: boards, a back, and rows of books a few centimetres behind the front."""
     p, depth, board = Place(at, yaw), 0.32, 0.025
     b.box(p(0, 0.5 * depth - 0.01), (width, 0.02, height), WOOD, yaw)
     for x in (-0.5 * width, 0.5 * width):
@@ -137,7 +137,7 @@ def shelf(b: SceneBuilder, at: Vector, yaw: float, width: float = 1.2, height: f
 
 
 def sofa(b: SceneBuilder, at: Vector, yaw: float, tint: Colour = (0.20, 0.30, 0.26), width: float = 1.9) -> None:
-    """A sofa with two cushions."""
+    """Add a sofa with two cushions."""
     p, cloth = Place(at, yaw), Look("fabric", 0.7, tint=tint, detail=0.2)
     b.box(p(0, 0, 0.08), (width, 0.85, 0.30), cloth, yaw)
     b.box(p(0, 0.34, 0.38), (width, 0.18, 0.42), cloth, yaw)
@@ -150,7 +150,7 @@ def sofa(b: SceneBuilder, at: Vector, yaw: float, tint: Colour = (0.20, 0.30, 0.
 
 
 def table(b: SceneBuilder, at: Vector, yaw: float, size: Vector = (1.1, 0.6, 0.45)) -> None:
-    """A low table with books and a tin."""
+    """Add a low table with books and a tin."""
     p, (width, depth, height) = Place(at, yaw), size
     b.box(p(0, 0, height - 0.04), (width, depth, 0.04), WOOD.tinted(0.7, 0.6, 0.5), yaw)
     for x in (-0.44 * width, 0.44 * width):
@@ -161,7 +161,7 @@ def table(b: SceneBuilder, at: Vector, yaw: float, size: Vector = (1.1, 0.6, 0.4
 
 
 def cabinet(b: SceneBuilder, at: Vector, yaw: float, size: Vector = (0.9, 0.45, 1.1), front: str = "door:8") -> None:
-    """A closed cabinet with things on top; `front` is the texture of its doors."""
+    """Add a closed cabinet with things on top; `front` is the texture of its doors."""
     p = Place(at, yaw)
     b.box(p(0, 0), size, WOOD, yaw, front=Look(front, None))
     b.cylinder(p(-0.2, 0, size[2]), 0.07, 0.18, Look("rug:4", 0.25))
@@ -169,7 +169,7 @@ def cabinet(b: SceneBuilder, at: Vector, yaw: float, size: Vector = (0.9, 0.45, 
 
 
 def plant(b: SceneBuilder, at: Vector, height: float = 1.3) -> None:
-    """A pot with a stem and tiers of leaves."""
+    """Add a pot with a stem and tiers of leaves."""
     p = Place(at, 0.0)
     b.cylinder(p(0, 0), 0.17, 0.34, Look("brick", 1.0, tint=(1.0, 0.7, 0.6)))
     b.cylinder(p(0, 0, 0.34), 0.025, height - 0.5, WOOD.tinted(0.4, 0.3, 0.2))
@@ -190,7 +190,7 @@ def lamp_panel(
     power: float = 3.2,
     reach: float = 9.0,
 ) -> None:
-    """A ceiling light with its glowing panel, 4 cm below the ceiling at height `z`."""
+    """Add a ceiling light with its glowing panel, 4 cm below the ceiling at height `z`."""
     low = np.array([x - 0.5 * size[0], y + 0.5 * size[1], z - 0.04])
     b.rectangle(low, (size[0], 0, 0), (0, -size[1], 0), Look("lamp", None, detail=0.0, emission=1.6), edges=True)
     b.light((x, y, z - 0.08), size, power, reach)
@@ -199,7 +199,7 @@ def lamp_panel(
 def beam(
     b: SceneBuilder, start: Vector, end: Vector, size: tuple[float, float], look: Look, edges: bool = True
 ) -> None:
-    """A straight bar from `start` to `end` in any direction, of `size` (width, height); casts no shadow."""
+    """Add a straight bar from `start` to `end` in any direction, of `size` (width, height); casts no shadow."""
     low, way = np.asarray(start, float), np.subtract(end, start)
     side = np.cross(way, [0.0, 0.0, 1.0] if abs(way[2]) < 0.9 * np.linalg.norm(way) else [1.0, 0.0, 0.0])
     side *= 0.5 * size[0] / np.linalg.norm(side)
@@ -222,7 +222,7 @@ def railing(b: SceneBuilder, start: Vector, end: Vector, height: float, look: Lo
 
 
 def bench(b: SceneBuilder, at: Vector, yaw: float) -> None:
-    """A wooden bench on two blocks of concrete."""
+    """Add a wooden bench on two blocks of concrete."""
     p = Place(at, yaw)
     for x in (-0.6, 0.6):
         b.box(p(x, 0), (0.15, 0.42, 0.40), Look("concrete", 0.9), yaw)
@@ -231,7 +231,7 @@ def bench(b: SceneBuilder, at: Vector, yaw: float) -> None:
 
 
 def kiosk(b: SceneBuilder, at: Vector, yaw: float, variant: int) -> None:
-    """An advertising column of 0.9 x 0.9 x 2.2 m with four posters."""
+    """Add an advertising column of 0.9 x 0.9 x 2.2 m with four posters."""
     p = Place(at, yaw)
     b.box(p(0, 0), (0.9, 0.9, 2.2), METAL, yaw)
     for side in range(4):

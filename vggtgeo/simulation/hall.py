@@ -100,7 +100,7 @@ def _dress(b: SceneBuilder, start: Vector, end: Vector, length: float, side: int
 
 
 def _gallery(b: SceneBuilder) -> None:
-    """A slab at 3.6 m along the north side with its railing."""
+    """Add a slab at 3.6 m along the north side with its railing."""
     sx, sy = _SIZE
     b.box((0.5 * sx, sy - 2.0, 3.5), (sx, 4.0, 0.35), _CONCRETE, top=Look("terrazzo", 2.4))
     railing(b, (0.1, sy - 3.9, 3.85), (sx - 0.1, sy - 3.9, 3.85), 1.1, METAL, 1.5)

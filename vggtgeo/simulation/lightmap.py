@@ -43,7 +43,7 @@ class Lightmap:
 def bake(
     surfaces: Surfaces, blockers: Blockers, lights: list[tuple], ambient: float, texel: float, seed: int
 ) -> Lightmap:
-    """The lightmap of a scene with about one sample each `texel` metres."""
+    """Return the lightmap of a scene with about one sample each `texel` metres."""
     rng = np.random.default_rng([seed, 11])
     counts = np.clip(np.ceil(surfaces.extent / texel).astype(int) + 1, 2, _WIDTH)
     corner, height = _pack(counts)
@@ -138,7 +138,7 @@ def _direct(
 
 
 def _shadowed(points: np.ndarray, rays: np.ndarray, blockers: Blockers, starts: np.ndarray) -> np.ndarray:
-    """Whether the segments points [n, 3] -> points + rays [n, S, 3] meet a box: bool [n, S].
+    """Return whether the segments points [n, 3] -> points + rays [n, S, 3] meet a box: bool [n, S].
 
     `starts` groups points that lie together, so that far boxes are left out at once.
     """

@@ -39,7 +39,7 @@ def simulate_loop(
     drift: float = 0.03,
     seed: int = 0,
 ) -> tuple[SimulatedWindow, SurfaceAlignment]:
-    """A loop of `keyframes` cameras, and the alignment of the surfaces that neighbours see.
+    """Return a loop of `keyframes` cameras, and the alignment of the surfaces that neighbours see.
 
     Args:
         keyframes: more than `2 reach`.
@@ -97,7 +97,7 @@ def simulate_loop(
 
 
 def _circle(keyframes: int) -> Float[np.ndarray, "n 7"]:
-    """World -> camera poses on a circle in the plane of x and z, y down; the first is the world."""
+    """Return world -> camera poses on a circle in the plane of x and z, y down; the first is the world."""
     angle = 2 * np.pi * np.arange(keyframes) / keyframes
     radius = _SPACING * keyframes / (2 * np.pi)
     outward = Rotation.from_rotvec(np.stack([np.zeros(keyframes), angle, np.zeros(keyframes)], 1))
@@ -108,7 +108,7 @@ def _circle(keyframes: int) -> Float[np.ndarray, "n 7"]:
 def _drifted(
     poses: Float[np.ndarray, "n 7"], drift: float, error: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 7"]:
-    """The motions from keyframe to keyframe, each turned by a share of the drift, put together again."""
+    """Return the motions from keyframe to keyframe, each turned by a share of the drift, put together again."""
     turns, shifts = Rotation.from_quat(poses[:, :4], scalar_first=True), poses[:, 4:]
     steps = turns[1:] * turns[:-1].inv()
     moves = shifts[1:] - steps.apply(shifts[:-1])

@@ -10,7 +10,7 @@ import scipy.fft
 def fractal(
     rng: np.random.Generator, size: int, slope: float = 1.0, stretch: float = 1.0, lowest: float = 1.0
 ) -> np.ndarray:
-    """A periodic Gaussian field with amplitude spectrum |k|^-slope: detail at every scale.
+    """Return a periodic Gaussian field with amplitude spectrum |k|^-slope: detail at every scale.
 
     Returns float32 [size, size], mean 0, standard deviation 1. `stretch` > 1 lengthens the grain along x; waves with
     fewer than `lowest` periods in the tile are removed.
@@ -32,13 +32,13 @@ def fractal(
 
 
 def blend(low: tuple[float, ...], high: tuple[float, ...], amount: np.ndarray) -> np.ndarray:
-    """Colours between `low` and `high`; `amount` [...] is clipped to [0, 1]. Returns float32 [..., 3]."""
+    """Return colours between `low` and `high`; `amount` [...] is clipped to [0, 1]. Returns float32 [..., 3]."""
     share = np.clip(amount, 0.0, 1.0)[..., None].astype(np.float32)
     return np.asarray(low, np.float32) * (1.0 - share) + np.asarray(high, np.float32) * share
 
 
 def quantise(colour: np.ndarray) -> np.ndarray:
-    """Colours in [0, 255] as uint8 [..., 3]."""
+    """Return colours in [0, 255] as uint8 [..., 3]."""
     return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
 
 
@@ -49,7 +49,7 @@ def random_colour(rng: np.random.Generator, low: int = 20, high: int = 235) -> t
 
 
 def tile_cells(size: int, rows: int, columns: int, offset: float) -> tuple[np.ndarray, ...]:
-    """A running bond: `rows` courses of `columns` cells, each odd course shifted by `offset` of a cell.
+    """Return a running bond: `rows` courses of `columns` cells, each odd course shifted by `offset` of a cell.
 
     Returns (cell index, distance to the nearest joint along x, the same along y) with distances in pixels,
     each [size, size]; the pattern is periodic if `rows` is even.
@@ -65,7 +65,7 @@ def tile_cells(size: int, rows: int, columns: int, offset: float) -> tuple[np.nd
 
 
 def scribble(image: np.ndarray, rng: np.random.Generator, box: tuple[int, int, int, int], colour: tuple) -> None:
-    """Draws word-like dashes into `box` = (x0, y0, x1, y1), in lines, as small print is seen from afar."""
+    """Draw word-like dashes into `box` = (x0, y0, x1, y1), in lines, as small print is seen from afar."""
     x0, y0, x1, y1 = box
     height = max(3, int((y1 - y0) / 14))
     for y in range(y0 + height, y1 - height // 2, int(1.8 * height)):

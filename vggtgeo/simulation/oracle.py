@@ -76,7 +76,7 @@ class SimulatedOracle:
         return len(self.sequence)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """The sequence's frames; each is known to `index_of` from then on."""
+        """Return the sequence's frames; each is known to `index_of` from then on."""
         check_selection(self.name, len(self), start, end, stride)
         for index in range(start, min(len(self), end or len(self)), stride):
             frame = self.sequence.frame(index, self._known(index).picture)
@@ -87,7 +87,7 @@ class SimulatedOracle:
         return self.sequence.ground_truth()
 
     def index_of(self, image: np.ndarray) -> int:
-        """The frame whose image this is; InputError for an image that `frames` has not given."""
+        """Return the frame whose image this is; InputError for an image that `frames` has not given."""
         index = self._given.get(_fingerprint(image))
         if index is None:
             raise InputError(
@@ -111,7 +111,7 @@ class SimulatedOracle:
         return self._known(index).picture.depth
 
     def glass(self, index: int) -> np.ndarray:
-        """Pixels seen through glass, bool [H, W]."""
+        """Return pixels seen through glass, bool [H, W]."""
         return self._known(index).picture.glass
 
     def texture(self, index: int) -> np.ndarray:
@@ -126,7 +126,9 @@ class SimulatedOracle:
         return known.edges[0]
 
     def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where `pixels` [n, 2] of frame i are in frame j, float64 [n, 2], and whether they are seen there, bool."""
+        """Return where `pixels` [n, 2] of frame i are in frame j, float64 [n, 2], and whether they are seen there,
+        bool.
+        """
         known = self._known(index_i)
         points, there = locate(known.view, self.pose(index_i), self.camera, known.picture, pixels)
         target, depth = project(points, self.pose(index_j), self.camera)

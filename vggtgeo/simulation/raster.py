@@ -44,7 +44,7 @@ class View:
 
 
 def view_from(surfaces: Surfaces, pose: np.ndarray, two_sided: bool = False) -> View:
-    """The view of `surfaces` from `pose` (world -> camera [4, 4]; a mirrored pose is allowed)."""
+    """Return the view of `surfaces` from `pose` (world -> camera [4, 4]; a mirrored pose is allowed)."""
     turn, shift = pose[:3, :3], pose[:3, 3]
     origin = surfaces.origin @ turn.T + shift
     axis1, axis2, normal = (v @ turn.T for v in (surfaces.axis1, surfaces.axis2, surfaces.normal))
@@ -62,7 +62,7 @@ def view_from(surfaces: Surfaces, pose: np.ndarray, two_sided: bool = False) -> 
 def rasterise(
     view: View, xs: np.ndarray, ys: np.ndarray, limit: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest surface along every ray of the grid.
+    """Return the nearest surface along every ray of the grid.
 
     xs: float [W], ys: float [H], increasing normalised coordinates. limit: float32 [H, W], largest inverse depth
     that counts (to see only what is behind a mirror).
@@ -107,7 +107,7 @@ def surface_coordinates(
 
 
 def inverse_depth_at(view: View, which: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Inverse depth float64 [n] of surface `which` [n] along rays (x, y) [n], in full precision."""
+    """Return inverse depth float64 [n] of surface `which` [n] along rays (x, y) [n], in full precision."""
     w = _affine(view.inverse_depth, which, x, y)
     bent = np.nonzero(view.surfaces.kind[which] == CYLINDER)[0]
     for surface in np.unique(which[bent]):
@@ -147,7 +147,7 @@ def _cast_flat(view: View, surface: int, x: np.ndarray, y: np.ndarray) -> tuple[
 def _cylinder_inverse(
     view: View, surface: int, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Inverse depth, whether the ray meets the wall's circle, and height z-rate of the hit."""
+    """Return inverse depth, whether the ray meets the wall's circle, and height z-rate of the hit."""
     axes = np.stack([view.axis1[surface], view.axis2[surface], view.normal[surface]])
     start = -axes @ view.origin[surface]
     axes, start = axes.astype(x.dtype), start.astype(x.dtype)

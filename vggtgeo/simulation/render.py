@@ -54,7 +54,7 @@ class _Grid:
 def render(
     scene: Scene, pose: np.ndarray, intrinsics: tuple[float, float, float, float], size: tuple[int, int]
 ) -> Picture:
-    """The scene from `pose` (world -> camera [4, 4]) with a pinhole `intrinsics` (pixels) and `size` = (W, H)."""
+    """Render the scene from `pose` (world -> camera [4, 4]) with `intrinsics` (pixels) and `size` (W, H)."""
     grid = _Grid.of(intrinsics, size, 1)
     view = view_from(scene.surfaces, pose)
     nearest, which = rasterise(view, grid.xs, grid.ys)
@@ -89,7 +89,7 @@ def _soften_edges(scene: Scene, view: View, light: np.ndarray, which: np.ndarray
 
 
 def _add_glass(scene: Scene, pose: np.ndarray, light: np.ndarray, nearest: np.ndarray, grid: _Grid) -> np.ndarray:
-    """Adds the mirror image of every visible pane to `light`; returns the pixels behind glass, bool [H, W]."""
+    """Add the mirror image of every visible pane to `light`; returns the pixels behind glass, bool [H, W]."""
     view = view_from(scene.panes, pose, two_sided=True)
     front, pane = rasterise(view, grid.xs, grid.ys)
     glass = (pane != EMPTY) & (front > nearest)

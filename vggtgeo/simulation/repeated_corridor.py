@@ -28,7 +28,7 @@ _RATE, _SPEED = 6.0, 0.4
 def repeated_corridor(
     seed: int = 0, sections: int = 6, *, returns: bool = False, size: tuple[int, int] = (320, 240)
 ) -> SyntheticSequence:
-    """A walk of RGB-D frames along the corridor, looking at its left wall.
+    """Return a walk of RGB-D frames along the corridor, looking at its left wall.
 
     Args:
         seed: of the posters, the walk and the noise.
@@ -52,7 +52,7 @@ def repeated_corridor(
 
 
 def _walk(sections: int) -> tuple[Walk, float]:
-    """The closed walk, and metres along it to the end of the corridor."""
+    """Return the closed walk, and metres along it to the end of the corridor."""
     first, last, middle = 0.8, sections * SECTION - 0.8, 0.5 * _WIDTH
     right, left = middle - 0.3, middle + 0.3
     stations = np.linspace(first, last, 2 * sections)
@@ -81,7 +81,7 @@ def _build(seed: int, sections: int) -> Scene:
 
 
 def _section(b: SceneBuilder, start: Vector, end: Vector, side: str) -> None:
-    """One section of a long wall, with its posters, the same in all sections."""
+    """Add one section of a long wall, with its posters, the same in all sections."""
     wall(b, start, end, _HEIGHT, Look("plaster", None, detail=0.0), edges=False)
     for number, along in enumerate(_POSTERS):
         variant = number + (10 if side == "b" else 0)

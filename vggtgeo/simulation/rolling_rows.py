@@ -19,8 +19,8 @@ ROUNDS = 4
 
 
 def camera_velocities(times: np.ndarray, truth: Trajectory) -> np.ndarray:
-    """Motion of the camera at each time, float64 [n, 6], the tangent of world -> camera, metres and radians a second:
-    that between the true poses before and after, at most three usual intervals away; zero beyond.
+    """Return motion of the camera at each time, float64 [n, 6], the tangent of world -> camera, metres and radians a
+    second: that between the true poses before and after, at most three usual intervals away; zero beyond.
     """
     known = truth.timestamps
     after = np.clip(np.searchsorted(known, times, side="right"), 1, len(known) - 1)
@@ -32,8 +32,8 @@ def camera_velocities(times: np.ndarray, truth: Trajectory) -> np.ndarray:
 
 
 def rolled(frame: Frame, velocity: np.ndarray, intrinsics: tuple[float, ...], seconds: float) -> Frame:
-    """The frame as a camera draws it that reads its rows one by one, over so many seconds, its time that of the middle
-    one. velocity: of the camera, float64 [6]. Depth goes with the picture; its holes are bridged to draw that.
+    """Return the frame as a camera draws it that reads its rows one by one, over so many seconds, its time that of the
+    middle one. velocity: of the camera, float64 [6]. Depth goes with the picture; its holes are bridged to draw that.
     """
     if frame.depth is None:
         raise InputError(f"frame {frame.index} has no depth; a rolling shutter is drawn by it: take frames with depth")

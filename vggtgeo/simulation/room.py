@@ -63,7 +63,7 @@ def floor_and_ceiling(b: SceneBuilder, low: Vector, high: Vector, height: float,
 
 
 def build_room(seed: int) -> Scene:
-    """A living room of 6 x 5 x 3 m with a desk corner."""
+    """Return a living room of 6 x 5 x 3 m with a desk corner."""
     b = SceneBuilder(seed)
     sx, sy, height = 6.0, 5.0, 3.0
     floor_and_ceiling(b, (0, 0), (sx, sy), height, Look("parquet", 1.9), Look("plaster", 2.9, detail=0.06))

@@ -55,7 +55,7 @@ class Scene:
 def finish(
     builder: SceneBuilder, name: str, ambient: float = 0.35, exposure: float = 1.0, texel: float = 0.10
 ) -> Scene:
-    """The scene a builder has collected: bakes its light and paints its textures."""
+    """Return the scene a builder has collected: bakes its light and paints its textures."""
     surfaces = stack_surfaces(builder.rows)
     blockers = stack_blockers(builder.boxes)
     return Scene(

@@ -50,13 +50,13 @@ class SyntheticSequence:
         return self.count
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """Renders the frames at start, start + stride, ... below end; InputError if that selects none."""
+        """Render the frames at start, start + stride, ... below end; InputError if that selects none."""
         check_selection(self.name, self.count, start, end, stride)
         for index in range(start, min(self.count, end or self.count), stride):
             yield self.frame(index)
 
     def ground_truth(self) -> Trajectory:
-        """The exact poses, camera -> world."""
+        """Return the exact poses, camera -> world."""
         times = np.array([self.timestamp(k) for k in range(self.count)])
         return Trajectory(times, np.array([self.motion.camera_to_world(time) for time in times]))
 
@@ -69,7 +69,7 @@ class SyntheticSequence:
         return self._pose_at(self.timestamp(index))
 
     def frame(self, index: int, picture: Picture | None = None) -> Frame:
-        """One frame as the sensor sees it. picture: what `picture(index)` gives, where it is at hand."""
+        """Return one frame as the sensor sees it. picture: what `picture(index)` gives, where it is at hand."""
         rng = np.random.default_rng([self.seed, 19, index])
         picture = self.picture(index) if picture is None else picture
         light = self._exposed(index, picture) * np.float32(self.sensor.gain(self.timestamp(index)))
@@ -93,7 +93,7 @@ class SyntheticSequence:
         return render(self.scene, pose, (fx, fy, cx, cy - top), (self.camera.width, bottom - top))
 
     def _exposed(self, index: int, picture: Picture) -> np.ndarray:
-        """Light [H, W, 3] gathered over the open shutter, row by row where the exposure rolls."""
+        """Return light [H, W, 3] gathered over the open shutter, row by row where the exposure rolls."""
         sensor, middle, height = self.sensor, self.timestamp(index), self.camera.height
         if not sensor.exposure_time and not sensor.readout_time:
             return picture.light
@@ -119,7 +119,7 @@ def simulate(
     speed: float | None = None,
     sensor: Sensor | None = None,
 ) -> SyntheticSequence:
-    """A hand-held walk of `frames` frames through the built-in `scene`.
+    """Return a hand-held walk of `frames` frames through the built-in `scene`.
 
     scene: a key of `WORLDS`. size: (width, height), pixels. rate: frames a second. speed: metres a second, None for
     the scene's own. sensor: error model, None for `Sensor()`. The horizontal field of view is 62 degrees.
@@ -179,7 +179,7 @@ def check_within_frame(sensor: Sensor, rate: float) -> None:
 
 
 def camera_of(size: tuple[int, int]) -> Camera:
-    """The simulated camera for images of `size` = (width, height): ideal, 62 degrees wide."""
+    """Return the simulated camera for images of `size` = (width, height): ideal, 62 degrees wide."""
     width, height = size
     focal = 0.832 * width
     return Camera((focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), width, height)

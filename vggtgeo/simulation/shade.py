@@ -70,7 +70,7 @@ def _structure(scene: Scene, which: np.ndarray, s: np.ndarray, t: np.ndarray, pi
 
 
 def _footprint(view: View, which: np.ndarray, x: np.ndarray, y: np.ndarray, w: np.ndarray, focal: float) -> np.ndarray:
-    """Width in metres of a pixel on its surface: the geometric mean of across and along the slant."""
+    """Return width in metres of a pixel on its surface: the geometric mean of across and along the slant."""
     normal = view.normal.astype(np.float32)
     ray = np.sqrt(x * x + y * y + 1.0)
     slope = np.abs(normal[:, 0][which] * x + normal[:, 1][which] * y + normal[:, 2][which]) / ray

@@ -33,7 +33,7 @@ class Look:
     emission: float = 0.0
 
     def tinted(self, red: float, green: float, blue: float) -> Look:
-        """The same look in another tint."""
+        """Return the same look in another tint."""
         return replace(self, tint=(red, green, blue))
 
 
@@ -62,7 +62,7 @@ class Surfaces:
         return np.where(self.kind == CYLINDER, self.extent[:, 0] / (2 * np.pi), 0.5 * self.extent[:, 0])
 
     def points(self, which: np.ndarray, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World points and unit normals [n, 3] of surfaces `which` [n] at (s, t) [n]."""
+        """Return world points and unit normals [n, 3] of surfaces `which` [n] at (s, t) [n]."""
         origin, axis1, axis2 = self.origin[which], self.axis1[which], self.axis2[which]
         normal = self.normal[which]
         flat = origin + s[:, None] * axis1 + t[:, None] * axis2
@@ -99,7 +99,7 @@ class SceneBuilder:
         self.rng = np.random.default_rng([self.seed, 7])
 
     def rectangle(self, origin: Vector, along: Vector, up: Vector, look: Look, edges: bool = False) -> None:
-        """A rectangle from `origin` along the vectors `along` and `up` (metres); it faces `along x up`."""
+        """Add a rectangle from `origin` along the vectors `along` and `up` (metres); it faces `along x up`."""
         origin, along, up = (np.asarray(v, float) for v in (origin, along, up))
         self._add(RECTANGLE, origin, along, up, look)
         if edges:
@@ -107,17 +107,17 @@ class SceneBuilder:
             self.edges.extend(np.stack([loop[:-1], loop[1:]], axis=1))
 
     def disc(self, centre: Vector, radius: float, look: Look) -> None:
-        """A horizontal disc that faces up."""
+        """Add a horizontal disc that faces up."""
         corner = np.asarray(centre, float) - [radius, radius, 0]
         self._add(DISC, corner, np.array([2 * radius, 0, 0]), np.array([0, 2 * radius, 0]), look)
 
     def pane(self, origin: Vector, along: Vector, up: Vector) -> None:
-        """A sheet of clear glass: it lets light through and mirrors what is in front of it."""
+        """Add a sheet of clear glass: it lets light through and mirrors what is in front of it."""
         origin, along, up = (np.asarray(v, float) for v in (origin, along, up))
         self.panes.append(_rectangle_row(RECTANGLE, origin, along, up))
 
     def light(self, centre: Vector, size: tuple[float, float], power: float, reach: float = 9.0) -> None:
-        """A horizontal lamp of `size` metres that shines down; nothing beyond `reach` metres is lit by it."""
+        """Add a horizontal lamp of `size` metres that shines down; nothing beyond `reach` metres is lit by it."""
         self.lights.append((np.asarray(centre, float), size, power, reach))
 
     def box(
@@ -131,7 +131,7 @@ class SceneBuilder:
         edges: bool = True,
         shadow: bool = True,
     ) -> None:
-        """A box standing on `centre` = (x, y, z of its base); `front` dresses its side towards local -y."""
+        """Add a box standing on `centre` = (x, y, z of its base); `front` dresses its side towards local -y."""
         base, (dx, dy, dz) = np.asarray(centre, float), size
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
         x, y, z = (turn[:, k] * size[k] for k in range(3))
@@ -149,7 +149,7 @@ class SceneBuilder:
             self.boxes.append((base + 0.5 * z, yaw, 0.5 * np.asarray(size, float)))
 
     def cylinder(self, base: Vector, radius: float, height: float, look: Look, top: Look | None = None) -> None:
-        """An upright closed cylinder standing on `base`."""
+        """Add an upright closed cylinder standing on `base`."""
         base = np.asarray(base, float)
         low, high = base - [radius, radius, 0], base + [radius, radius, height]
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
@@ -177,7 +177,7 @@ def _rectangle_row(kind: int, origin: np.ndarray, along: np.ndarray, up: np.ndar
 
 
 def stack_surfaces(rows: list[tuple]) -> Surfaces:
-    """Rows of a builder as arrays."""
+    """Return rows of a builder as arrays."""
     if not rows:
         none = np.zeros((0, 3))
         return Surfaces(np.zeros(0, np.int8), none, none, none, none, np.zeros((0, 2)), np.zeros((0, 8, 3)))

@@ -76,7 +76,7 @@ class SimulatedWindow:
         return centres_of(self.poses)
 
     def pack(self, **options: Any) -> tuple[Problem, State, SlotIndex]:
-        """The problem, the guess (depths at their prior), and where each landmark went; `options` are those of
+        """Return the problem, the guess (depths at their prior), and where each landmark went; `options` are those of
         `vggtgeo.pack`. The intrinsics are held unless an option says otherwise.
         """
         assert self.observations.depth_mean is not None
@@ -84,7 +84,7 @@ class SimulatedWindow:
         return pack(self.observations, self.start, self.intrinsics, self.observations.depth_mean, **options)
 
     def truth(self, **options: Any) -> State:
-        """The true state, as the problem of `pack(**options)` stores it."""
+        """Return the true state, as the problem of `pack(**options)` stores it."""
         options = {"fixed_intrinsics": True, **options}
         _, state, index = pack(self.observations, self.poses, self.intrinsics, self.inverse_depth, **options)
         if state.pixel_offset is None:
@@ -95,7 +95,7 @@ class SimulatedWindow:
         return replace(state, pixel_offset=jnp.asarray(offset, state.pixel_offset.dtype))
 
     def errors(self, state: State) -> Float[np.ndarray, " n"]:
-        """Distance of each camera centre of `state` from the truth, metres."""
+        """Return distance of each camera centre of `state` from the truth, metres."""
         poses = np.array(state.poses.wxyz_xyz, np.float64)
         return np.linalg.norm(centres_of(poses) - self.centres, axis=1)
 
@@ -119,7 +119,7 @@ def simulate_window(
     host_noise: bool = True,
     seed: int = 0,
 ) -> SimulatedWindow:
-    """A window of `keyframes` cameras, 0.15 m apart, that look at one place.
+    """Return a window of `keyframes` cameras, 0.15 m apart, that look at one place.
 
     Args:
         keyframes: at least 2.
@@ -204,7 +204,7 @@ def simulate_window(
 
 
 def centres_of(poses: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 3"]:
-    """Camera centres in the world of world -> camera poses."""
+    """Return camera centres in the world of world -> camera poses."""
     return -Rotation.from_quat(poses[:, :4], scalar_first=True).inv().apply(poses[:, 4:])
 
 
@@ -231,13 +231,13 @@ def _segments(keyframes: int, lines: int, rng: np.random.Generator) -> tuple[np.
 
 
 def _seen(edges: np.ndarray, host: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edge and landmark of every observation: each landmark along all edges of its host."""
+    """Return edge and landmark of every observation: each landmark along all edges of its host."""
     edge, landmark = np.nonzero(edges[:, :1] == host[None, :])
     return edge, landmark
 
 
 def project_between(poses: np.ndarray, edges: np.ndarray, pixel: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Pixels in the target keyframe of each edge."""
+    """Return pixels in the target keyframe of each edge."""
     turns = Rotation.from_quat(poses[:, :4], scalar_first=True)
     host, target = edges.T
     local = pinhole.rays(pixel, INTRINSICS) * depth[:, None]
@@ -248,7 +248,7 @@ def project_between(poses: np.ndarray, edges: np.ndarray, pixel: np.ndarray, dep
 def _lines(
     poses: np.ndarray, edges: np.ndarray, pixel: np.ndarray, depth: np.ndarray, landmark: np.ndarray
 ) -> np.ndarray:
-    """Coefficients of the line through the images of both ends of each sample's segment."""
+    """Return coefficients of the line through the images of both ends of each sample's segment."""
     if not len(landmark):
         return np.zeros((0, 3))
     first = landmark // _SAMPLES * _SAMPLES
@@ -259,6 +259,6 @@ def _lines(
 
 
 def _one_each(group: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
-    """Noise that the samples of one segment on one edge share."""
+    """Return noise that the samples of one segment on one edge share."""
     _, index = np.unique(group, return_inverse=True)
     return rng.normal(0, sigma, index.max(initial=-1) + 1)[index]

@@ -83,7 +83,7 @@ def flight(b: SceneBuilder, x: float, base: float, way: int) -> None:
 
 
 def _walls(b: SceneBuilder, base: float, floor: int) -> None:
-    """One storey of the four walls: coloured to 1.2 m above each floor, white above."""
+    """Add one storey of the four walls: coloured to 1.2 m above each floor, white above."""
     corners = [(0.0, 0.0), (0.0, LENGTH), (WIDTH, LENGTH), (WIDTH, 0.0)]
     paint = Look("plaster", 2.0, tint=_PAINTS[floor % len(_PAINTS)])
     for side in range(4):

@@ -167,7 +167,7 @@ TILES: dict[str, Painter] = {
 
 
 def paint_texture(name: str, seed: int, size: int) -> np.ndarray:
-    """The texture `name` as uint8 [size, size, 3], gamma-encoded RGB.
+    """Return the texture `name` as uint8 [size, size, 3], gamma-encoded RGB.
 
     name: a key of `TILES` or of `decals.DECALS`, optionally with a variant, as in "poster:3".
     Raises InputError if there is no such texture.

@@ -51,7 +51,7 @@ class HandheldMotion:
 
     @classmethod
     def along(cls, walk: Walk, seed: int) -> Self:
-        """The motion of one person on `walk`."""
+        """Return the motion of one person on `walk`."""
         corners = np.vstack([walk.way, walk.way[:1]])
         chords = np.linalg.norm(np.diff(corners, axis=0), axis=1)
         at = np.concatenate([[0.0], np.cumsum(chords)])
@@ -68,7 +68,7 @@ class HandheldMotion:
         return cls(path, step, walk.speed, _waves(np.random.default_rng([seed, 17])))
 
     def at_speed(self, speed: float) -> Self:
-        """The same walk at `speed` metres a second."""
+        """Return the same walk at `speed` metres a second."""
         return replace(self, speed=speed)
 
     @property
@@ -77,7 +77,7 @@ class HandheldMotion:
         return self.step * (len(self.path) - 1)
 
     def camera_to_world(self, time: float) -> np.ndarray:
-        """Pose at `time` (seconds), camera -> world, float64 [4, 4]."""
+        """Return pose at `time` (seconds), camera -> world, float64 [4, 4]."""
         place = self.speed * (time + _integral(self.waves[0], time)) % self.length
         low = min(int(place / self.step), len(self.path) - 2)
         share = place / self.step - low

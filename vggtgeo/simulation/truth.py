@@ -35,7 +35,7 @@ class VisibleEdges:
 
 
 def texture_strength(picture: Picture) -> np.ndarray:
-    """How well each pixel can be localised from texture alone: float32 [H, W] in [0, 1).
+    """Return how well each pixel can be localised from texture alone: float32 [H, W] in [0, 1).
 
     g / (g + 6), g the root of the smaller eigenvalue of the structure tensor (Gaussian, 2 px) of the noise-free
     image in grey levels: straight edges do not count, corners and texture do.
@@ -51,7 +51,7 @@ def texture_strength(picture: Picture) -> np.ndarray:
 def locate(
     view: View, pose: np.ndarray, camera: Camera, picture: Picture, pixels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """World points float64 [n, 3] that `pixels` [n, 2] show, and whether there is a surface, bool [n].
+    """Return world points float64 [n, 3] that `pixels` [n, 2] show, and whether there is a surface, bool [n].
 
     view, picture: of the camera at `pose`. Exact at sub-pixel places: the ray meets the surface that the nearest
     pixel's centre sees.
@@ -69,19 +69,19 @@ def locate(
 
 
 def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels float64 [n, 2] and depths [n] of world points [n, 3]; NaN pixels behind the camera."""
+    """Return pixels float64 [n, 2] and depths [n] of world points [n, 3]; NaN pixels behind the camera."""
     local = points @ pose[:3, :3].T + pose[:3, 3]
     return pinhole.project(local, camera.intrinsics, NEAR), local[:, 2]
 
 
 def farthest_depth(picture: Picture) -> np.ndarray:
-    """The largest depth within a pixel of each pixel, float32 [H, W], metres: what hides nothing nearer."""
+    """Return the largest depth within a pixel of each pixel, float32 [H, W], metres: what hides nothing nearer."""
     depth = np.nan_to_num(picture.depth, nan=np.inf).astype(np.float32)
     return np.asarray(cv2.dilate(depth, np.ones((3, 3), np.uint8)))
 
 
 def is_visible(pixels: np.ndarray, depths: np.ndarray, farthest: np.ndarray) -> np.ndarray:
-    """Whether points at `pixels` [n, 2] with depths [n] are inside the picture and not hidden: bool [n].
+    """Return whether points at `pixels` [n, 2] with depths [n] are inside the picture and not hidden: bool [n].
 
     farthest: of `farthest_depth`. A point is hidden if all surfaces within a pixel of it are nearer by over 1 %.
     """
@@ -97,7 +97,7 @@ def is_visible(pixels: np.ndarray, depths: np.ndarray, farthest: np.ndarray) -> 
 def visible_edges(
     scene: Scene, pose: np.ndarray, camera: Camera, picture: Picture, shortest: float = 15.0
 ) -> VisibleEdges:
-    """The visible parts of the scene's edges that are at least `shortest` pixels long."""
+    """Return the visible parts of the scene's edges that are at least `shortest` pixels long."""
     maps = (farthest_depth(picture), _gradient(picture))
     parts: list[tuple[np.ndarray, np.ndarray, int, float]] = []
     for index, ends in _clipped(scene.edges, pose, camera):
@@ -117,7 +117,7 @@ def _gradient(picture: Picture) -> np.ndarray:
 
 
 def _clipped(edges: np.ndarray, pose: np.ndarray, camera: Camera) -> list[tuple[int, np.ndarray]]:
-    """Edges cut to the picture: (row, [2, 3] = (u, v, inverse depth) of both ends); affine along the segment."""
+    """Return edges cut to the picture: (row, [2, 3] = (u, v, inverse depth) of both ends); affine along the segment."""
     local = edges @ pose[:3, :3].T + pose[:3, 3]
     found = []
     for index in np.nonzero((local[..., 2] > NEAR).any(axis=1))[0]:

@@ -23,7 +23,7 @@ _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
 def write_tum_folder(sequence: SyntheticSequence, folder: str | os.PathLike[str]) -> Iterator[Frame]:
-    """Renders `sequence` into `folder`, giving each frame once it is written (for a progress bar).
+    """Render `sequence` into `folder`, giving each frame once it is written (for a progress bar).
 
     Raises InputError if `folder` is there and not empty, or cannot be written.
     """
