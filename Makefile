@@ -10,13 +10,15 @@ TIME    ?= 60
 LOWEST  := .cache/lowest
 NEWEST  := .cache/newest
 MORE    := .cache/more
+TRIAL   := .cache/release
+PYTHONS ?= $(PYTHON)
 # Compiled modules are kept, also where the environment says otherwise: the tests start hundreds of processes, and each
 # begins in a third of the time with them.
 export PYTHONDONTWRITEBYTECODE :=
 CORE    := tests/test_packing.py tests/test_solve.py tests/test_properties.py tests/test_report.py tests/test_point_cloud.py \
 	tests/test_plots.py tests/test_settings_file.py
 
-.PHONY: help venv demo test test-long test-slow test-lowest test-newest test-more fuzz fuzz-parsers fuzz-decoders docs audit sbom lint types format lock clean
+.PHONY: help venv demo test test-long test-slow test-lowest test-newest test-more fuzz fuzz-parsers fuzz-decoders docs audit sbom release lint types format lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -89,6 +91,21 @@ audit: $(READY)  ## ask a public database for known vulnerabilities of what requ
 sbom: $(READY)  ## write sbom.json, a bill of materials (CycloneDX) of requirements.lock; asks nobody
 	$(BIN)/python -m pip install --quiet "cyclonedx-bom>=5"
 	$(BIN)/cyclonedx-py requirements --output-file sbom.json requirements.lock
+
+# The trial runs in a folder of its own, so that nothing of the source tree is imported.
+release: $(READY)  ## build wheel and source archive into dist/, check them, try the wheel in empty environments; PYTHONS="3.11 3.12"
+	$(BIN)/python -m pip install --quiet "build>=1.2" "twine>=6.1" uv
+	rm -rf build dist $(TRIAL)
+	$(BIN)/python -m build --quiet --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python .ci/check_release.py dist
+	set -e; for version in $(PYTHONS); do \
+		$(BIN)/uv venv --quiet --clear --python $$version $(TRIAL)/venv; \
+		$(BIN)/uv pip install --quiet --python $(TRIAL)/venv/bin/python dist/*.whl; \
+		(cd $(TRIAL) && venv/bin/vggtgeo --version && venv/bin/vggtgeo demo --frames 12 -o demo --quiet); \
+		$(BIN)/uv pip install --quiet --python $(TRIAL)/venv/bin/python pytest hypothesis beartype; \
+		(cd $(TRIAL) && venv/bin/python -m pytest -q -p no:cacheprovider ../../tests/test_lie.py); \
+	done
 
 lint: $(READY)  ## check format, style and types
 	$(BIN)/ruff format --check .

@@ -1,9 +1,11 @@
-"""Measure what the README's window compiles: value, gradient and Hessian product, in processor seconds.
+"""Measure what the README's window and a chain of five windows compile, in processor seconds.
 
     .venv/bin/python benchmarks/compile_time.py [--cache FOLDER]
 
-Each runs in a process of its own. Without `--cache` everything is compiled; with it a second call shows what a cache
-saves. Processor seconds count all threads: on two idle cores the wall time is about two thirds of them.
+Of the window: value, gradient by the matches' weights, and Hessian product. The chain is the gradient of the last pose
+by the first window's weights through five windows that are solved, marginalised and slid in a `scan`. Each runs in a
+process of its own. Without `--cache` everything is compiled; with it a second call shows what a cache saves. Processor
+seconds count all threads: on two idle cores the wall time is about two thirds of them.
 """
 
 from __future__ import annotations
@@ -12,12 +14,15 @@ import argparse
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 import vggtgeo as vg
 
+KEYFRAMES, WINDOWS = 4, 5
+NAMES = ("value", "gradient", "Hessian product", "gradient of five windows")
 HEADER = "| of | trace and lower, s | compile, s | lines of StableHLO |\n|---|---|---|---|"
 
 
@@ -25,13 +30,13 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cache", help="folder of JAX's compilation cache")
-    parser.add_argument("--one", choices=("value", "gradient", "Hessian product"), help="this one, in this process")
+    parser.add_argument("--one", choices=NAMES, help="this one, in this process")
     options = parser.parse_args()
     if options.one:
         print(measured(options.one, options.cache))
         return
     print(HEADER)
-    for name in ("value", "gradient", "Hessian product"):
+    for name in NAMES:
         command = [sys.executable, __file__, "--one", name, *(["--cache", options.cache] if options.cache else [])]
         print(subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip(), flush=True)
 
@@ -43,6 +48,18 @@ def measured(name: str, cache: str | None) -> str:
     if cache is not None:
         jax.config.update("jax_compilation_cache_dir", cache)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    function, weight = _chain() if name == NAMES[-1] else _window(name)
+    begun = time.process_time()
+    lowered = jax.jit(function).lower(weight)
+    traced = time.process_time()
+    lowered.compile()
+    compiled = time.process_time()
+    lines = len(lowered.as_text().splitlines())
+    return f"| {name} | {traced - begun:.1f} | {compiled - traced:.1f} | {lines} |"
+
+
+def _window(name: str) -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
+    """A function of the matches' weights of the README's window, and the weights."""
     window = vg.simulate_window()
     seen = window.observations
     problem, initial, _ = vg.pack(seen, window.start, window.intrinsics, seen.depth_mean, fixed_intrinsics=True)
@@ -57,13 +74,32 @@ def measured(name: str, cache: str | None) -> str:
         "gradient": gradient,
         "Hessian product": lambda weight: jax.jvp(gradient, (weight,), (jnp.ones_like(weight),))[1],
     }
-    begun = time.process_time()
-    lowered = jax.jit(functions[name]).lower(problem.points.weight)
-    traced = time.process_time()
-    lowered.compile()
-    compiled = time.process_time()
-    lines = len(lowered.as_text().splitlines())
-    return f"| {name} | {traced - begun:.1f} | {compiled - traced:.1f} | {lines} |"
+    return functions[name], problem.points.weight
+
+
+def _chain() -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
+    """The gradient through windows as large as the README's, the oldest keyframe marginalised after each."""
+    long = vg.simulate_window(KEYFRAMES + WINDOWS - 1)
+    parts = []
+    for first in range(WINDOWS):
+        inside = range(first, first + KEYFRAMES)
+        seen = long.observations.within(inside)
+        parts.append((seen, long.start[list(inside)], long.intrinsics, seen.depth_mean))
+    windows = vg.batches.pack_batch(parts, terms=[vg.no_prior(KEYFRAMES)], fixed_intrinsics=True)[:2]
+    first, start = jax.tree.map(lambda leaf: leaf[0], windows)
+    # The last window is slid into the first one again, so that the body is compiled once; nothing looks at that.
+    following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, 0), windows)
+
+    def loss(weight: jax.Array) -> jax.Array:
+        def step(window: tuple[vg.Problem, vg.State], coming: tuple[vg.Problem, vg.State]):
+            state = vg.solve(*window).state
+            return vg.slide(window[0], state, *coming), state.poses.inverse().translation()[-1]
+
+        reweighted = first.with_term(first.points.reweighted(weight))
+        newest = jax.lax.scan(step, (reweighted, start), following)[1]
+        return jnp.sum((newest[-1] - long.centres[-1]) ** 2)
+
+    return jax.grad(loss), first.points.weight
 
 
 if __name__ == "__main__":

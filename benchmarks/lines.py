@@ -1,7 +1,7 @@
-"""Line segments in tracking and in edges: what each gives, where there is texture and where there is hardly any.
+"""Line segments: what they give, where there is texture and where there is hardly any.
 
     .venv/bin/python benchmarks/lines.py [--data ../shared/data] [--sources building-walk poor corridor]
-        [--variants none tracking edges both] [--without-picture | --rgb-only] [--points 80]
+        [--variants none lines] [--without-picture | --rgb-only] [--points 80]
 
 Sources: the clips by their names; `poor`, those pieces of the two HoloLens clips where a frame has fewer than 100
 matches with the frame three before it; `corridor`, the simulated one with bare white walls and equal doors, with exact
@@ -42,9 +42,7 @@ from vggtgeo.slam.state import Slam
 
 VARIANTS = {
     "none": LineSettings(use_lines=False),
-    "tracking": LineSettings(in_edges=False),
-    "edges": LineSettings(in_tracking=False),
-    "both": LineSettings(),
+    "lines": LineSettings(),
 }
 CLIPS = ("building-walk", "corridor-office")
 FEW, APART, SHORTEST, HOLE = 100, 3, 12, 3

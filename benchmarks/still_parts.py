@@ -3,7 +3,8 @@
     D=../shared/data
     .venv/bin/python benchmarks/still_parts.py $D/building-walk $D/corridor-office $D/redkitchen $D/icl-office
 
-The first 40 frames of each clip, with depth and without, as they are and painted over; `camera.still_parts` off and on.
+The first 40 frames of each clip, with depth and without, as they are and painted over; `camera.static_overlay`
+off and on.
 ATE after SE(3) with depth, after Sim(3) without.
 """
 
@@ -29,9 +30,9 @@ def cells(sequence: SequenceView) -> Iterator[str]:
 
 def _run(sequence: SequenceView, still_parts: bool) -> list[str]:
     """ATE in cm, the verdict, and the share of the picture that is left out."""
-    settings = vg.SlamSettings(camera=vg.settings.CameraSettings(still_parts=still_parts))
+    settings = vg.SlamSettings(camera=vg.settings.CameraSettings(static_overlay=still_parts))
     result, error = judged(sequence, settings)
-    return [f"{100 * error:.1f}", result.verdict.level, f"{100 * result.summary.get('still_parts', 0.0):.0f} %"]
+    return [f"{100 * error:.1f}", result.verdict.level, f"{100 * result.summary.get('static_overlay', 0.0):.0f} %"]
 
 
 if __name__ == "__main__":

@@ -230,7 +230,7 @@ def test_solve_says_what_is_wrong(tmp_path: Path) -> None:
     spoilt[1, 4] = np.nan
     problem = write(tmp_path, T_init=spoilt)
     cases = [
-        ((str(tmp_path / "no.npz"),), "no.npz` is no file"),
+        ((str(tmp_path / "no.npz"),), "no.npz` does not exist"),
         ((str(problem), "--max-steps", "0"), "--max-steps"),
         ((str(problem), "--dtype", "float16"), "--dtype"),
         ((str(problem), "--max-steps", "3"), "problem.npz`: `poses[1]` is"),
@@ -336,4 +336,4 @@ def test_a_flag_that_xla_does_not_know_is_told(
     result = CliRunner().invoke(make_app(), ["solve", "no.npz", "-o", "x.npz"])
     assert result.exit_code == 2
     told = f"the environment variable `XLA_FLAGS` has `{unknown}`, which jaxlib"
-    assert result.stderr.startswith(f"error: {told}" if unknown else "error: `no.npz` is no file"), result.stderr
+    assert result.stderr.startswith(f"error: {told}" if unknown else "error: `no.npz` does not exist"), result.stderr

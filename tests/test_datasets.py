@@ -13,6 +13,7 @@ from reported import raises, warns
 from tiny_layouts import matroska
 
 from vggtgeo.cli.run import open_input
+from vggtgeo.cli.run_options import InputOptions
 from vggtgeo.datasets import (
     Frame,
     ImageFolder,
@@ -378,8 +379,8 @@ def test_a_camera_that_is_given_is_not_guessed(tmp_path: Path) -> None:
     for number in range(2):
         tiny.write_image(tmp_path / f"{number}.png", tiny.image(number))
     with pytest.warns(GuessedCameraWarning, match="no intrinsics found"):
-        assert not open_input(tmp_path, None, None, rgb_only=False).camera.known
-    sequence = open_input(tmp_path, None, "50,50,31.5,23.5", rgb_only=False)  # a warning is an error here
+        assert not open_input(tmp_path, InputOptions()).camera.known
+    sequence = open_input(tmp_path, InputOptions(intrinsics="50,50,31.5,23.5"))  # a warning is an error here
     assert sequence.camera.intrinsics == (50.0, 50.0, 31.5, 23.5)
 
 

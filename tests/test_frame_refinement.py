@@ -12,7 +12,6 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.perception.rgbd_view import RgbdView
-from vggtgeo.slam.settings.groups import RefinementSettings
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.units import scaled_keyframe
 from vggtgeo.slam.state import Slam
@@ -114,8 +113,7 @@ def test_pictures_do_not_wait_for_long(run: RecordedRun) -> None:
     slam, row = run.slam, between(run.slam)[-1]
     slam = waiting(run, replace(slam, tracker=replace(slam.tracker, frames=slam.frames[: row + 1])), [row] * (MOST - 1))
     seen = slam.tracker.between[0][1]
-    settings = RefinementSettings()
-    waits = lambda known, tracker: len(with_view(known, tracker, seen, slam.intrinsics, Roles(), settings).between)
+    waits = lambda known, tracker: len(with_view(known, tracker, seen, slam.intrinsics, Roles()).between)
     assert waits(slam.map, replace(slam.tracker, between=slam.tracker.between[1:])) == MOST - 1
     assert waits(slam.map, slam.tracker) == 0
     assert waits(replace(slam.map, metric=False), slam.tracker) == MOST - 1, "lengths of a map without unit"

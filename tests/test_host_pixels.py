@@ -47,6 +47,17 @@ def test_gradient_is_that_of_the_energy(window):
     np.testing.assert_allclose(by_pixel, offset, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("part", [None, 0.7])
+def test_the_linearised_gradient_is_that_of_the_energy(window, part):
+    """Proves that the gradient of all landmarks, by pixel and depth, is complete: by `energy_gradient`."""
+    problem, state = window
+    ready = prepared(problem)
+    correction = None if part is None else jnp.asarray(part)
+    system = jax.jit(lambda state: linearise(ready, state, correction, joined=False))(state)
+    expected = jax.jit(lambda state: energy_gradient(ready, state))(state)
+    np.testing.assert_allclose(system.cross[:, -2], expected.landmarks, rtol=1e-9, atol=1e-9)
+
+
 def test_schur_complement_of_the_exact_hessian(window):
     """By dense elimination of all landmark unknowns from the Hessian of the energy."""
     problem, state = window

@@ -43,7 +43,7 @@ SLAM_STAIR = (
     ("state_file",),
     ("known_map",),
     ("run",),
-    ("first_pass",),
+    ("self_calibration",),
     ("verdict",),
 )
 """Folders and files of `vggtgeo.slam`, the lowest first: each imports of those below it; those of one step nothing of

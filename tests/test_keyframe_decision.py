@@ -45,7 +45,7 @@ def test_distance_angle_and_inliers_decide_each_alone(
     """
     for world in (np.eye(4), rigid.invert(pose(3.0, 70.0))):
         frame, reference = pose(metres, degrees) @ world, world
-        found = needs_keyframe(frame, reference, inliers, ENOUGH, SETTINGS)
+        found = needs_keyframe(frame, reference, inliers, SETTINGS)
         assert found == expected, view_change(frame, reference, SETTINGS)
 
 

@@ -12,8 +12,7 @@ from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatch
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.settings.table import updated
+from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.covisibility import Directed, match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
@@ -186,11 +185,8 @@ def test_points_and_lines_make_an_edge_together(points: int, lines: int, joined:
         points=Slots(pixels, third, third, 0.02 * third, np.ones(20), np.ones(20)),
     )
     roles = Roles(points=_FirstPoints(points), line_matches=_FirstLines(lines))
-    pair = match_keyframes(keyframe, replace(keyframe, number=1), roles, SlamSettings(), INTRINSICS)
+    pair = match_keyframes(keyframe, replace(keyframe, number=1), roles, INTRINSICS)
     assert (pair is not None) is joined
-    without = updated(SlamSettings(), {"line": {"in_edges": False}})
-    alone = match_keyframes(keyframe, replace(keyframe, number=1), roles, without, INTRINSICS)
-    assert (alone is not None) is (points >= 12)
 
 
 class _FirstPoints:

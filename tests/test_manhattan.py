@@ -121,5 +121,5 @@ def test_the_residual_is_the_measured_rotation() -> None:
 
 def test_it_is_off_unless_asked_for() -> None:
     # Proves that a run without the setting is untouched. Oracle: the same object.
-    slam = begin(Camera(tuple(INTRINSICS), 320, 240), Roles(), SlamSettings())
+    slam = begin(Camera(tuple(INTRINSICS), 320, 240), Roles())
     assert constrain_rotation(slam, SlamSettings()) is slam

@@ -43,7 +43,7 @@ def test_every_hint_to_install_names_an_extra_that_is_there() -> None:
     sources = [file for folder in ("vggtgeo", "models", "solvers") for file in (ROOT / folder).rglob("*.py")]
     texts = {file.name: file.read_text(encoding="utf-8") for file in sources}
     asked = {extra for text in texts.values() for extra in re.findall(r"install_hint\([\"'](\w+)", text)}
-    assert asked == {"bags", "bench", "cluster", "export", "fetch", "gpu", "maps", "phones"}
+    assert asked == {"bags", "bench", "cluster", "export", "fetch", "gpu", "maps", "phones", "viewer"}
     known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     assert asked <= set(known)
     assert [name for name, text in texts.items() if "pip install" in text] == ["extras.py"]
@@ -146,7 +146,7 @@ def test_wheel_holds_every_source_file_and_nothing_else(source: Path, wheel: Pat
     found = {".".join(file.with_suffix("").parts).removesuffix(".__init__") for file in files if file.suffix == ".py"}
     assert found == _source_modules(source)
     data = {file for file in files if file.suffix != ".py"}
-    kinds = ("*.toml", "*.j2", "*.css", "*.pyi", "py.typed")
+    kinds = ("*.toml", "*.j2", "*.css", "*.js", "*.pyi", "py.typed")
     assert data == {file.relative_to(source) for kind in kinds for file in (source / "vggtgeo").rglob(kind)}
     assert Path("vggtgeo/benchmark/suites/quick.toml") in data
 

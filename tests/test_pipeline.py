@@ -272,7 +272,7 @@ def test_rgb_recovers_the_shape(room) -> None:
     between = [record.evidence for record in slam.frames if record.frame not in numbers]
     assert all(np.isfinite(evidence.sigma_translation) for evidence in between)  # and of those that waited for the map
     assert len(slam.map.odometry_factors) >= len(slam.keyframes) - 2
-    prior = camera_prior(slam, SETTINGS)
+    prior = camera_prior(slam)
     adjustment, _ = window_problem(slam.map, slam.window, slam.intrinsics, prior, SETTINGS)
     (motions,) = (term for term in adjustment.problem.terms if isinstance(term, RelativePose))
     present = np.asarray(motions.weight) > 0

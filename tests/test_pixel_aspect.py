@@ -199,5 +199,5 @@ def test_a_squeezed_video_without_calibration(tmp_path: Path) -> None:
     result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), dense="none")
     expected = frames.source.camera.resized(*frames.size).intrinsics
     np.testing.assert_allclose(result.intrinsics[:2], expected[:2], rtol=0.03)
-    assert any("pixels that are not square" in note for note in result.summary["notes"])
+    assert any("pixels are not square" in note for note in result.summary["notes"])
     assert evaluate_trajectory(result.trajectory, frames.ground_truth()).sim3.statistics.rmse < 0.02

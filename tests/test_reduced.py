@@ -68,7 +68,7 @@ def test_a_run_of_large_images_says_so_and_is_right() -> None:
     settings = vg.SlamSettings(
         window=SHORT_RUN.window,
         refinement=SHORT_RUN.refinement,
-        camera=vg.settings.CameraSettings(most_pixels=MOST),
+        camera=vg.settings.CameraSettings(max_pixels=MOST),
     )
     sequence = room(LARGE, 6)
     truth = sequence.ground_truth()

@@ -21,25 +21,13 @@ from vggtgeo.cli.pipeline_settings import pipeline_settings
 from vggtgeo.slam.settings.table import GROUPS, changed, names, parsed, tables_of, updated
 
 WRONG = {
-    "tracking.least_inliers": (0, 2.5, True, "many"),
-    "tracking.search_map": (1,),
+    "keyframes.min_inliers": (0, 2.5, True, "many"),
     "keyframes.keyframe_distance": (0.0, -1.0, float("nan"), float("inf"), "far"),
     "keyframes.keyframe_angle": (0.0, 4.0),
     "keyframes.localise_only": (1,),
-    "matching.least_covisible": (0,),
-    "matching.least_matches": (-1,),
-    "matching.least_line_matches": (1.0,),
-    "matching.match_gate": (0.0,),
-    "matching.epipolar_gate": (-4.0,),
-    "matching.least_overlap": (-0.1, 1.1),
     "line.use_lines": (1, "yes"),
-    "line.in_tracking": ("always",),
-    "line.in_edges": (0,),
-    "line.line_gate": (0,),
-    "line.line_spacing": (0.0,),
     "line.line_weight": (-0.1,),
     "line.two_ends_lines": (None,),
-    "line.segment_samples": (1,),
     "line.manhattan": (0,),
     "depth_terms.depth_weight": (-2.0,),
     "depth_terms.depth_trust": ("omega", 1),
@@ -47,12 +35,9 @@ WRONG = {
     "weights.use_confidence": ("on",),
     "weights.confidence_gain": (-1.0,),
     "weights.confidence_floor": (float("nan"),),
-    "camera.known_intrinsics_sigma": (0.0,),
-    "camera.guessed_intrinsics_sigma": (-0.3,),
-    "camera.guessed_centre_sigma": (0.0, -0.02),
-    "camera.most_pixels": (-1, 1.5),
-    "camera.still_parts": (1,),
-    "camera.first_pass": (-1, 1.5),
+    "camera.max_pixels": (-1, 1.5),
+    "camera.calibration_frames": (-1, 1.5),
+    "camera.static_overlay": (1,),
     "camera.refine_intrinsics": ("sometimes", True),
     "window.size": (2, 10.0),
     "window.point_slots": (0,),
@@ -63,9 +48,7 @@ WRONG = {
     "refinement.global_adjustment": ("no",),
     "refinement.global_iterations": (0,),
     "refinement.global_rounds": (0,),
-    "refinement.global_neighbours": (0,),
     "refinement.rolling_shutter": ("yes",),
-    "refinement.frames": ("yes",),
     "refinement.loop_candidates": (-1, 1.5),
 }
 OTHER = {bool: lambda value: not value, int: lambda value: 2 * value + 2, float: lambda value: 0.5 * value}
@@ -141,8 +124,8 @@ def test_no_group_has_the_name_of_a_flag() -> None:
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("tracking.min_inliers=20", "`tracking.min_inliers` is no setting; the nearest is `tracking.least_inliers`"),
-        ("least_inliers=20", "`least_inliers` is no setting; the nearest is `tracking.least_inliers`"),
+        ("tracking.min_inliers=20", "`tracking.min_inliers` is no setting; the nearest is `keyframes.min_inliers`"),
+        ("min_inliers=20", "`min_inliers` is no setting; the nearest is `keyframes.min_inliers`"),
         ("window.window=4", "`window.window` is no setting; the nearest is `window.window_iterations`"),
         ("window.size", "`window.size` sets nothing; write `group.field=value`"),
         ("window.size=four", "`window.size` is 'four'; it must be a whole number from 3 to 1000"),
@@ -161,7 +144,7 @@ def test_a_wrong_assignment_ends_the_program_before_it_runs(tmp_path: Path, assi
 
 def test_a_table_of_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
     """A table with a name that is no group's ends the program; oracle: the list of groups."""
-    (tmp_path / "s.toml").write_text("frames = 3\n[track]\nleast_inliers = 3\n")
+    (tmp_path / "s.toml").write_text("frames = 3\n[track]\nmin_inliers = 3\n")
     done = CliRunner().invoke(make_app(), ["demo", "--settings", str(tmp_path / "s.toml"), "-o", str(tmp_path / "out")])
     assert done.exit_code == 2
     assert f"`track` is no group of settings; it must be one of {', '.join(GROUPS)}" in done.stderr

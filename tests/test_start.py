@@ -29,7 +29,7 @@ VIEW, OTHER = _picture(0), _picture(1)
 
 def _seen(images: list[np.ndarray]) -> Slam:
     """The state after these images; none of them has parallax to another, so that no map begins."""
-    slam = begin(CAMERA, ROLES, SlamSettings())
+    slam = begin(CAMERA, ROLES)
     for number, image in enumerate(images):
         frame = Frame(number, 0.1 * number, image, None, f"{number}.png")
         slam = step(slam, frame, Description.of(ROLES.points.describe(image)), ROLES, SlamSettings())

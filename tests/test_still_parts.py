@@ -150,7 +150,7 @@ def test_of_a_stream_it_is_told(count: int, every: int) -> None:
     """Frames that come once cannot be looked at before the first is tracked; at the end the verdict knows. Oracle: text
     that was painted into every picture, or into one in thirteen, which nobody can take for a part of the camera.
     """
-    search, pictures, slam = StaticOverlaySearch(), moving(19, (25, 20)), begin(CAMERA, vg.Roles(), vg.SlamSettings())
+    search, pictures, slam = StaticOverlaySearch(), moving(19, (25, 20)), begin(CAMERA, vg.Roles())
     for row in range(count):
         picture = pictures[row % 19].copy()
         if row % every == 0:
@@ -248,19 +248,19 @@ def test_the_mask_is_undistorted_with_the_images() -> None:
 
 
 def test_a_lens_that_was_found_undistorts_the_mask(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames of a run whose first pass found a lens are undistorted by that; so must be what is left out of them.
+    """Frames of a run whose self-calibration found a lens are undistorted by that; so must be what is left out of them.
     Oracle: the mask that the lens itself undistorts.
     """
     lens = vg.Camera(CAMERA.intrinsics, WIDTH, HEIGHT, (-0.3, 0.05, 0.0, 0.0))
     parts = StillParts(np.tile(np.arange(HEIGHT)[:, None] < 30, (1, WIDTH)))
     settings, given = vg.SlamSettings(), {}
-    known = begin(CAMERA, vg.Roles(), settings)
+    known = begin(CAMERA, vg.Roles())
     known = replace(known, camera=replace(known.camera, lens=lens))
     described = lambda frames, camera, roles, clock, waiting: given.update(camera=camera, roles=roles) or iter(())
     monkeypatch.setattr("vggtgeo.slam.run._described", described)
-    assert not list(run_frames(iter(()), CAMERA, vg.Roles(still_parts=parts), settings, Clock(), known))
+    assert not list(run_frames(iter(()), CAMERA, vg.Roles(static_overlay=parts), settings, Clock(), known))
     assert given["camera"] == lens
-    np.testing.assert_array_equal(given["roles"].still_parts.mask, parts.undistorted(lens).mask)
+    np.testing.assert_array_equal(given["roles"].static_overlay.mask, parts.undistorted(lens).mask)
     assert (parts.undistorted(lens).mask != parts.mask).any()
 
 
@@ -293,7 +293,7 @@ def test_a_run_with_text_in_the_picture_is_as_good_as_one_without(tmp_path: Path
     with pytest.warns(InputWarning, match="% of the image is a static overlay"):
         result = vg.reconstruct(tmp_path / "room", dense="none")
     assert 0.1 < result.summary["still_parts"] < 0.35
-    off = vg.SlamSettings(camera=vg.settings.CameraSettings(still_parts=False))
+    off = vg.SlamSettings(camera=vg.settings.CameraSettings(static_overlay=False))
     without = vg.reconstruct(tmp_path / "room", settings=off, dense="none")
     assert "still_parts" not in without.summary
     errors = [run.summary["truth"]["ate_se3_m"]["rmse"] for run in (result, without)]

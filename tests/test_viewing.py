@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import socket
 import subprocess
@@ -194,3 +195,16 @@ def test_without_the_flag_rerun_is_not_imported(tmp_path: Path) -> None:
     script = "import sys, vggtgeo.cli.run_sequence, vggtgeo.report, vggtgeo.cli.view; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_view_opens_the_page_where_there_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that `--page` opens the report of the folder, and that a missing one is an error. Oracle: the address.
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda address: bool(opened.append(address)))
+    call = ["view", str(tmp_path), "--page", "--json"]
+    assert CliRunner().invoke(make_app(), call).exit_code == 2
+    (tmp_path / "report.html").write_text("<p>")
+    result = CliRunner().invoke(make_app(), call)
+    assert result.exit_code == 0, result.output
+    assert opened == [(tmp_path / "report.html").resolve().as_uri()]
+    assert json.loads(result.stdout)["opened"] is False

@@ -16,8 +16,8 @@ import gc
 import io
 import logging
 import os
-import resource
 import shutil
+import sys
 import tempfile
 import time
 import warnings
@@ -99,8 +99,17 @@ def export(
         megabytes = sum(file.stat().st_size for file in folder.glob(f"{output.name}*") if file.suffix != ".npz") / 1e6
         _move(folder, output)
     seconds = time.perf_counter() - started
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    memory = _peak_memory_gb()
     return Report(output, recipe.network, weights, parameters, rewrite, parity, megabytes, seconds, latency, memory)
+
+
+def _peak_memory_gb() -> float:
+    """GiB; NaN on Windows, which has no `resource`. macOS counts bytes, others KiB."""
+    if sys.platform == "win32":
+        return float("nan")
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def pooled_depth_errors(fused: _Depths, before: _Depths, exact: ExactFrames, sca
     """Return errors over all pixels of (frame index, depth) pairs, with depth multiplied by `scale`.
 
     `depth_prior_rmse_m` is that of `before`. Exact depth is reduced to the size of the depth by nearest neighbour
-    (`camera.most_pixels`).
+    (`camera.max_pixels`).
     """
     found, prior = (
         [

@@ -14,7 +14,7 @@ from vggtgeo.benchmark.table import Row
 from vggtgeo.benchmark.worker import LOG, RECORDING
 from vggtgeo.io.files import write_text
 from vggtgeo.report.figures import svg
-from vggtgeo.report.page import style, template
+from vggtgeo.report.templates import style, template
 
 
 def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> None:

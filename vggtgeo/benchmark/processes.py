@@ -16,8 +16,10 @@ from pathlib import Path
 
 import psutil
 
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.jax_environment import jax_environment
 from vggtgeo.io.locks import LockedError, locked
+from vggtgeo.io.peak_memory import rusage_gb
 
 _POLL = 0.02
 _MEMORY_POLL = 0.25
@@ -62,7 +64,7 @@ class Ending:
         return f"exit status {self.code}"
 
 
-_OUTSIDE_SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
+_OUTSIDE_SIGNALS = {getattr(signal, name, None) for name in ("SIGKILL", "SIGTERM", "SIGHUP")}
 
 
 def run_limited(
@@ -72,6 +74,8 @@ def run_limited(
 
     cores: processors that it may use; by default all. stop: ends the process when set, with KeyboardInterrupt.
     """
+    if not hasattr(os, "wait4"):
+        raise InputError("`vggtgeo bench` needs the process calls of Linux or macOS; on Windows use WSL 2")
     tries = 1
     while True:
         ending = _once(command, log, limits, cores, stop)
@@ -94,7 +98,7 @@ def _once(
             now = time.monotonic()
             if pid:
                 process.returncode = os.waitstatus_to_exitcode(status)
-                return Ending("ended", process.returncode, now - began, max(peak, usage.ru_maxrss / 2**20))
+                return Ending("ended", process.returncode, now - began, max(peak, rusage_gb(usage.ru_maxrss)))
             if now - began > limits.seconds:
                 return Ending("timeout", 0, now - began, peak)
             if now - looked > _MEMORY_POLL:

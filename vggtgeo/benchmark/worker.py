@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import resource
 import shutil
 import signal
 import sys
@@ -23,6 +22,7 @@ from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
+from vggtgeo.io.peak_memory import peak_memory_gb
 from vggtgeo.io.warned import collected_warnings
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import Result
@@ -52,7 +52,7 @@ def run_job(folder: Path, scratch: Path | None = None) -> None:
         if _is_full(error):
             raise
         row = {"status": "error", "message": str(error)}
-    cost = {"seconds_process": time.perf_counter() - began, "peak_memory_gb": _peak_gb()}
+    cost = {"seconds_process": time.perf_counter() - began, "peak_memory_gb": peak_memory_gb()}
     write_json(folder / ROW, {**identity(job), **row, **cost, **provenance()})
 
 
@@ -75,10 +75,6 @@ def identity(job: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _SETTINGS = ("set", "features", "start_of_pose", "calibrated", "key_points", "depth_errors", "stride", "start", "end")
-
-
-def _peak_gb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None) -> dict[str, Any]:

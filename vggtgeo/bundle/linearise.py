@@ -77,15 +77,24 @@ def linearise(
             cross = jax.lax.dynamic_update_slice(cross, shared + tail, start)
         return (cross, blocks if blocks is None or own is None else blocks.at[row].add(own)), gram
 
-    own_terms, blocks = _landmark_terms(problem, state, correction, exact)
-    cross = jnp.zeros((len(own_terms), common + cameras.size + 2, own_terms.shape[2]), own_terms.dtype)
+    by_depth = _depth_terms(problem, state, correction, exact)
+    blocks, by_pixel = _pixel_terms(problem, state, correction, exact)
+    (points, slots), rows = sizes, len(state.inverse_depth)
+    cross = jnp.zeros((rows, common + cameras.size + 2, 2 * points + slots), state.inverse_depth.dtype)
     if problem.edge_terms:
         edges = (places(problem), problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
     # After the edges, in place: XLA would copy cross terms that do not begin as zeros.
-    cross = cross.at[:, -2:].add(own_terms)
+    if by_pixel is None:
+        cross = cross.at[:, -2:].add(jnp.stack(by_depth, 1))
+    else:
+        # Row by row: XLA does not vectorise a stack that is added to a part of the columns.
+        cross = cross.at[:, -1, 2 * points :].add(by_depth[1]).at[:, -2, 2 * points :].add(by_depth[0])
+        for axis in range(2):
+            of_axis = slice(axis * points, (axis + 1) * points)
+            cross = cross.at[:, -2, of_axis].add(by_pixel[:, axis])
     force = gram[:, : lie.TANGENT, size]
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     system = ArrowSystem(
@@ -280,23 +289,31 @@ def _joined(parts: Columns, size: int) -> Columns:
     return [(0, total)]
 
 
-def _landmark_terms(
+def _depth_terms(
     problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
-) -> tuple[Float[Array, "h 2 s"], Float[Array, "h 3 p"] | None]:
-    """Gradient and curvature of the terms on landmarks, and the blocks of landmarks with free pixels."""
-    (rows, slots), first = state.inverse_depth.shape, num_offsets(state)
-    gradient = jnp.zeros((rows, first + slots), state.inverse_depth.dtype)
+) -> tuple[Float[Array, "h s"], Float[Array, "h s"]]:
+    """Gradient and curvature of the terms on inverse depths."""
+    gradient = jnp.zeros_like(state.inverse_depth)
     curvature = jnp.zeros_like(gradient)
     for term in problem.slot_terms:
         force, own = term.derivatives(state.inverse_depth, correction, exact)
-        gradient, curvature = gradient.at[:, first:].add(force), curvature.at[:, first:].add(own)
+        gradient, curvature = gradient + force, curvature + own
+    return gradient, curvature
+
+
+def _pixel_terms(
+    problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
+) -> tuple[Float[Array, "h 3 p"], Float[Array, "h 2 p"]] | tuple[None, None]:
+    """Hessian and gradient of the terms on free pixels."""
     if state.pixel_offset is None:
-        return jnp.stack([gradient, curvature], 1), None
-    blocks = jnp.zeros((rows, 3, first // 2), gradient.dtype)
+        return None, None
+    rows, points, _ = state.pixel_offset.shape
+    blocks = jnp.zeros((rows, 3, points), state.inverse_depth.dtype)
+    gradient = jnp.zeros((rows, 2, points), blocks.dtype)
     for pixel, offset in pixel_observations(problem, state):
         hessian, force = pixel.model(offset, correction, exact)
-        gradient, blocks = gradient.at[:, :first].add(force.reshape(rows, first)), blocks + hessian
-    return jnp.stack([gradient, curvature], 1), blocks
+        blocks, gradient = blocks + hessian, gradient + force
+    return blocks, gradient
 
 
 def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool[Array, "h t"] | None:

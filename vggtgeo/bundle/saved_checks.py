@@ -45,7 +45,9 @@ def _check_shapes(problem: Problem, state: State, rows: int, edges: int, slots: 
     if (problem.host is None) != (problem.edges.row_of is None):
         raise InputError("it must have both `problem.host` and `problem.edges.row_of`, or neither")
     offset = state.pixel_offset
-    offsets = min(np.shape(offset)[1], slots) if np.ndim(offset) == 3 else slots
+    shape = () if offset is None else np.shape(offset)
+    offsets = min(shape[1], slots) if len(shape) == 3 else slots
+    shares = () if problem.fraction is None else np.shape(problem.fraction)
     for name, array, expected in (
         ("problem.pixels", problem.pixels, (rows, slots, 2)),
         ("state.poses", state.poses.wxyz_xyz, (keyframes, 7)),
@@ -60,7 +62,7 @@ def _check_shapes(problem: Problem, state: State, rows: int, edges: int, slots: 
         ("problem.edges.row_of", problem.edges.row_of, (edges,)),
         ("problem.host", problem.host, (rows,)),
         ("problem.camera_of", problem.camera_of, (keyframes,)),
-        ("problem.fraction", problem.fraction, (rows, *np.shape(problem.fraction)[1:3])),
+        ("problem.fraction", problem.fraction, (rows, *shares[1:3])),
     ):
         if array is not None:
             _check_shape(name, array, expected)

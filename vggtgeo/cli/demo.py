@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
+from vggtgeo.cli.option_groups import with_option_groups
+from vggtgeo.cli.options import AssignmentsOption, ReportOptions, RerunOption
 from vggtgeo.cli.run_options import ResumeOption
 from vggtgeo.cli.settings_file import SettingsOption
 
@@ -15,35 +17,47 @@ SIZE = (480, 360)
 """Pixels: large enough for a dense map, small enough to render during the run."""
 
 
+@dataclass(frozen=True)
+class SceneOptions:
+    """The simulated scene."""
+
+    scene: Annotated[str, typer.Option(help="Scene: office, hall, corridor, staircase, building, room.")] = "office"
+    frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of frames.")] = 45
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the scene and its noise.")] = 0
+
+
+@with_option_groups
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("runs/demo"),
     settings: SettingsOption = None,
-    scene: Annotated[str, typer.Option(help="Scene: office, hall, corridor, staircase, building, room.")] = "office",
-    frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of frames.")] = 45,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the scene and its noise.")] = 0,
+    *,
+    world: SceneOptions,
     assignments: AssignmentsOption = None,
     rerun: RerunOption = None,
     resume: ResumeOption = None,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
+    report: ReportOptions,
 ) -> None:
     """Run in a synthetic office with exact truth, rendered on the spot."""
     from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.cli.run_sequence import Output, RunArguments, run_and_write
     from vggtgeo.simulation import simulate
     from vggtgeo.slam.settings.slam_settings import Roles
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
     slam_settings = pipeline_settings(settings, assignments or (), {})
-    sequence = simulate(scene, frames, seed, rate=10.0, size=SIZE)
-    if not (quiet or as_json):
-        typer.echo(f"simulated scene `{scene}`: all results below are from a simulation")
+    sequence = simulate(world.scene, world.frames, world.seed, rate=10.0, size=SIZE)
+    if not (report.quiet or report.as_json):
+        typer.echo(f"simulated scene `{world.scene}`: all results below are from a simulation")
     run_and_write(
         sequence,
         Roles(),
         slam_settings,
-        Output(output, settings.values() if settings else {}, rerun, quiet=quiet, as_json=as_json, resume=resume),
-        title=f"simulated {scene}",
-        facts={"simulated": True},
+        Output(
+            *(output, settings.values() if settings else {}, rerun),
+            quiet=report.quiet,
+            as_json=report.as_json,
+            resume=resume,
+        ),
+        RunArguments(title=f"simulated {world.scene}", facts={"simulated": True}),
     )

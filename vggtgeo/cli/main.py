@@ -77,6 +77,7 @@ COMMANDS = (
         "Show the run in DIR: path, map, and depth where it was saved.",
         (
             "vggtgeo view runs/desk  # a window",
+            "vggtgeo view runs/desk --page  # the report with its 3D view, in a browser",
             "vggtgeo view runs/desk --rerun serve  # a browser, also on another machine",
             "vggtgeo view runs/desk --rerun desk.rrd  # a file, where there is no screen",
         ),

@@ -4,12 +4,13 @@ import contextlib
 import json
 import signal
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from vggtgeo.cli.option_groups import with_option_groups
 from vggtgeo.cli.options import JsonOption, QuietOption
 from vggtgeo.io.errors import InputError
 
@@ -28,6 +29,31 @@ def _exit_on_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+@dataclass(frozen=True)
+class ExportOptions:
+    """Weights and shape of the exported network."""
+
+    checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None
+    random_weights: Annotated[
+        bool,
+        typer.Option("--random-weights/--no-random-weights", help="For tests and timing: random weights."),
+    ] = False
+    height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None
+    width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None
+    views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None
+    tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None
+    variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None
+    allow_extra_weights: Annotated[
+        bool,
+        typer.Option(
+            "--allow-extra-weights/--no-allow-extra-weights",
+            help="Leave out weights of the checkpoint that the network has no place for.",
+        ),
+    ] = False
+    half: Annotated[bool, typer.Option("--half/--no-half", help="Attention and perceptrons in float16.")] = False
+
+
+@with_option_groups
 def export(
     name: Annotated[
         str,
@@ -37,24 +63,7 @@ def export(
     ],
     source: Annotated[Path, typer.Option(help="Checkout of the network's published code.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.onnx", help="File to write.")],
-    checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None,
-    random_weights: Annotated[
-        bool,
-        typer.Option("--random-weights/--no-random-weights", help="For tests and timing: random weights."),
-    ] = False,
-    height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None,
-    width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None,
-    views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None,
-    tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None,
-    variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None,
-    allow_extra_weights: Annotated[
-        bool,
-        typer.Option(
-            "--allow-extra-weights/--no-allow-extra-weights",
-            help="Leave out weights of the checkpoint that the network has no place for.",
-        ),
-    ] = False,
-    half: Annotated[bool, typer.Option("--half/--no-half", help="Attention and perceptrons in float16.")] = False,
+    options: ExportOptions,
     tolerance: Annotated[
         float | None,
         typer.Option(help="Largest difference from PyTorch; 0.001, or 0.03 with --half.", show_default=False),
@@ -70,12 +79,15 @@ def export(
         if not quiet:
             typer.echo(f"{stage} ...", err=True)
 
-    if (checkpoint is None) != random_weights:
-        found = "neither was given" if checkpoint is None else "both were given"
+    if (options.checkpoint is None) != options.random_weights:
+        found = "neither was given" if options.checkpoint is None else "both were given"
         raise InputError(f"one of `--checkpoint` FILE and `--random-weights` is needed; {found}")
     try:
         recipe = recipe_of(name)
-        request = recipe.request(source, checkpoint, height, width, views, tokens, variant, half, allow_extra_weights)
+        request = recipe.request(
+            *(source, options.checkpoint, options.height, options.width, options.views, options.tokens),
+            *(options.variant, options.half, options.allow_extra_weights),
+        )
         from vggtgeo.models.exporters.export import export as write
 
         with _exit_on_sigterm():

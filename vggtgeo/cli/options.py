@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,7 +36,7 @@ AssignmentsOption = Annotated[
     typer.Option(
         "--set",
         metavar="GROUP.FIELD=VALUE",
-        help="A setting of the pipeline, such as tracking.least_inliers=20; may be given several times.",
+        help="A setting of the pipeline, such as keyframes.min_inliers=20; may be given several times.",
     ),
 ]
 RerunOption = Annotated[
@@ -47,3 +48,11 @@ RerunOption = Annotated[
         help="Log to Rerun: spawn, serve, or a file ending with .rrd.",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What the command prints."""
+
+    quiet: QuietOption = False
+    as_json: JsonOption = False

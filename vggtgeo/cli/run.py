@@ -11,10 +11,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vggtgeo.cli import run_options as options
-from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
+from vggtgeo.cli.option_groups import with_option_groups
+from vggtgeo.cli.run_options import (
+    InputOptions,
+    OutputOption,
+    PerceptionOptions,
+    Provider,
+    RunOptions,
+    SequenceArgument,
+    SwitchOptions,
+)
 from vggtgeo.cli.settings_file import SettingsOption
-from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning
 from vggtgeo.io.warned import collected_warnings
 
@@ -22,6 +29,7 @@ if TYPE_CHECKING:
     from vggtgeo.datasets import Sequence
     from vggtgeo.slam.settings.presets import Perception
     from vggtgeo.slam.settings.slam_settings import Roles
+    from vggtgeo.slam.settings.table import Tables
 
 
 REFINE = {None: "auto", True: "always", False: "never"}
@@ -30,47 +38,16 @@ MAX_FPS = 1e5
 """Above that of any camera; at higher rates the times of frames would be equal after rounding."""
 
 
+@with_option_groups
 def run(
-    path: options.SequenceArgument,
-    output: options.OutputOption = Path("run"),
+    path: SequenceArgument,
+    output: OutputOption = Path("run"),
     settings: SettingsOption = None,
-    kind: options.KindOption = None,
-    start: options.StartOption = 0,
-    end: options.EndOption = None,
-    stride: options.StrideOption = 1,
-    fps: options.RateOption = None,
-    intrinsics: options.IntrinsicsOption = None,
-    rgb_only: options.RgbOnlyOption = False,
-    depth_scale: options.DepthScaleOption = None,
-    no_lines: options.NoLinesOption = False,
-    depth_prior: options.DepthPriorOption = True,
-    no_confidence: options.NoConfidenceOption = False,
-    global_adjustment: options.GlobalOption = True,
-    refine_intrinsics: options.RefineIntrinsicsOption = None,
-    preset: options.PresetOption = "classical",
-    models: options.ModelsOption = None,
-    cache: options.CacheOption = None,
-    provider: options.ProviderOption = "auto",
-    memory_limit_gb: options.MemoryOption = None,
-    points: options.PointsOption = None,
-    lines: options.LinesOption = None,
-    line_matcher: options.LineMatcherOption = None,
-    confidence: options.ConfidenceOption = None,
-    init: options.InitOption = None,
-    depth: options.DepthOption = None,
-    dense: options.DenseOption = "auto",
-    save_depth: options.SaveDepthOption = False,
-    save_every_depth: options.SaveEveryDepthOption = False,
-    assignments: AssignmentsOption = None,
-    rerun: RerunOption = None,
-    map_file: options.MapOption = None,
-    localise_only: options.LocaliseOption = False,
-    save_map: options.SaveMapOption = None,
-    resume: options.ResumeOption = None,
-    checkpoint_every: options.CheckpointOption = EVERY,
-    seed: options.SeedOption = 0,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
+    *,
+    given: InputOptions,
+    switches: SwitchOptions,
+    perception: PerceptionOptions,
+    options: RunOptions,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
     from vggtgeo.datasets.frame import check_selection
@@ -78,69 +55,72 @@ def run(
     from vggtgeo.results.output_checks import check_can_be_written, check_output
     from vggtgeo.viewing.target import check_target
 
-    rerun = check_target(rerun) if rerun else None
-    check_flags(memory_limit_gb, fps)
-    if kind != "camera":
+    rerun = check_target(options.rerun) if options.rerun else None
+    check_flags(perception.memory_limit_gb, given.fps)
+    if given.kind != "camera":
         check_there(path)
-    if save_map is not None:
-        check_map_place(save_map, output)
+    if options.save_map is not None:
+        check_map_place(options.save_map, output)
     if rerun:
         check_recording_file(rerun, output)
     check_output(output, Path(path))
     check_can_be_written(output)
     with collected_warnings() as warned:
-        sequence = open_input(path, kind, intrinsics, rgb_only, fps, depth_scale)
+        sequence = open_input(path, given)
     if len(sequence):  # zero for a live camera
-        check_selection(sequence.name, len(sequence), start, end, stride)
-    from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.slam.settings.groups import DepthSettings
-    from vggtgeo.slam.settings.table import Tables
-
-    check_provider(provider)
-    if save_depth and dense == "none":
+        check_selection(sequence.name, len(sequence), given.start, given.end, given.stride)
+    check_provider(perception.provider)
+    if options.save_depth and options.dense == "none":
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
         warnings.warn(text, InputWarning, stacklevel=2)
-    switches: dict[str, Tables] = {
-        "no_lines": {"line": {"use_lines": not no_lines}},
-        "no_confidence": {"weights": {"use_confidence": not no_confidence}},
-        "depth_prior": {"depth_terms": {"depth_weight": DepthSettings.depth_weight if depth_prior else 0.0}},
-        "global_adjustment": {"refinement": {"global_adjustment": global_adjustment}},
-        "refine_intrinsics": {"camera": {"refine_intrinsics": REFINE[refine_intrinsics]}},
-    }
-    if localise_only:
-        switches["localise_only"] = {"keyframes": {"localise_only": True}}
-    slam_settings = pipeline_settings(settings, assignments or (), switches)
-    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.cli.pipeline_settings import pipeline_settings
+    from vggtgeo.cli.run_sequence import Output, RunArguments, run_and_write
     from vggtgeo.slam.known_map import load_map
     from vggtgeo.slam.run import default_roles
 
-    if save_map is not None:
-        check_map_file(save_map)
-    classical = default_roles(sequence.has_depth)
-    named = {
-        **{"points": points, "lines": lines, "line_matches": line_matcher},
-        **{"confidence": confidence, "geometry": init, "depth": depth},
-    }
-    mixed = mixture(named, no_lines, no_confidence)
-    perceived = make_perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
+    slam_settings = pipeline_settings(settings, options.assignments or (), tables_of_switches(switches, options))
+    if options.save_map is not None:
+        check_map_file(options.save_map)
+    perceived = make_perception(perception, default_roles(sequence.has_depth), switches)
     flags = settings.values() if settings else {}
     run_and_write(
         sequence,
         perceived,
         slam_settings,
         Output(
-            *(output, flags, rerun, "every" if save_every_depth else save_depth, quiet, as_json),
+            *(output, flags, rerun, "every" if options.save_every_depth else options.save_depth),
+            quiet=options.quiet,
+            as_json=options.as_json,
             source=Path(path),
-            save_map=save_map,
-            resume=resume,
-            checkpoint_every=checkpoint_every,
+            save_map=options.save_map,
+            resume=options.resume,
+            checkpoint_every=options.checkpoint_every,
         ),
-        (start, end, stride),
-        seed=seed,
-        dense=dense,
-        warned=warned,
-        known_map=None if map_file is None else load_map(map_file),
+        RunArguments(
+            (given.start, given.end, given.stride),
+            seed=options.seed,
+            dense=options.dense,
+            warned=warned,
+            known_map=None if options.map_file is None else load_map(options.map_file),
+        ),
     )
+
+
+def tables_of_switches(switches: SwitchOptions, options: RunOptions) -> dict[str, Tables]:
+    """Return the settings of each switch, by the name of its parameter."""
+    from vggtgeo.slam.settings.groups import DepthSettings
+
+    depth_weight = DepthSettings.depth_weight if switches.depth_prior else 0.0
+    tables: dict[str, Tables] = {
+        "no_lines": {"line": {"use_lines": not switches.no_lines}},
+        "no_confidence": {"weights": {"use_confidence": not switches.no_confidence}},
+        "depth_prior": {"depth_terms": {"depth_weight": depth_weight}},
+        "global_adjustment": {"refinement": {"global_adjustment": switches.global_adjustment}},
+        "refine_intrinsics": {"camera": {"refine_intrinsics": REFINE[switches.refine_intrinsics]}},
+    }
+    if options.localise_only:
+        tables["localise_only"] = {"keyframes": {"localise_only": True}}
+    return tables
 
 
 def check_map_place(file: Path, output: Path) -> None:
@@ -213,7 +193,7 @@ def check_flags(memory_limit_gb: float | None, fps: float | None = None) -> None
         raise InputError(f"`--fps` must be positive, at most {MAX_FPS:g} frames per second, got {fps:g}")
 
 
-def check_provider(provider: options.Provider) -> None:
+def check_provider(provider: Provider) -> None:
     """Raise InputError if a GPU is requested and not available."""
     if provider != "cuda":
         return
@@ -224,46 +204,38 @@ def check_provider(provider: options.Provider) -> None:
         choose_provider(provider)
 
 
-def open_input(
-    path: str | Path,
-    kind: str | None,
-    intrinsics: str | None,
-    rgb_only: bool,
-    fps: float | None = None,
-    depth_scale: float | None = None,
-) -> Sequence:
+def open_input(path: str | Path, given: InputOptions) -> Sequence:
     """Open the sequence at `path`, with the overrides of the flags."""
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_depth_scale, with_intrinsics, without_depth
 
     with warnings.catch_warnings():
-        if intrinsics is not None:  # the guess is overridden
+        if given.intrinsics is not None:  # the guess is overridden
             warnings.simplefilter("ignore", GuessedCameraWarning)
-        if depth_scale is not None:  # the unit of the layout is overridden
+        if given.depth_scale is not None:  # the unit of the layout is overridden
             warnings.simplefilter("ignore", UnusableDepthWarning)
-        sequence = open_sequence(path, kind, fps, depth=not rgb_only)
-    if depth_scale is not None:
-        sequence = with_depth_scale(sequence, depth_scale)
-    if intrinsics is not None:
-        sequence = with_intrinsics(sequence, parse_intrinsics(intrinsics))
-    return without_depth(sequence) if rgb_only else sequence
+        sequence = open_sequence(path, given.kind, given.fps, depth=not given.rgb_only)
+    if given.depth_scale is not None:
+        sequence = with_depth_scale(sequence, given.depth_scale)
+    if given.intrinsics is not None:
+        sequence = with_intrinsics(sequence, parse_intrinsics(given.intrinsics))
+    return without_depth(sequence) if given.rgb_only else sequence
 
 
-def make_perception(
-    preset: str,
-    classical: Roles,
-    models: Path | None,
-    cache: Path | None,
-    provider: options.Provider,
-    memory_limit_gb: float | None,
-    mixed: Mapping[str, str],
-) -> Perception:
+def make_perception(chosen: PerceptionOptions, classical: Roles, switches: SwitchOptions) -> Perception:
     """Return the roles of a preset with the chosen replacements; warn of networks with random weights, and of an unused
     GPU.
     """
     from vggtgeo.slam.settings.presets import perception
 
-    perceived = perception(preset, classical, models, cache, provider, memory_limit_gb, mixed)
-    if provider == "cuda" and not perceived.networks:
+    named = {
+        **{"points": chosen.points, "lines": chosen.lines, "line_matches": chosen.line_matcher},
+        **{"confidence": chosen.confidence, "geometry": chosen.init, "depth": chosen.depth},
+    }
+    mixed = mixture(named, switches.no_lines, switches.no_confidence)
+    perceived = perception(
+        *(chosen.preset, classical, chosen.models, chosen.cache, chosen.provider, chosen.memory_limit_gb, mixed)
+    )
+    if chosen.provider == "cuda" and not perceived.networks:
         warnings.warn("`--provider cuda` has no effect: no role is a network", InputWarning, stacklevel=2)
     if perceived.random:
         warnings.warn(perceived.warning(), InputWarning, stacklevel=2)

@@ -61,19 +61,21 @@ class Output:
     checkpoint_every: float = EVERY
 
 
+@dataclass(frozen=True)
+class RunArguments:
+    """Further arguments of `vggtgeo.reconstruct`. selection: start, end, stride."""
+
+    selection: tuple[int, int | None, int] = (0, None, 1)
+    seed: int = 0
+    dense: str = "auto"
+    title: str | None = None
+    facts: Mapping[str, Any] | None = None
+    warned: Iterable[Warning | str] = ()
+    known_map: Slam | None = None
+
+
 def run_and_write(
-    sequence: Sequence,
-    roles: Roles | Perception,
-    settings: SlamSettings,
-    output: Output,
-    selection: tuple[int, int | None, int] = (0, None, 1),
-    *,
-    seed: int = 0,
-    dense: str = "auto",
-    title: str | None = None,
-    facts: Mapping[str, Any] | None = None,
-    warned: Iterable[Warning | str] = (),
-    known_map: Slam | None = None,
+    sequence: Sequence, roles: Roles | Perception, settings: SlamSettings, output: Output, arguments: RunArguments
 ) -> None:
     """Run a sequence with a progress bar, write its folder, print the report, and exit with the code of the verdict.
 
@@ -83,9 +85,9 @@ def run_and_write(
 
     """
     silent = output.quiet or output.as_json
-    title = (title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
+    title = (arguments.title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
     console = Console(stderr=False, quiet=silent)
-    start, end, stride = selection
+    start, end, stride = arguments.selection
     # From the first frame to the last file, a signal ends the run early; the results so far are written completely.
     with interruption() as stop, open_run_folder(output.folder, output.source, RESERVE, output.resume) as folder:
         checkpoints = Checkpoints(folder.checkpoint, bool(output.resume), output.checkpoint_every)
@@ -102,14 +104,14 @@ def run_and_write(
                 start=start,
                 end=end,
                 stride=stride,
-                seed=seed,
-                dense=dense,
+                seed=arguments.seed,
+                dense=arguments.dense,
                 title=title,
                 callbacks=(bar, _EarlyFiles(folder.stage, {**output.flags, **changed(settings)}), *viewed),
-                facts=facts,
-                warned=warned,
+                facts=arguments.facts,
+                warned=arguments.warned,
                 checkpoints=checkpoints,
-                known_map=known_map,
+                known_map=arguments.known_map,
             )
             bar.on_stage("writing")
             frames = _reopen(sequence, roles, settings) if output.save_depth == "every" else None
@@ -151,7 +153,7 @@ def _reopen(sequence: Sequence, roles: Roles | Perception, settings: SlamSetting
         return None
     own = roles.roles if isinstance(roles, Perception) else roles
     seen = sequence if sequence.has_depth and isinstance(own.depth, SensorDepth) else without_depth(sequence)
-    return reduced(seen, settings.camera.most_pixels)
+    return reduced(seen, settings.camera.max_pixels)
 
 
 class _EarlyFiles(Callback):

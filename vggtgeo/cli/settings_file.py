@@ -1,8 +1,8 @@
 """Settings files: a TOML file with the flags of a command; a run writes the one it used into its folder.
 
 A key is the long name of a flag without dashes (`rgb-only = true`, also `no-rgb-only = false`), or the name of an
-argument (`path = "..."`). A table has settings of the pipeline (`[tracking]`, `least_inliers = 20`), as
-`--set tracking.least_inliers=20`. The file replaces the defaults: flags on the command line override it.
+argument (`path = "..."`). A table has settings of the pipeline (`[keyframes]`, `min_inliers = 20`), as
+`--set keyframes.min_inliers=20`. The file replaces the defaults: flags on the command line override it.
 """
 
 from __future__ import annotations

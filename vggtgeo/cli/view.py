@@ -1,4 +1,4 @@
-"""`vggtgeo view`: a finished run in the Rerun viewer."""
+"""`vggtgeo view`: a finished run in the Rerun viewer, or its page in a browser."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import json
 import time
 import warnings
+import webbrowser
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +19,7 @@ from vggtgeo.results.unfinished import check_can_be_shown
 def view(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that a run wrote.")],
     rerun: Annotated[str, typer.Option(metavar="TARGET", help="spawn, serve, or a file ending with .rrd.")] = "spawn",
+    page: Annotated[bool, typer.Option("--page/--no-page", help="Open the report and its 3D view.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -26,6 +28,9 @@ def view(
 
     if not folder.is_dir():
         check_can_be_shown(folder)
+    if page:
+        _open_page(folder, as_json)
+        return
     from vggtgeo.viewing.folder import log_folder, recording_of
     from vggtgeo.viewing.target import check_target, flush, has_screen, open_target
 
@@ -52,6 +57,17 @@ def view(
         typer.echo(json.dumps({"target": rerun, "shown": str(recording or folder), "url": opened.url}))
     if rerun == "serve":
         serve_until_interrupted(opened.url, quiet or as_json)
+
+
+def _open_page(folder: Path, as_json: bool) -> None:
+    """Open `report.html` in the browser; print its path, too, for machines without one."""
+    from vggtgeo.io.errors import InputError
+
+    report = (folder / "report.html").resolve()
+    if not report.is_file():
+        raise InputError(f"`{report}` does not exist; `vggtgeo run` and `Result.save` write it for a run in memory")
+    opened = webbrowser.open(report.as_uri())
+    typer.echo(json.dumps({"target": "page", "shown": str(report), "opened": opened}) if as_json else str(report))
 
 
 def serve_until_interrupted(url: str | None, quiet: bool = False) -> None:

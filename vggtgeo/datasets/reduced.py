@@ -51,18 +51,18 @@ class ReducedSequence:
 
 
 @overload
-def reduced(source: Sequence, most_pixels: int) -> Sequence: ...
+def reduced(source: Sequence, max_pixels: int) -> Sequence: ...
 
 
 @overload
-def reduced(source: FrameStream, most_pixels: int) -> FrameStream: ...
+def reduced(source: FrameStream, max_pixels: int) -> FrameStream: ...
 
 
-def reduced(source: Sequence | FrameStream, most_pixels: int) -> Sequence | FrameStream:
-    """Return the frames and camera reduced to about `most_pixels` pixels; the source itself if its images are smaller,
-    or if `most_pixels` is 0.
+def reduced(source: Sequence | FrameStream, max_pixels: int) -> Sequence | FrameStream:
+    """Return the frames and camera reduced to about `max_pixels` pixels; the source itself if its images are smaller,
+    or if `max_pixels` is 0.
     """
-    camera = reduced_camera(source.camera, most_pixels)
+    camera = reduced_camera(source.camera, max_pixels)
     if camera == source.camera:
         return source
     if isinstance(source, FrameStream):
@@ -70,10 +70,10 @@ def reduced(source: Sequence | FrameStream, most_pixels: int) -> Sequence | Fram
     return ReducedSequence(source, camera)
 
 
-def reduced_camera(camera: Camera, most_pixels: int) -> Camera:
-    """Return the camera of images reduced to about `most_pixels` pixels; 0: unchanged."""
-    factor = math.sqrt(most_pixels / (camera.width * camera.height))
-    if factor >= 1 or not most_pixels:
+def reduced_camera(camera: Camera, max_pixels: int) -> Camera:
+    """Return the camera of images reduced to about `max_pixels` pixels; 0: unchanged."""
+    factor = math.sqrt(max_pixels / (camera.width * camera.height))
+    if factor >= 1 or not max_pixels:
         return camera
     return camera.resized(max(round(factor * camera.width), 1), max(round(factor * camera.height), 1))
 

@@ -137,7 +137,7 @@ def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
         (time / FRAMES_PER_SECOND if counted else time, file.parent / image): file.parent / depth
         for time, image, depth in pairs
     }
-    frames = [(*image, depths[image]) for image in _in_order(file, list(depths), frames=True)]
+    frames = [(at, image, depths[at, image]) for at, image in _in_order(file, list(depths), frames=True)]
     return frames, MILLIMETRES if counted else FIVE_THOUSANDTHS
 
 

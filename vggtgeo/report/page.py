@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jinja2
 import numpy as np
 
 from vggtgeo.figures import map_view
+from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
+from vggtgeo.report.map_scene import map_scene, pictured
+from vggtgeo.report.templates import style, template
+from vggtgeo.report.viewer import INSTALL, has_viewer, view_html
+from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.window_recorder import WindowRecord
 
@@ -74,6 +78,8 @@ def write_page(
     summary: Mapping[str, Any],
     verdict: Verdict,
     warnings: Sequence[str] = (),
+    uncertainty: PoseUncertainty | None = None,
+    mesh: Callable[[], Mesh | None] = lambda: None,
 ) -> None:
     """Write the report of a run, a self-contained HTML file, atomically.
 
@@ -88,6 +94,8 @@ def write_page(
         summary: content of `summary.json`.
         verdict: how far the result can be trusted; the first part of the page.
         warnings: about the input; the state's notes follow.
+        uncertainty: of the poses, for the 3D view.
+        mesh: returns the mesh of the map for the 3D view, which is made last.
 
     """
     trajectory = frame_trajectory(slam)
@@ -120,8 +128,36 @@ def write_page(
         truth_table=_truth_table(summary.get("truth"), slam.metric),
         scale=summary["scale"],
         scale_basis=summary.get("scale_basis"),
+        install=INSTALL,
+        view=_view(slam, trajectory, truth, cloud, summary, uncertainty, mesh),
     )
     write_text(path, text)
+
+
+def _view(
+    slam: Slam,
+    trajectory: Trajectory,
+    truth: Trajectory | None,
+    cloud: PointCloud,
+    summary: Mapping[str, Any],
+    uncertainty: PoseUncertainty | None,
+    mesh: Callable[[], Mesh | None],
+) -> str | None:
+    """The 3D view; None if no frame has a pose, or K3D is not installed."""
+    if not len(trajectory) or not has_viewer():
+        return None
+    scene = map_scene(
+        cloud,
+        trajectory,
+        pictured([slam.keyframes[number] for number in pieces_by_size(slam)[0]]),
+        [float(value) for value in slam.intrinsics],
+        mesh=mesh(),
+        truth=truth,
+        uncertainty=uncertainty,
+        metric=slam.metric,
+        truth_in_metres=summary.get("truth", {}).get("in_metres", True),
+    )
+    return view_html(scene)
 
 
 def _draw_trajectory(slam: Slam, trajectory: Trajectory, truth: Trajectory | None, metres: bool) -> str:
@@ -129,18 +165,6 @@ def _draw_trajectory(slam: Slam, trajectory: Trajectory, truth: Trajectory | Non
     if not len(trajectory):
         return ""
     return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric, metres)
-
-
-def template(package: str, name: str) -> jinja2.Template:
-    """Load a page's template, a file of `package`, with autoescaping."""
-    text = (files(package) / name).read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(text)
-
-
-def style() -> str:
-    """Return the style sheet of all pages: light and dark mode, desktop and phone."""
-    return (files("vggtgeo.report") / "style.css").read_text(encoding="utf-8")
 
 
 def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[Fact]:

@@ -28,11 +28,11 @@ from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.first_pass import begin_with_found_camera
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
+from vggtgeo.slam.self_calibration import self_calibrate
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
@@ -109,7 +109,11 @@ def reconstruct(
 
     """
     clock, began = Clock(), time.perf_counter()
-    _check_arguments(roles, settings, camera, known_map, callbacks, facts, warned, checkpoints, title, seed)
+    check_run_arguments(roles.roles if isinstance(roles, Perception) else roles, settings, camera, known_map)
+    check_kind("callbacks", callbacks, Iterable, "a list of `vggtgeo.Callback`")
+    check_kind("checkpoints", checkpoints, Checkpoints | None, "`vggtgeo.Checkpoints`, or None")
+    _check_report(title, facts, warned)
+    check_whole("seed", seed)
     settings = settings or SlamSettings()
     with program_settings(), interruption() as stop, collected_warnings() as collected:
         with stop.at_once():  # a live camera may not deliver any frame
@@ -133,7 +137,7 @@ def reconstruct(
         hooks = RunCallbacks((windows, evidence, overlay, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles, source.camera)
-        if settings.camera.still_parts and source.repeatable(selection):
+        if settings.camera.static_overlay and source.repeatable(selection):
             with stop.at_once():
                 perception = _without_overlay(perception, source, selection, hooks, overlay, evidence)
         if first is None and before is None:
@@ -148,7 +152,7 @@ def reconstruct(
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
             **reduction_summary(source, slam),
-            **({} if overlay.found is None else {"still_parts": round(overlay.found.share, 4)}),
+            **({} if overlay.found is None else {"static_overlay": round(overlay.found.share, 4)}),
         }
         finished = _FinishedRun(
             slam=slam,
@@ -164,22 +168,8 @@ def reconstruct(
         return _conclude(finished, settings, hooks, windows.records, overlay, evidence)
 
 
-def _check_arguments(
-    roles: Any,
-    settings: Any,
-    camera: Any,
-    known_map: Any,
-    callbacks: Any,
-    facts: Any,
-    warned: Any,
-    checkpoints: Any,
-    title: Any,
-    seed: Any,
-) -> None:
+def _check_report(title: Any, facts: Any, warned: Any) -> None:
     """Validate before the first frame what is used after the last one."""
-    check_run_arguments(roles.roles if isinstance(roles, Perception) else roles, settings, camera, known_map)
-    check_kind("callbacks", callbacks, Iterable, "a list of `vggtgeo.Callback`")
-    check_kind("checkpoints", checkpoints, Checkpoints | None, "`vggtgeo.Checkpoints`, or None")
     check_kind("title", title, str | None, "a text")
     check_plain("facts", {} if facts is None else facts)
     invalid = [key for key in facts or {} if not isinstance(key, str) or key in RESERVED_KEYS]
@@ -190,7 +180,6 @@ def _check_arguments(
         )
     if isinstance(warned, str) or not isinstance(warned, Iterable):
         check_kind("warned", warned, (), "a list of warnings or texts")
-    check_whole("seed", seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,16 +267,16 @@ def _calibrate(
     Warnings and refusals are restored: the run itself reports them.
     """
     start, _, stride = selection
-    count = min(source.count(*selection) or 0, settings.camera.first_pass)
+    count = min(source.count(*selection) or 0, settings.camera.calibration_frames)
     if source.camera.known or not count or not settings.refinement.global_adjustment:
         return None
     end = start + count * stride
     hooks.each("on_stage", f"calibrating the camera on the first {count} frames")
     refused = {role: replace(counts) for role, counts in perception.refusals.items()}
-    with hooks.clock.measure("first pass"), stop.at_once(), warnings.catch_warnings():
+    with hooks.clock.measure("self-calibration"), stop.at_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         frames = lambda: source.frames.frames(start, end, stride)
-        found = begin_with_found_camera(frames, source.camera, perception.roles, settings)
+        found = self_calibrate(frames, source.camera, perception.roles, settings)
     for role, counts in refused.items():
         vars(perception.refusals[role]).update(vars(counts))
     return found
@@ -303,12 +292,12 @@ def _without_overlay(
 ) -> Perception:
     """Search for a static overlay; mask it in perception and in the verdict's evidence."""
     hooks.each("on_stage", "searching for a static overlay in the images")
-    with hooks.clock.measure("still parts"):
+    with hooks.clock.measure("static overlay"):
         overlay.search(source, selection)
     if overlay.found is None:
         return perception
     evidence.leave_out(overlay.found.mask)
-    return replace(perception, roles=replace(perception.roles, still_parts=overlay.found))
+    return replace(perception, roles=replace(perception.roles, static_overlay=overlay.found))
 
 
 def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -108,7 +108,7 @@ class Result:
 
     @property
     def intrinsics_as_read(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy, pixels of the original images, if the run reduced them (`camera.most_pixels`)."""
+        """fx, fy, cx, cy, pixels of the original images, if the run reduced them (`camera.max_pixels`)."""
         reduced = self.summary.get("images_reduced")
         if reduced is None:
             return self.intrinsics
@@ -241,7 +241,7 @@ class Result:
         with ThreadPoolExecutor(1, thread_name_prefix="mesh") as pool:  # mesh and report take equally long
             meshed = pool.submit(self._save_mesh, place / "mesh.ply")
             self.cloud.save_ply(place / "map.ply")
-            self._draw(place, run.folder.resolve().name, {**plain, "settings": flags})
+            self._draw(place, run.folder.resolve().name, {**plain, "settings": flags}, meshed.result)
             if self.record is not None:
                 write_scene(place, self.record.slam, self.record.valid, frames if depth == "every" else None)
             meshed.result()
@@ -268,11 +268,12 @@ class Result:
             raise InputError("`save_map` needs a result of a run in memory; this one was loaded from a folder")
         save_map(path, self.record.slam)
 
-    def _save_mesh(self, path: Path) -> None:
+    def _save_mesh(self, path: Path) -> Mesh | None:
         if self.mesh is not None:
             self.mesh.save_ply(path)
+        return self.mesh
 
-    def _draw(self, place: Path, name: str, summary: Mapping[str, Any]) -> None:
+    def _draw(self, place: Path, name: str, summary: Mapping[str, Any], mesh: Callable[[], Mesh | None]) -> None:
         record = self.record
         if len(self.trajectory):
             plot_trajectory(
@@ -296,6 +297,8 @@ class Result:
                 summary=summary,
                 verdict=self.verdict,
                 warnings=record.warnings,
+                uncertainty=self.uncertainty,
+                mesh=mesh,
             )
 
     def to_dict(self) -> dict[str, Any]:

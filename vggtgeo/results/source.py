@@ -115,18 +115,18 @@ class Source:
 def open_source(
     frames: str | os.PathLike[str] | Sequence | Iterable[Any], camera: Camera | None, settings: SlamSettings
 ) -> Source:
-    """Open the `frames` of `reconstruct`; reduce images to at most `camera.most_pixels`."""
-    most = settings.camera.most_pixels
+    """Open the `frames` of `reconstruct`; reduce images to at most `camera.max_pixels`."""
+    max_pixels = settings.camera.max_pixels
     if isinstance(frames, str | os.PathLike):
         frames = open_sequence(Path(frames))
     if not isinstance(frames, Sequence):
         stream = frame_stream(frames, camera)
-        return Source("frames", reduced(stream, most), None, stream.camera)
+        return Source("frames", reduced(stream, max_pixels), None, stream.camera)
     name = frames.name.encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
     view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
     simulated = isinstance(frames, SyntheticSequence)
     truth, metres = _truth(frames), getattr(frames, "truth_in_metres", True)
-    return Source(name, reduced(view, most), truth, view.camera, simulated, metres)
+    return Source(name, reduced(view, max_pixels), truth, view.camera, simulated, metres)
 
 
 def _truth(sequence: Sequence) -> Trajectory | None:

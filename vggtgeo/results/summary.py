@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-import resource
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -17,6 +16,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.peak_memory import peak_memory_gb
 from vggtgeo.results.files import submap_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
@@ -45,7 +45,7 @@ RESERVED_KEYS = frozenset(
         *("verdict", "settings", "versions", "frames", "frames_tracked", "keyframes", "pairs", "pieces"),
         *("peak_memory_gb", "scale", "scale_basis", "pose_sigma", "intrinsics", "lens", "rolling_shutter"),
         *("seconds_by_stage", "notes", "map_points", "dense", "frames_per_second", "interrupted", "images_reduced"),
-        *("still_parts", "truth", "frames_per_second_whole_run"),
+        *("static_overlay", "truth", "frames_per_second_whole_run"),
     }
 )
 """Keys of every summary, which `facts` of `vggtgeo.reconstruct` must not use."""
@@ -75,7 +75,7 @@ def summarise(
         "keyframes": len(slam.keyframes),
         "pairs": len(slam.map.pairs),
         "pieces": list_submaps(slam),
-        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
+        "peak_memory_gb": round(peak_memory_gb(), 3),
         "scale": scale_name(slam, verdict),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
         **_pose_sigma(slam),

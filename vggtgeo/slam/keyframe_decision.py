@@ -11,20 +11,17 @@ from vggtgeo.slam.settings.groups import KeyframeSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 
-def needs_keyframe(
-    pose: np.ndarray, keyframe_pose: np.ndarray, inliers: int, min_inliers: int, settings: KeyframeSettings
-) -> bool:
+def needs_keyframe(pose: np.ndarray, keyframe_pose: np.ndarray, inliers: int, settings: KeyframeSettings) -> bool:
     """Whether a tracked frame becomes a keyframe: it moved or turned too far from its keyframe, or shares too little.
 
     Args:
         pose: of the frame, float64 [4, 4], world -> camera.
         keyframe_pose: of the keyframe that it was tracked against, likewise.
         inliers: matches with that keyframe that agree with the pose.
-        min_inliers: fewer make it a keyframe.
-        settings: largest distance and angle.
+        settings: largest distance and angle, least inliers.
 
     """
-    return view_change(pose, keyframe_pose, settings) > 1.0 or inliers < min_inliers
+    return view_change(pose, keyframe_pose, settings) > 1.0 or inliers < settings.min_inliers
 
 
 def view_change(pose: np.ndarray, keyframe_pose: np.ndarray, settings: KeyframeSettings) -> float:

@@ -26,7 +26,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.start import (
-    MOST_WAITING,
+    MAX_WAITING,
     begin_again_with_depth,
     start_without_depth,
     without_depth,
@@ -64,16 +64,9 @@ NEIGHBOURS = 3
 """Keyframes before and after an old one that make up the window when the camera comes back to it."""
 
 
-def begin(camera: Camera, roles: Roles, settings: SlamSettings) -> Slam:
-    """The state before the first frame."""
-    intrinsics = np.array(camera.intrinsics, np.float64)
-    if camera.known:
-        sigma = np.full(4, settings.camera.known_intrinsics_sigma * intrinsics[0])
-    else:
-        focal = settings.camera.guessed_intrinsics_sigma * intrinsics[0]
-        centre = settings.camera.guessed_centre_sigma * np.array([camera.width, camera.height])
-        sigma = np.array([focal, focal, *centre])
-    return Slam(Map(roles.metric), CameraEstimate(intrinsics, given=intrinsics, sigma=sigma))
+def begin(camera: Camera, roles: Roles) -> Slam:
+    """Return the state before the first frame."""
+    return Slam(Map(roles.metric), CameraEstimate.of(camera))
 
 
 @in_double_precision
@@ -106,7 +99,7 @@ def step(
     else:
         slam = _refer_to(slam, found.keyframe, roles)
         slam = _with_record(slam, record_of(frame, found))
-        slam = _with_view(slam, data.view, roles, settings)
+        slam = _with_view(slam, data.view, roles)
     return _place_waiting(slam, roles) if was_lost else slam
 
 
@@ -199,11 +192,11 @@ def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> 
         found = track(given, keyframe, view_of(keyframe, slam.tracker, slam.intrinsics, roles))
         if best is None or _rank(found) > _rank(best):
             best = found
-        if best.accepted and (best.evidence.inliers >= settings.tracking.least_inliers or best.evidence.dense_strong):
+        if best.accepted and (best.evidence.inliers >= settings.keyframes.min_inliers or best.evidence.dense_strong):
             break
     assert best is not None
     # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
-    if not settings.tracking.search_map or (best.accepted and not data.description.described):
+    if best.accepted and not data.description.described:
         return best
     piece = slam.keyframes[slam.map.roots[-1] :]
     if not best.accepted:
@@ -214,9 +207,7 @@ def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> 
 
 
 def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameData:
-    """The data with a way to its segments, where lines take part in tracking."""
-    if not settings.line.in_tracking:
-        return data
+    """The data with a way to its segments."""
     return replace(data, find_lines=lambda: find_lines(data.frame.image, roles, settings))
 
 
@@ -289,8 +280,8 @@ def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
     return replace(slam, tracker=against_reference(slam.map, replace(slam.tracker, reference=reference)))
 
 
-def _with_view(slam: Slam, view: RgbdView | None, roles: Roles, settings: SlamSettings) -> Slam:
-    return replace(slam, tracker=with_view(slam.map, slam.tracker, view, slam.intrinsics, roles, settings.refinement))
+def _with_view(slam: Slam, view: RgbdView | None, roles: Roles) -> Slam:
+    return replace(slam, tracker=with_view(slam.map, slam.tracker, view, slam.intrinsics, roles))
 
 
 def _place_waiting(slam: Slam, roles: Roles) -> Slam:
@@ -323,11 +314,11 @@ def _missed(slam: Slam, data: FrameData, evidence: Evidence, roles: Roles, setti
     if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
-    waiting = wait(slam.tracker, frame, features, MOST_WAITING)
+    waiting = wait(slam.tracker, frame, features, MAX_WAITING)
     slam = replace(slam, tracker=replace(slam.tracker, lost=slam.tracker.lost + 1))
-    shown = sum(len(other.features) > settings.tracking.least_inliers for other in waiting)
+    shown = sum(len(other.features) > settings.keyframes.min_inliers for other in waiting)
     patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE
-    if not patient and len(features) > settings.tracking.least_inliers:
+    if not patient and len(features) > settings.keyframes.min_inliers:
         note = (
             f"a new piece of map begins at frame {frame.index} ({frame.name}): "
             "nothing ties it to the one before, its place is only a guess"
@@ -366,7 +357,4 @@ def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settin
 
 
 def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
-    return needs_keyframe(
-        *(found.pose, found.keyframe.pose, found.evidence.inliers),
-        *(settings.tracking.least_inliers, settings.keyframes),
-    )
+    return needs_keyframe(found.pose, found.keyframe.pose, found.evidence.inliers, settings.keyframes)

@@ -84,7 +84,7 @@ def run(
     source: Sequence | FrameStream = frames if isinstance(frames, Sequence) else frame_stream(frames, camera)
     roles = roles or default_roles(source.has_depth)
     settings, clock = settings or SlamSettings(), clock or Clock()
-    source = reduced(source, settings.camera.most_pixels)
+    source = reduced(source, settings.camera.max_pixels)
     selected = source.frames(start, end, stride)
     known = None if known_map is None else entered(known_map, source.camera, roles.points)
     yield from run_frames(selected, source.camera, roles, settings, clock, known)
@@ -120,11 +120,11 @@ def run_frames(
     before: the last frames of that state, of which the run that goes on asks whether the next depth image is new.
     waiting: entered while a frame is waited for.
     """
-    slam = begin(camera, roles, settings) if known is None else known
+    slam = begin(camera, roles) if known is None else known
     # Frames of a map whose camera's lens was found are as that lens drew them.
     seen_by = slam.camera.lens or camera
-    if roles.still_parts is not None:
-        roles = replace(roles, still_parts=roles.still_parts.undistorted(seen_by))
+    if roles.static_overlay is not None:
+        roles = replace(roles, static_overlay=roles.static_overlay.undistorted(seen_by))
     last = slam.frames[-1].timestamp if slam.frames else -math.inf
     source = with_own_depth(in_order(frames, seen_by, last), before)
     for frame, description in _described(source, seen_by, roles, clock, waiting):
@@ -249,13 +249,13 @@ def _described(
         with clock.measure(stage):
             features = roles.points.describe(image)
             check_answer("points.describe", features, Features)
-            return features if roles.still_parts is None else roles.still_parts.without_points(features)
+            return features if roles.static_overlay is None else roles.static_overlay.without_points(features)
 
     def prepare(frame: Frame) -> tuple[Frame, Description]:
         image = undistorter.image(frame.image)
         depth = None if frame.depth is None else undistorter.depth(frame.depth)
-        if depth is not None and roles.still_parts is not None:
-            depth = roles.still_parts.without_depth(depth)
+        if depth is not None and roles.static_overlay is not None:
+            depth = roles.static_overlay.without_depth(depth)
         frame = Frame(frame.index, frame.timestamp, image, depth, frame.name)
         view = None
         if roles.alignment is not None and roles.metric and camera.known:

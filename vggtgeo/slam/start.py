@@ -20,8 +20,8 @@ from vggtgeo.slam.tracking.tracker import FramePose, Waiting
 from vggtgeo.slam.window.sliding_window import scale_anchor
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
-MOST_WAITING = 90
-LEAST_SHARED = 100
+MAX_WAITING = 90
+MIN_SHARED = 100
 """Matches that a waiting frame shares with the present one, if it is to begin the map in place of the first keyframe:
 `TwoViewStart` needs 60 of them to agree. The initialiser of ORB-SLAM (Mur-Artal, Montiel, Tardos, 2015) takes another
 reference below as many."""
@@ -37,7 +37,7 @@ def begin_again_with_depth(
 ) -> Slam | None:
     """The map begins at this frame in place of the first keyframe, whose depth is not known.
 
-    None where this frame's depth is known at fewer than `least_inliers` key points.
+    None where this frame's depth is known at fewer than `min_inliers` key points.
     """
     depth = roles.depth.estimate(frame.image, frame.depth, tuple(slam.intrinsics))
     if not np.any(np.isfinite(depth.depth)):
@@ -46,7 +46,7 @@ def begin_again_with_depth(
     keyframe = make_keyframe(
         blind.number, frame, blind.pose, Description.of(features), roles, settings, slam.intrinsics
     )
-    if np.count_nonzero(np.isfinite(keyframe.points.inverse_depth)) < settings.tracking.least_inliers:
+    if np.count_nonzero(np.isfinite(keyframe.points.inverse_depth)) < settings.keyframes.min_inliers:
         return None
     note = f"the depth of frame {blind.frame} is not known; the map begins at frame {frame.index} ({frame.name})"
     before = tuple(
@@ -125,7 +125,7 @@ def _later_first(slam: Slam, features: Features, roles: Roles, settings: SlamSet
     """
     chosen, old = None, slam.keyframes[slam.window.members[-1]]
     for waiting in reversed(slam.tracker.waiting):
-        if waiting.frame < old.frame or len(roles.points.match(waiting.features, features)) < LEAST_SHARED:
+        if waiting.frame < old.frame or len(roles.points.match(waiting.features, features)) < MIN_SHARED:
             break
         chosen = waiting
     if chosen is None:
@@ -148,14 +148,14 @@ def _later_first(slam: Slam, features: Features, roles: Roles, settings: SlamSet
     return replace(
         slam,
         map=replace(slam.map, keyframes=(*slam.keyframes[:-1], first)),
-        tracker=replace(slam.tracker, frames=tuple(records), waiting=(back, *others)[-MOST_WAITING:]),
+        tracker=replace(slam.tracker, frames=tuple(records), waiting=(back, *others)[-MAX_WAITING:]),
     )
 
 
 def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
     waiting = (*slam.tracker.waiting, Waiting(frame.index, frame.timestamp, frame.image, features))
     record = FramePose(frame.index, frame.timestamp, slam.window.members[-1], np.eye(4), False, 0)
-    return replace(slam, tracker=replace(slam.tracker, waiting=waiting[-MOST_WAITING:], frames=(*slam.frames, record)))
+    return replace(slam, tracker=replace(slam.tracker, waiting=waiting[-MAX_WAITING:], frames=(*slam.frames, record)))
 
 
 def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:

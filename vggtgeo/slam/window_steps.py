@@ -21,7 +21,7 @@ def insert_keyframe(
 
 def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
     """The state after its window was bundle-adjusted."""
-    found = sliding_window.adjust(slam.map, slam.window, slam.intrinsics, camera_prior(slam, settings), settings)
+    found = sliding_window.adjust(slam.map, slam.window, slam.intrinsics, camera_prior(slam), settings)
     return replace(
         slam,
         map=found.map,
@@ -31,7 +31,7 @@ def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
     )
 
 
-def camera_prior(slam: Slam, settings: SlamSettings) -> CameraPrior:
+def camera_prior(slam: Slam) -> CameraPrior:
     """The prior of the intrinsics in the window."""
-    sigma = slam.camera.window_sigma(len(slam.keyframes), settings.camera.known_intrinsics_sigma)
+    sigma = slam.camera.window_sigma(len(slam.keyframes))
     return CameraPrior(slam.camera.given, sigma)

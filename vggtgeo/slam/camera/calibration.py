@@ -47,15 +47,15 @@ SHARE = 0.5
 """Most variance of a direction by the pairs, of the prior's, for it to be moved at all."""
 SET_ASIDE = 0.2
 """Of the matches of key points that are seen often enough."""
-LEAST_SEEN = 2
+MIN_SEEN = 2
 """Matches that each key point keeps."""
 SEED = 0
-MOST_PAIRS = 1000
+MAX_PAIRS = 1000
 """In even steps over all edges: a bound of memory and time, above the 879 that redkitchen has. With 120 of those of 60
 frames of corridor-office, ten seeds wanted 488.7 to 492.5 px, one of them for no reason, and their ATE spread by
 47.7 %; with all of them 490.0 to 490.4 px and 6.6 % (`benchmarks/seeds.py`)."""
-LEAST_MATCHES = 15
-LEAST_FLOW = 3.0
+MIN_MATCHES = 15
+MIN_FLOW = 3.0
 """Pixels, the median of a pair's matches: a camera that stands still says nothing of its lens."""
 BLOCK = 3
 """Keyframes in a row whose errors count as shared."""
@@ -134,13 +134,13 @@ def keyframe_pairs(
     readout = camera.readout
     moving_at = {} if motions is None else dict(zip(by_number, motions, strict=True))
     found = []
-    chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MOST_PAIRS).astype(int))
+    chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MAX_PAIRS).astype(int))
     for edge in (edges[row] for row in chosen if row < len(edges)):
         host, target = by_number[edge.host], by_number[edge.target]
         inverse = (host.points.prior if known.metric else host.points.inverse_depth)[edge.slots]
         seen = np.isfinite(inverse) & (inverse > 0)
         before, after = host.points.pixels[edge.slots[seen]], edge.pixels[seen]
-        if len(before) < LEAST_MATCHES or np.median(np.linalg.norm(after - before, axis=1)) < LEAST_FLOW:
+        if len(before) < MIN_MATCHES or np.median(np.linalg.norm(after - before, axis=1)) < MIN_FLOW:
             continue
         relative = target.pose @ rigid.invert(host.pose)
         block = min(edge.host, edge.target) // BLOCK
@@ -174,7 +174,7 @@ def _set_aside(problem: Problem) -> np.ndarray:
     chosen = present & (np.random.default_rng(SEED).random(present.shape) < SET_ASIDE)
     left = np.zeros((problem.num_keyframes, present.shape[1]), int)
     np.add.at(left, source, (present & ~chosen).astype(int))
-    return np.asarray(chosen & (left[source] >= LEAST_SEEN))
+    return np.asarray(chosen & (left[source] >= MIN_SEEN))
 
 
 def without_surfaces(problem: Problem) -> Problem:

@@ -13,7 +13,7 @@ from vggtgeo.io.kept_program import KeptProgram
 
 CHANCE = 1e-3
 """Of taking a camera that is no better."""
-LEAST_HOSTS = 3
+MIN_HOSTS = 3
 
 
 def _energies(problem: Problem, state: State) -> Float[Array, "e p"]:
@@ -42,7 +42,7 @@ def gain(
     np.add.at(counts, source, chosen.sum(1))
     total, hosts = counts.sum(), np.count_nonzero(counts)
     free = hosts - max(fitted, 1)
-    if hosts < LEAST_HOSTS or free < 1:
+    if hosts < MIN_HOSTS or free < 1:
         return 0.0, float("inf")
     mean = sums.sum() / total
     by_keyframe = np.sqrt(hosts / free * np.sum((sums - mean * counts) ** 2)) / total

@@ -25,9 +25,9 @@ from scipy.stats import t as student_t
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.threads import map_in_threads
 
-LEAST_PAIRS = 8
+MIN_PAIRS = 8
 PARAMETERS = 4
-LEAST_BLOCKS = PARAMETERS + 2
+MIN_BLOCKS = PARAMETERS + 2
 ITERATIONS, SETTLED = 20, 0.002
 """At most, and the step, in the longest ones, below which there are no more. Half the focal length is seven of these
 away."""
@@ -86,7 +86,7 @@ def camera_of_pairs(
     """
     kinds, block = np.unique([pair.block for pair in pairs], return_inverse=True)
     count = len(kinds)
-    if len(pairs) < 2 * LEAST_PAIRS or count < LEAST_BLOCKS:
+    if len(pairs) < 2 * MIN_PAIRS or count < MIN_BLOCKS:
         return None
     points = _Points.of(pairs)
     value, poses, reduced = _solved(points, intrinsics)

@@ -1,10 +1,11 @@
 """The lens of a camera that nobody calibrated: found once in the last adjustment, and taken out of the map.
 
-A guessed camera is a pinhole until the whole map is adjusted, that of a first pass (`first_pass.py`) or of the run.
+A guessed camera is a pinhole until the whole map is adjusted: that of the calibration frames (`self_calibration.py`),
+or of the run.
 Where its lens distorts, the focal length takes that up, and comes out wrong: redkitchen, images alone, ends at 539 and
 550 px (COLMAP: 522 and 520, with k1 -0.007 and k2 -0.043). So the map is adjusted once more with the two radial
 coefficients of the lens free (520 px, -0.006, -0.047).
-Where that explains the matches better by more than chance, and moves pixels by more than `LEAST_WARP`, images, key
+Where that explains the matches better by more than chance, and moves pixels by more than `MIN_WARP`, images, key
 points and segments of the keyframes are resampled to those of the ideal pinhole, and everything after sees only that.
 
 What every tracked frame was placed by hangs on keyframes, and moves with them.
@@ -34,7 +35,7 @@ from vggtgeo.slam.sparse_map.map import Map
 
 RADIAL = 0.3
 """Standard deviation of k1 and k2 before anything is seen: lenses of phones and action cameras are within."""
-LEAST_WARP = 1.0
+MIN_WARP = 1.0
 """Pixels, the most that the lens moves any pixel: below, images would lose more by being resampled."""
 
 Solve = Callable[[Problem, State], State]
@@ -58,7 +59,7 @@ class FoundLens:
     @property
     def pays(self) -> bool:
         """Whether it is there, and worth to be taken out."""
-        return self.gain > self.needed and LEAST_WARP < self.warp < float("inf")
+        return self.gain > self.needed and MIN_WARP < self.warp < float("inf")
 
 
 def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solve) -> FoundLens | None:

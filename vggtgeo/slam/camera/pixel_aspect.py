@@ -3,7 +3,7 @@
 Cameras have square pixels, so a guessed one has one focal length. But recordings are resized to the input of a
 network, widescreen is squeezed into 4:3, tapes have pixels of 0.9: then one focal length fits no more, and a map takes
 that up by depths and motions. So the map is adjusted once more with both focal lengths free. Where that explains the
-matches better by more than chance, and they differ by more than `LEAST_STRETCH`, the camera has both from then on.
+matches better by more than chance, and they differ by more than `MIN_STRETCH`, the camera has both from then on.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.slam.camera.camera_gain import gain
 
-LEAST_STRETCH = 0.03
+MIN_STRETCH = 0.03
 """Logarithm of `f_x / f_y`. Images that are reduced to whole pixels differ by 0.005 at most, and pixels of tapes by at
 least 0.065 (720 x 576 shown as 768 x 576)."""
 
@@ -44,12 +44,12 @@ class FoundAspect:
     @property
     def pays(self) -> bool:
         """Whether pixels are not square."""
-        return self.gain > self.needed and abs(self.stretch) > LEAST_STRETCH
+        return self.gain > self.needed and abs(self.stretch) > MIN_STRETCH
 
 
 def are_square(intrinsics: np.ndarray) -> bool:
     """Whether fx and fy, pixels, count as one."""
-    return bool(abs(np.log(intrinsics[0] / intrinsics[1])) <= LEAST_STRETCH)
+    return bool(abs(np.log(intrinsics[0] / intrinsics[1])) <= MIN_STRETCH)
 
 
 def find_aspect(problem: Problem, state: State, solve: Solve) -> FoundAspect | None:

@@ -29,7 +29,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera_models import SquarePinhole
 from vggtgeo.slam.camera.camera_estimate import Readout
-from vggtgeo.slam.camera.camera_gain import LEAST_HOSTS, gain, match_energies
+from vggtgeo.slam.camera.camera_gain import MIN_HOSTS, gain, match_energies
 from vggtgeo.slam.threads import map_in_threads
 
 FIRST_SHIFT, SETTLED = 1.0, 0.05
@@ -259,7 +259,7 @@ def find_readout(
             continue
         slopes = search.slopes(0.0, state)
         slopes = slopes[slopes != 0]
-        if len(slopes) < LEAST_HOSTS:
+        if len(slopes) < MIN_HOSTS:
             continue
         sure = abs(slopes.sum()) / np.sqrt(np.sum(slopes**2)) / student_t.isf(WORTH_A_TRIAL, len(slopes) - 1)
         if sure > max(surest, 1.0):

@@ -12,14 +12,14 @@ from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
-from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
+from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.camera.camera_of_pairs import CameraPair
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
 from vggtgeo.slam.camera.rolling_shutter import find_readout, without_readout
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
-from vggtgeo.slam.global_map.global_shape import GlobalShape, global_solver, shape_of
+from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS, GlobalShape, global_solver, shape_of
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
@@ -74,7 +74,7 @@ class _Whole:
 
     @classmethod
     def of(cls, slam: Slam, settings: SlamSettings) -> _Whole:
-        edges = _edges(slam, settings)
+        edges = _edges(slam)
         degrees = np.bincount([edge.host for edge in edges])
         shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.map.factors, len(slam.map.pairs), settings)
         camera = CameraPrior(slam.camera.given, slam.camera.sigma, camera_of(slam))
@@ -113,9 +113,9 @@ class _Whole:
             return slam, self
         camera = replace(self.camera, mean=slam.intrinsics)
         if not slam.camera.calibrated:
-            held = settings.camera.known_intrinsics_sigma * slam.intrinsics[0]
+            held = KNOWN_SIGMA * slam.intrinsics[0]
             camera = replace(camera, sigma=np.full(4, held), kind=_of_pixels(slam.intrinsics))
-        return slam, replace(self, edges=_edges(slam, settings), surfaces=_surfaces(slam), camera=camera)
+        return slam, replace(self, edges=_edges(slam), surfaces=_surfaces(slam), camera=camera)
 
 
 def _solves(settings: SlamSettings) -> Solve:
@@ -196,10 +196,10 @@ def _of_pixels(intrinsics: np.ndarray) -> type[Pinhole | SquarePinhole]:
     return SquarePinhole if are_square(intrinsics) else Pinhole
 
 
-def _edges(slam: Slam, settings: SlamSettings) -> list[Directed]:
+def _edges(slam: Slam) -> list[Directed]:
     by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
     edges = [edge for pair in slam.map.pairs for edge in directions(pair, by_number)]
-    return _thin(edges, len(slam.keyframes), settings)
+    return _thin(edges, len(slam.keyframes))
 
 
 def _surfaces(slam: Slam) -> list[Surface]:
@@ -296,10 +296,10 @@ def _of_any_camera(slam: Slam) -> tuple[Factor, ...]:
     return tuple(factor for factor in slam.map.factors if not tied(factor))
 
 
-def _thin(edges: list[Directed], keyframes: int, settings: SlamSettings) -> list[Directed]:
-    """At most `global_neighbours` edges a host: those with the most matches."""
+def _thin(edges: list[Directed], keyframes: int) -> list[Directed]:
+    """At most `MAX_NEIGHBOURS` edges a host: those with the most matches."""
     kept = []
     for host in range(keyframes):
         own = sorted((edge for edge in edges if edge.host == host), key=lambda edge: -len(edge.slots))
-        kept += own[: settings.refinement.global_neighbours]
+        kept += own[:MAX_NEIGHBOURS]
     return kept

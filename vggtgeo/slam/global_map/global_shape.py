@@ -25,6 +25,8 @@ MOST_PADDING = 2.0
 """Stored edges for each that is there; a larger map of few edges keeps its own shape."""
 TIES, PAIRS = 2, 12
 """Tracked motions and pairs for each keyframe that there is room for. Redkitchen: 64 keyframes, 533 pairs."""
+MAX_NEIGHBOURS = 16
+"""Edges of one keyframe, at most: they set the padded size, and so time and memory of the adjustment."""
 LARGEST_DENSE = 128
 """Keyframes up to which the reduced system is factorised whole: at 64 that takes as long as conjugate gradients do, and
 16 s to compile in place of 24 s."""
@@ -47,7 +49,7 @@ class GlobalShape:
 def shape_for(keyframes: int, settings: SlamSettings) -> GlobalShape:
     """The shape of a map of so many keyframes, tied by their tracked motions, with metric depth."""
     padded = padded_count(keyframes)
-    size = replace(window_size(settings), keyframes=padded, degree=settings.refinement.global_neighbours)
+    size = replace(window_size(settings), keyframes=padded, degree=MAX_NEIGHBOURS)
     return GlobalShape(size, ((MeasuredRelativePose, TIES * padded),), PAIRS * padded)
 
 
@@ -56,7 +58,7 @@ def shape_of(
 ) -> GlobalShape:
     """The shape of a map: that of `shape_for` wherever it fits.
 
-    edges_of_host: how many edges each keyframe has, at most `global_neighbours`.
+    edges_of_host: how many edges each keyframe has, at most `MAX_NEIGHBOURS`.
     """
     usual, counts = shape_for(keyframes, settings), Counter(type(factor) for factor in factors)
     size, edges = usual.size, sum(edges_of_host)

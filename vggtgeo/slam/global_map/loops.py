@@ -24,6 +24,8 @@ from vggtgeo.slam.tracking.track import PIXEL_SIGMA
 
 LEAST_VISIBLE, MOST_TURNED = 0.4, np.deg2rad(40)
 """Share of one keyframe's points that another should see, and angle between them, for a pair to be proposed."""
+MIN_INLIERS = 50
+"""A loop needs more inliers of PnP than this: keyframes far apart in time have no predicted pose to check them by."""
 FLOOR = (0.02, np.deg2rad(0.5))
 """Standard deviation of a verified pose that no number of matches removes, metres and radians: the depths that it
 rests on are those of one keyframe, and share its error."""
@@ -37,27 +39,25 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     """
     label, known = piece_of(slam.map), {pair.key for pair in slam.map.pairs}
     proposed = list(dict.fromkeys([*_by_estimate(slam, settings, known), *_by_appearance(slam, settings, known)]))
-    found = _verified(slam, proposed, label, roles, settings)
+    found = _verified(slam, proposed, label, roles)
     before, (straight, believed) = slam, straightened(slam, found)
     slam = replace(straight, map=replace(straight.map, pairs=(*slam.map.pairs, *(loop.pair for loop in believed))))
     if straight is before:
         return slam
     known |= {loop.pair.key for loop in found}
-    more = _verified(slam, _by_estimate(slam, settings, known), piece_of(slam.map), roles, settings)
+    more = _verified(slam, _by_estimate(slam, settings, known), piece_of(slam.map), roles)
     return replace(
         slam, map=replace(slam.map, pairs=(*slam.map.pairs, *(loop.pair for loop in more if loop.agrees(slam))))
     )
 
 
-def _verified(
-    slam: Slam, proposed: list[tuple[int, int]], label: np.ndarray, roles: Roles, settings: SlamSettings
-) -> list[Loop]:
+def _verified(slam: Slam, proposed: list[tuple[int, int]], label: np.ndarray, roles: Roles) -> list[Loop]:
     """Those of the proposed pairs that geometry confirms. Pieces of free scale have units of their own."""
     comparable = [(first, second) for first, second in proposed if slam.metric or label[first] == label[second]]
 
     def verified(pair: tuple[int, int]) -> Loop | None:
         first, second = (slam.keyframes[number] for number in pair)
-        return verify(first, second, roles, settings, slam.intrinsics)
+        return verify(first, second, roles, slam.intrinsics)
 
     loops = map_in_threads(verified, comparable, alone=not can_search(slam.keyframes[0].features))
     return [loop for loop in loops if loop is not None]
@@ -111,9 +111,7 @@ def _by_appearance(slam: Slam, settings: SlamSettings, known: set[tuple[int, int
     return chosen
 
 
-def verify(
-    first: Keyframe, second: Keyframe, roles: Roles, settings: SlamSettings, intrinsics: np.ndarray
-) -> Loop | None:
+def verify(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarray) -> Loop | None:
     """Matches that agree on one pose of the second keyframe in the first one's points, whatever the drift."""
     matches = roles.points.match(first.features, second.features)
     inverse = first.points.inverse_depth[matches.index_i]
@@ -121,7 +119,7 @@ def verify(
     matches, inverse = matches.select(known), inverse[known]
     points = rigid.unproject(matches.pixels_i, inverse, first.pose, intrinsics)
     guess = roles.geometry.locate(PoseQuery(second.image, intrinsics, points, matches.pixels_j, matches.confidence))
-    if guess.result is not GeometryResult.SUCCESS or guess.inlier_count <= settings.matching.least_covisible:
+    if guess.result is not GeometryResult.SUCCESS or guess.inlier_count <= MIN_INLIERS:
         return None
     agreed, empty = matches.select(guess.inliers), np.zeros(0, int)
     pair = Pair(first.number, second.number, agreed, LineMatches(empty, empty, np.zeros(0)))

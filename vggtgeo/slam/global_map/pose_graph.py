@@ -25,6 +25,7 @@ from vggtgeo.bundle.solution import solve
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.relative_pose import RelativePose
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.global_map.global_shape import padded_count
 from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, relative_pose_rows
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.solvers.kernels import Cauchy
@@ -37,7 +38,8 @@ GRADUATION = Graduation(factors=(256.0, 64.0, 16.0, 4.0), iterations=6)
 """A loop of 2 cm that 10 m of drift contradict is 500 standard deviations off, half of the first width."""
 ITERATIONS = 50
 ROOM = 32
-"""Loops are padded to a multiple of this, so that another graph of as many keyframes compiles nothing."""
+"""Loops are padded to a multiple of this, and poses to `padded_count`: a graph of about the same size compiles
+nothing."""
 DENSE_POSES = 200
 """Poses up to which the factor is dense, whatever the loops are; it takes some 20 ms."""
 
@@ -74,23 +76,25 @@ def solve_pose_graph(graph: PoseGraph) -> Untangled:
     """The poses that motions and loops agree on; the graph's own, and no loop believed, where the solve fails."""
     spread = drift_variance(graph)
     loosened = [replace(motion, information=motion.information / spread) for motion in graph.motions]
-    motions = RelativePose(**relative_pose_rows(loosened))
+    count = len(graph.poses)
+    padding = padded_count(count) - count
+    motions = RelativePose(**relative_pose_rows(loosened, count + padding))
     room = -(-max(len(graph.loops), 1) // ROOM) * ROOM
     loops = LoopClosure(**relative_pose_rows(graph.loops, room), kernel=Cauchy(jnp.asarray(TIE_WIDTH)))
     problem, initial, _ = pack(
         _no_observations(),
-        rigid.to_quaternion(graph.poses),
+        rigid.to_quaternion(np.concatenate([graph.poses, np.tile(np.eye(4), (padding, 1, 1))])),
         np.array([1.0, 1.0, 0.0, 0.0]),
         np.zeros(0),
-        fixed_pose=graph.held,
+        fixed_pose=np.concatenate([graph.held, np.ones(padding, bool)]),
         fixed_intrinsics=True,
         terms=(motions, loops),
     )
-    small = len(graph.poses) <= DENSE_POSES
+    small = count <= DENSE_POSES
     reduced = DenseCholesky() if small else choose_reduced_solver(problem)
     solver = SchurLevenbergMarquardt(max_iterations=ITERATIONS, rtol=1e-6, reduced_solver=reduced)
     solution = solve_graph_jit(problem, initial, solver=solver, graduation=GRADUATION)
-    poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64))
+    poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64)[:count])
     if not np.isfinite(poses).all():
         return Untangled(graph.poses, np.zeros(len(graph.loops), bool))
     return Untangled(poses, np.array([distance(loop, poses) < BELIEF for loop in graph.loops], bool))

@@ -1,1 +1,1 @@
-"""What a run may be told: the numbers of its stages, who plays which role, presets, tables in files."""
+"""Settings of a run: numbers by stage, implementations of the roles, presets, and tables in files."""

@@ -1,4 +1,4 @@
-"""Fields that know what they may be: each setting states its bounds where it is declared, and is checked when made."""
+"""Validated fields: each setting states its bounds where it is declared, and is validated when it is made."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vggtgeo.io.errors import InputError
 
 
 class Expected(NamedTuple):
-    """What a setting may be: in words, for the error, and as a test."""
+    """Valid values of a setting: in words, for the error, and as a test."""
 
     words: str
     holds: Callable[[Any], bool]
@@ -26,7 +26,7 @@ def switch(default: bool) -> Any:
 
 
 def whole(default: int, at_least: int, at_most: int = 1_000_000) -> Any:
-    """A setting that is a whole number. at_most: arrays are made of such sizes, and JAX counts in 32 bits."""
+    """A setting that is an integer. at_most: arrays have such sizes, and JAX counts in 32 bits."""
     holds = lambda value: _is_whole(value) and at_least <= value <= at_most
     return _field(default, Expected(f"a whole number from {at_least} to {at_most}", holds))
 
@@ -51,10 +51,10 @@ def one_of(default: str, *others: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class CheckedSettings:
-    """A group of settings, its fields made by the functions above; `group` is its name in files and messages.
+    """A group of settings, with fields of the functions above; `group` is its name in files and messages.
 
     Raises:
-        InputError: a value is not what it may be; names the field, the value, and what is possible.
+        InputError: a value is invalid; names the field, the value, and the valid values.
 
     """
 

@@ -25,13 +25,12 @@ from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector,
 from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.perception.still_parts import StillParts
 from vggtgeo.slam.settings.groups import (
+    SEGMENT_SAMPLES,
     CameraSettings,
     DepthSettings,
     KeyframeSettings,
     LineSettings,
-    MatchingSettings,
     RefinementSettings,
-    TrackingSettings,
     WeightSettings,
     WindowSettings,
 )
@@ -62,8 +61,8 @@ class Roles:
             that out.
         flow: Follows a keyframe's key points into frames that `alignment` then refines, so that most frames need no
             descriptors; None describes and matches every frame.
-        still_parts: What of the images, as they are read, belongs to the camera and not to the world: nothing is
-            looked for there. `vggtgeo.reconstruct` finds it.
+        static_overlay: Mask of the parts of the images, as they are read, that do not move with the scene; no
+            features are detected there. `vggtgeo.reconstruct` finds it.
 
     Example:
         >>> import vggtgeo as vg
@@ -82,7 +81,7 @@ class Roles:
     alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
     flow: PatchFlow | None = field(default_factory=PatchFlow)
 
-    still_parts: StillParts | None = None
+    static_overlay: StillParts | None = None
 
     def __post_init__(self) -> None:
         """InputError for what plays no role, which would be found in the middle of a run."""
@@ -93,7 +92,7 @@ class Roles:
                     f"`{role}` is {given!r:.60}; expected an object with the methods {', '.join(methods)}, such as "
                     f"`vggtgeo.Roles().{role}`"
                 )
-        for role, kind in (("alignment", RgbdAlignment), ("flow", PatchFlow), ("still_parts", StillParts)):
+        for role, kind in (("alignment", RgbdAlignment), ("flow", PatchFlow), ("static_overlay", StillParts)):
             check_kind(role, getattr(self, role), kind | None, f"a `{kind.__name__}`, or None")
 
     def seeded(self, seed: int) -> Roles:
@@ -148,27 +147,23 @@ class SlamSettings:
     """Numbers of the pipeline by stage; lengths in metres, angles in radians, pixels where named so.
 
     Fields:
-        tracking: How a frame is placed.
         keyframes: When a frame becomes a keyframe.
-        matching: Which keyframes are joined by an edge.
-        line: Residuals of lines.
-        depth_terms: What metric depth says in the adjustments.
+        line: Line segments: whether they are used, and how.
+        depth_terms: Weights of metric depth in the adjustments.
         weights: Weight of a match.
-        camera: How far the intrinsics may move.
+        camera: Images as they are read, and the calibration of their camera.
         window: The keyframes that are adjusted together while the run goes on.
         refinement: The adjustment of the whole map at the end.
 
     Example:
         >>> import vggtgeo as vg
         >>> settings = vg.SlamSettings(window=vg.settings.WindowSettings(size=8))
-        >>> settings.window.size, settings.tracking.least_inliers
+        >>> settings.window.size, settings.keyframes.min_inliers
         (8, 50)
 
     """
 
-    tracking: TrackingSettings = field(default_factory=TrackingSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
-    matching: MatchingSettings = field(default_factory=MatchingSettings)
     line: LineSettings = field(default_factory=LineSettings)
     depth_terms: DepthSettings = field(default_factory=DepthSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
@@ -179,7 +174,7 @@ class SlamSettings:
     @property
     def padded_samples(self) -> int | None:
         """Samples of a segment in a problem's padded size; None where samples stand alone."""
-        return self.line.segment_samples if self.line.two_ends_lines else None
+        return SEGMENT_SAMPLES if self.line.two_ends_lines else None
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -191,5 +186,5 @@ class SlamSettings:
         if samples is not None and self.window.line_slots % samples:
             raise InputError(
                 f"`window.line_slots` is {self.window.line_slots}; with `line.two_ends_lines` it must be a multiple "
-                f"of `line.segment_samples`, which is {samples}"
+                f"of {samples}, the samples of a segment"
             )

@@ -1,4 +1,4 @@
-"""Settings as text and back: tables of a TOML file (`[tracking]`), assignments (`tracking.least_inliers=20`).
+"""Settings as text and back: tables of a TOML file (`[keyframes]`), assignments (`keyframes.min_inliers=20`).
 
 A kernel is its name and its numbers, in the order of its fields: `huber 1.5`, `cauchy 2.0`, `square`.
 """
@@ -38,7 +38,7 @@ def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
     """`settings` with the values of `tables`; all are put in at once, so that they are checked together.
 
     Raises:
-        InputError: a name that is no setting, or a value that it may not have.
+        InputError: an unknown setting, or an invalid value.
 
     """
     groups: dict[str, Any] = {}
@@ -56,12 +56,12 @@ def parsed(assignment: str) -> Tables:
     """`group.field=value` as a table; the value as in TOML, or a word without quotes.
 
     Raises:
-        InputError: there is no `=`, or the name is no setting.
+        InputError: there is no `=`, or the setting is unknown.
 
     """
     name, equals, text = (part.strip() for part in assignment.partition("="))
     if not equals:
-        raise InputError(f"`{assignment}` sets nothing; write `group.field=value`, such as `tracking.least_inliers=20`")
+        raise InputError(f"`{assignment}` sets nothing; write `group.field=value`, such as `keyframes.min_inliers=20`")
     _check_name(name)
     group, field = name.split(".")
     try:

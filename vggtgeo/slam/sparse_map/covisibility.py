@@ -8,8 +8,18 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.roles import LineMatches, PointMatches, RelativeView
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
+from vggtgeo.slam.settings.slam_settings import Roles, check_answer
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
+
+MIN_MATCHES, MIN_LINE_MATCHES = 12, 4
+"""Matches that agree with the tracked poses and join two keyframes; fewer may do so by chance."""
+REPROJECTION_GATE = 8.0
+"""Largest reprojection error of a match by the tracked poses, pixels. Wide against the noise of a match: the poses
+are not adjusted yet. Outliers within it are left to the robust kernel."""
+EPIPOLAR_GATE = 4.0
+"""The same for the epipolar distance, where depth is not known; narrower, because it checks one direction only."""
+MIN_OVERLAP = 0.25
+"""Share of a keyframe's points that must fall into another's image before the two are matched."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +73,7 @@ def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> f
     return float(np.mean(inside))
 
 
-def match_keyframes(
-    first: Keyframe, second: Keyframe, roles: Roles, settings: SlamSettings, intrinsics: np.ndarray
-) -> Pair | None:
+def match_keyframes(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarray) -> Pair | None:
     """Match two keyframes whose poses are known well enough to predict; None if they share too little.
 
     Where no depth is known in the first, that of the second tells what they share; without any, the matches do.
@@ -73,18 +81,17 @@ def match_keyframes(
     for one, other in ((first, second), (second, first)):
         seen = some_points(one, intrinsics)
         if len(seen):
-            if overlap(seen, other, intrinsics) < settings.matching.least_overlap:
+            if overlap(seen, other, intrinsics) < MIN_OVERLAP:
                 return None
             break
     relative = second.pose @ rigid.invert(first.pose)
     points = roles.points.match(first.features, second.features, None)
     check_answer("points.match", points, PointMatches)
-    points = points.select(_consistent(points, first, relative, intrinsics, settings))
+    points = points.select(_consistent(points, first, relative, intrinsics))
     view = RelativeView(relative, intrinsics, first.line_depths)
-    lines = roles.line_matches.match(first.lines, second.lines, view) if settings.line.in_edges else _NO_LINES
-    asked = settings.matching
+    lines = roles.line_matches.match(first.lines, second.lines, view)
     # Points and lines count together: half of what each alone would need is enough where both are there.
-    if len(points) / asked.least_matches + len(lines) / asked.least_line_matches < 1:
+    if len(points) / MIN_MATCHES + len(lines) / MIN_LINE_MATCHES < 1:
         return None
     return Pair(first.number, second.number, points, lines)
 
@@ -115,9 +122,7 @@ def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Di
     return forward, backward
 
 
-def _consistent(
-    points: PointMatches, first: Keyframe, relative: np.ndarray, intrinsics: np.ndarray, settings: SlamSettings
-) -> np.ndarray:
+def _consistent(points: PointMatches, first: Keyframe, relative: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Matches that agree with the predicted motion: by reprojection where depth is known, else by epipolar distance.
 
     What passes wrongly is left to the robust kernel.
@@ -128,4 +133,4 @@ def _consistent(
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
     off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)
     epipolar = pinhole.epipolar_distance(points.pixels_i, points.pixels_j, relative, intrinsics)
-    return np.where(known, off < settings.matching.match_gate, epipolar < settings.matching.epipolar_gate)
+    return np.where(known, off < REPROJECTION_GATE, epipolar < EPIPOLAR_GATE)

@@ -14,6 +14,9 @@ from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer, check_size
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages, array_of
 
+LINE_SPACING = 10.0
+"""Pixels between the samples of a segment: closer ones would measure the same piece of an edge again."""
+
 
 @dataclass(frozen=True, eq=False)
 class Slots:
@@ -116,7 +119,7 @@ def make_keyframe(
         features = described.result()
     ends = lines.segments.endpoints
     line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
-    segment, pixels, fraction = sample_segments(ends, settings.line.line_spacing)
+    segment, pixels, fraction = sample_segments(ends, LINE_SPACING)
     points = _slots_at(features.pixels, depth, confidence)
     samples = _slots_at(pixels, depth, confidence)
     on_line = _along_segments(line_depths, segment, fraction)
@@ -147,8 +150,8 @@ def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineF
         return roles.line_matches.describe(image, Segments(np.zeros((0, 2, 2)), np.zeros(0)))
     found = roles.lines.detect(image)
     check_answer("lines.detect", found, Segments)
-    if roles.still_parts is not None:
-        found = roles.still_parts.without_segments(found)
+    if roles.static_overlay is not None:
+        found = roles.static_overlay.without_segments(found)
     return roles.line_matches.describe(image, found)
 
 

@@ -13,9 +13,9 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 
 NOMINAL_DEPTH = 2.5
 """Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
-LEAST_SHARED = 20
+MIN_SHARED = 20
 """Key points with a depth in both keyframes that tell the ratio of their units."""
-MOST_SCALE_ERROR = 0.03
+MAX_SCALE_ERROR = 0.03
 """Largest standard error of that ratio; at 3 m it moves what is joined by 9 cm, which the adjustment then mends."""
 
 
@@ -33,13 +33,13 @@ def ratio_of_units(
     local = rigid.unproject(matches.pixels_i, before, np.eye(4), intrinsics)
     depth = local @ relative[2, :3] + relative[2, 3]
     ahead = depth > 0
-    if np.count_nonzero(ahead) < LEAST_SHARED:
+    if np.count_nonzero(ahead) < MIN_SHARED:
         return None
     logs = np.log(depth[ahead] * after[ahead])
     middle = float(np.median(logs))
     # Standard error of a median: 1.25 sigma / sqrt(n), sigma from the median absolute deviation.
     error = 1.25 * 1.48 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
-    return float(np.exp(middle)) if error < MOST_SCALE_ERROR else None
+    return float(np.exp(middle)) if error < MAX_SCALE_ERROR else None
 
 
 def longer(motion: np.ndarray, ratio: float) -> np.ndarray:

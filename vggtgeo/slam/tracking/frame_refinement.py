@@ -19,7 +19,6 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.slam.perception.rgbd_alignment import Aligned, RgbdAlignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
-from vggtgeo.slam.settings.groups import RefinementSettings
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.threads import map_in_threads
@@ -38,16 +37,9 @@ NOTHING = 1e-9
 """Information, 1/m^2 and 1/rad^2, that is none: an inverse exists with it."""
 
 
-def with_view(
-    known: Map,
-    tracker: Tracker,
-    view: RgbdView | None,
-    intrinsics: np.ndarray,
-    roles: Roles,
-    settings: RefinementSettings,
-) -> Tracker:
+def with_view(known: Map, tracker: Tracker, view: RgbdView | None, intrinsics: np.ndarray, roles: Roles) -> Tracker:
     """The tracker with the view of its last frame, which waits for the next keyframe; not for long."""
-    measured = settings.frames and isinstance(roles.depth, SensorDepth) and roles.alignment is not None
+    measured = isinstance(roles.depth, SensorDepth) and roles.alignment is not None
     if view is None or not (measured and known.metric):
         return tracker
     tracker = replace(tracker, between=(*tracker.between, (len(tracker.frames) - 1, view)))

@@ -15,14 +15,18 @@ from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.models.classical import line_coefficients
+from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe import LINE_SPACING, Keyframe, Slots
 from vggtgeo.slam.window.line_support import sample_shares, supported
 from vggtgeo.slam.window.selection import Selection
 
-LEAST_INVERSE_DEPTH = 1e-3
+MIN_INVERSE_DEPTH = 1e-3
 """1/m; a landmark starts no farther than a kilometre away."""
+LINE_GATE = 12.0
+"""Largest distance of a line sample from its matched segment by the poses before an adjustment, pixels; outliers within
+it are left to the robust kernel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +87,7 @@ def build(
         observations,
         rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
         camera.parameters(intrinsics),
-        np.maximum(depths, LEAST_INVERSE_DEPTH),
+        np.maximum(depths, MIN_INVERSE_DEPTH),
         size=size,
         intrinsics_mean=camera.parameters(camera.mean),
         intrinsics_sigma=camera.parameters(camera.sigma),
@@ -224,15 +228,13 @@ def _line_rows(
         places = rigid.unproject(
             samples.pixels[chosen], samples.inverse_depth[chosen], keyframes[host].pose, intrinsics
         )
-        near = supported(
-            places, target.pose, own_ends, intrinsics, reach=settings.line.line_spacing, gate=settings.line.line_gate
-        )
+        near = supported(places, target.pose, own_ends, intrinsics, reach=LINE_SPACING, gate=LINE_GATE)
         edge_ids.append(np.full(len(chosen), number))
         landmarks.append(offset + lines.table[host][chosen])
         coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
         weight = _weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen], settings)
         if settings.line.two_ends_lines:
-            weight = weight * sample_shares(keyframes[host].sample_segment, settings.line.segment_samples)[chosen]
+            weight = weight * sample_shares(keyframes[host].sample_segment, SEGMENT_SAMPLES)[chosen]
         weights.append(np.where(near, weight * settings.line.line_weight, 0.0))
     return {
         "line_edge": np.concatenate(edge_ids),
@@ -275,7 +277,7 @@ def _initial_depths(
         np.add.at(weighted, landmark[chosen], weight * value)
         np.add.at(information, landmark[chosen], weight)
     triangulated = weighted / np.maximum(information, 1e-12)
-    good = (information > 0) & (triangulated > LEAST_INVERSE_DEPTH) & (triangulated * np.sqrt(information) > 5.0)
+    good = (information > 0) & (triangulated > MIN_INVERSE_DEPTH) & (triangulated * np.sqrt(information) > 5.0)
     known = np.isfinite(current)
     typical = np.median(current[known]) if np.any(known) else (np.median(triangulated[good]) if np.any(good) else 1.0)
     depths = np.where(known, current, np.where(good, triangulated, typical))

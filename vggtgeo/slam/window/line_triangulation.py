@@ -27,7 +27,7 @@ PIXELS = 1.0
 """Standard deviation of an end from its line in another view: the ends of both segments, in pixels."""
 LARGEST_SIGMA = 0.05
 """Relative standard deviation of a depth beyond which it is not known."""
-LEAST_VIEWS = 2
+MIN_VIEWS = 2
 CHANCE = 0.99
 
 
@@ -39,7 +39,7 @@ def with_segment_depths(
     for number, keyframe in keyframes.items():
         blank = np.isnan(keyframe.line_depths).any(1)
         own = [edge for edge in edges if edge.host == number and len(edge.line_slots)]
-        if len(own) < LEAST_VIEWS or not blank.any():
+        if len(own) < MIN_VIEWS or not blank.any():
             continue
         inverse, sigma = _triangulated(keyframe, own, keyframes, intrinsics)
         new = blank & np.isfinite(inverse).all(1)
@@ -66,7 +66,7 @@ def _triangulated(
     sigma = 1.0 / np.sqrt(np.maximum(total, 1e-18))
     spread = second - total * mean**2
     agree = spread < chi_square.ppf(CHANCE, np.maximum(views - 1, 1))
-    known = (views >= LEAST_VIEWS) & agree & (mean > 1e-3) & (sigma < LARGEST_SIGMA * mean)
+    known = (views >= MIN_VIEWS) & agree & (mean > 1e-3) & (sigma < LARGEST_SIGMA * mean)
     both = known.all(1, keepdims=True)
     return np.where(both, mean, np.nan), np.where(both, sigma, np.nan)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
@@ -65,10 +66,10 @@ class Selection:
             known = np.isfinite(keyframe.samples.inverse_depth)
             taken = np.ones(len(known), bool)
             if settings.line.two_ends_lines:
-                taken = spread_samples(keyframe.sample_segment, settings.line.segment_samples)
+                taken = spread_samples(keyframe.sample_segment, SEGMENT_SAMPLES)
             length = np.bincount(keyframe.sample_segment[taken], minlength=len(count))
             if settings.line.two_ends_lines:
-                length = np.full_like(length, settings.line.segment_samples)
+                length = np.full_like(length, SEGMENT_SAMPLES)
             order = np.argsort(-count, kind="stable")
             order = order[count[order] > 0]
             order = order[np.cumsum(length[order]) <= settings.window.line_slots]

@@ -150,7 +150,7 @@ def enter(
     The images of those outside the window are compressed.
     """
     window = make_room(window, settings, tied_to)
-    match = lambda number: match_keyframes(known.keyframes[number], keyframe, roles, settings, intrinsics)
+    match = lambda number: match_keyframes(known.keyframes[number], keyframe, roles, intrinsics)
     matched = map_in_threads(match, window.members, alone=not can_search(keyframe.features))
     pairs = tuple(pair for pair in matched if pair is not None)
     inside = (*window.members, keyframe.number)

@@ -1,4 +1,4 @@
-"""The camera that nobody gave is found in a first pass over the frames, and the run begins with it."""
+"""Self-calibration: an unknown camera is estimated on calibration frames, and the run begins with it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.checkpoints import Checkpoints
-from vggtgeo.slam import first_pass
+from vggtgeo.slam import self_calibration
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.pipeline import begin
@@ -35,20 +35,20 @@ LENS = Camera((280.0, 280.0, 158.0, 121.0), 320, 240, (-0.1, 0.01, 0.0, 0.0), kn
 
 
 def found(**camera: Any) -> Slam:
-    """What the last adjustment of a first pass gives: the recorded run's map, with a camera of its own."""
+    """What the last adjustment of self-calibration gives: the recorded run's map, with a camera of its own."""
     slam = recorded_run().slam
-    keyframes = (slam.keyframes * first_pass.LEAST_KEYFRAMES)[: first_pass.LEAST_KEYFRAMES]
+    keyframes = (slam.keyframes * self_calibration.MIN_KEYFRAMES)[: self_calibration.MIN_KEYFRAMES]
     estimate = replace(slam.camera, intrinsics=np.array(LENS.intrinsics), **camera)
     return replace(slam, map=replace(slam.map, keyframes=keyframes), camera=estimate)
 
 
 def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
-    """The state that a first pass gives whose last adjustment ends with `end`."""
+    """The state that self-calibration gives whose last adjustment ends with `end`."""
     monkeypatch.setattr(
-        first_pass, "run_frames", lambda *_: iter([replace(end, camera=replace(end.camera, lens=None))])
+        self_calibration, "run_frames", lambda *_: iter([replace(end, camera=replace(end.camera, lens=None))])
     )
-    monkeypatch.setattr(first_pass, "finish", lambda *_: end)
-    return first_pass.begin_with_found_camera(tuple, GUESS, ROLES, SETTINGS)
+    monkeypatch.setattr(self_calibration, "finish", lambda *_: end)
+    return self_calibration.self_calibrate(tuple, GUESS, ROLES, SETTINGS)
 
 
 def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,11 +62,11 @@ def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
         far = replace(slam, camera=replace(slam.camera, given=np.array([focal, focal, 158.0, 121.0])))
         assert not far.camera.calibrated, "the last adjustment estimates it once more"
     assert (slam.frames, slam.keyframes, slam.map.factors) == ((), (), ())
-    assert "280.0 px (images of 320 x 240) and a lens that distorts, k1 -0.100" in slam.notes[0]
+    assert "280.0 px (images of 320 x 240), lens distortion k1 -0.100" in slam.notes[0]
     plain = begun(monkeypatch, found())
     assert plain is not None
     assert plain.camera.lens is None
-    assert plain.notes[0].endswith("focal length of 280.0 px (images of 320 x 240)")
+    assert plain.notes[0].endswith("focal length 280.0 px (images of 320 x 240)")
 
 
 def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
@@ -76,7 +76,7 @@ def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
     wide = replace(slam, camera=replace(slam.camera, sigma=np.full(4, 100.0), self_calibrated=False))
     for count, held in ((2, True), (3, False)):
         slam = replace(wide, map=replace(wide.map, keyframes=wide.keyframes[:count]))
-        assert bool(camera_prior(slam, SETTINGS).sigma[0] < 1.0) == held
+        assert bool(camera_prior(slam).sigma[0] < 1.0) == held
         numbers = frozenset(range(count))
         pairs = tuple(pair for pair in wide.map.pairs if numbers.issuperset(pair.key))
         frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
@@ -109,16 +109,16 @@ def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.M
             slam, camera=replace(slam.camera, intrinsics=np.array([answers[len(tracked) - 1]] * 2 + [160.0, 120.0]))
         )
 
-    monkeypatch.setattr(first_pass, "run_frames", run)
-    monkeypatch.setattr(first_pass, "finish", end)
+    monkeypatch.setattr(self_calibration, "run_frames", run)
+    monkeypatch.setattr(self_calibration, "finish", end)
     guess = GUESS.intrinsics[0]
     for answers, cameras in (([1.01 * guess], [guess]), ([400.0, 300.0, 280.0], [guess, 400.0, 300.0])):
         tracked.clear()
-        slam = first_pass.begin_with_found_camera(tuple, GUESS, ROLES, SETTINGS)
+        slam = self_calibration.self_calibrate(tuple, GUESS, ROLES, SETTINGS)
         assert tracked == pytest.approx(cameras)
         assert slam is not None
         assert slam.intrinsics[0] == pytest.approx(answers[len(cameras) - 1])
-    assert "3 first passes" in slam.notes[0]
+    assert "3 passes" in slam.notes[0]
 
 
 def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,18 +142,18 @@ def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_how_free_a_guess_is() -> None:
     # Proves that the focal length of a guess is free, and that its principal point stays near the middle. Oracle: the
     # settings' words.
-    sigma = begin(GUESS, ROLES, SETTINGS).camera.sigma
+    sigma = begin(GUESS, ROLES).camera.sigma
     assert sigma == pytest.approx([0.3 * GUESS.intrinsics[0]] * 2 + [0.02 * 320, 0.02 * 240])
 
 
 def test_windows_hold_a_found_camera() -> None:
-    # Proves that a camera of a first pass stays where it is while frames are tracked, and that a guess does not: a
+    # Proves that a self-calibrated camera stays where it is while frames are tracked, and that a guess does not: a
     # focal length that is 10 % too long. Oracle: the number that it began with.
     wrong = np.array(walk().camera.intrinsics) * [1.1, 1.1, 1.0, 1.0]
     guess = replace(walk().camera, intrinsics=tuple(wrong.tolist()), known=False)
     ends = []
     for camera_found in (True, False):
-        first = begin(guess, ROLES, SETTINGS)
+        first = begin(guess, ROLES)
         first = replace(first, camera=replace(first.camera, self_calibrated=camera_found))
         *_, slam = run_frames(iter(recorded_run().frames), guess, ROLES, SETTINGS, Clock(), first)
         ends.append(settled(slam).intrinsics)
@@ -163,7 +163,7 @@ def test_windows_hold_a_found_camera() -> None:
 
 
 class _Passes:
-    """Stands for the first pass: counts the frames of each call, and gives a camera."""
+    """Stands for self-calibration: counts the frames of each call, and gives a camera."""
 
     def __init__(self, camera: Camera | None = LENS) -> None:
         self.counts: list[int] = []
@@ -174,19 +174,19 @@ class _Passes:
         if self._camera is None:
             return None
         own = np.array(self._camera.intrinsics)
-        slam = begin(camera, roles, settings)
+        slam = begin(camera, roles)
         return replace(slam, camera=replace(slam.camera, intrinsics=own, given=own, self_calibrated=True))
 
 
 def settings(frames: int = 150) -> vg.SlamSettings:
     """Those of the recorded run with a last adjustment, which no test of this file comes to."""
     base = vg.SlamSettings()
-    return replace(SETTINGS, camera=replace(base.camera, first_pass=frames), refinement=base.refinement)
+    return replace(SETTINGS, camera=replace(base.camera, calibration_frames=frames), refinement=base.refinement)
 
 
 def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **options: Any) -> vg.Result:
-    """A run without a last adjustment, whose first pass is `passes`."""
-    monkeypatch.setattr(reconstruction, "begin_with_found_camera", passes)
+    """A run without a last adjustment, whose self-calibration is `passes`."""
+    monkeypatch.setattr(reconstruction, "self_calibrate", passes)
     monkeypatch.setattr(reconstruction, "finish", lambda slam, *_: slam)
     monkeypatch.setattr(reconstruction, "CompileAhead", lambda _: vg.Callback())
     given = {"roles": ROLES, "settings": settings(), "dense": "none", **options}
@@ -195,18 +195,18 @@ def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **
 
 @pytest.mark.long
 def test_a_guessed_camera_is_sought_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that the run begins with what its first pass found, over as many frames as the setting says of those that
+    # Proves that the run begins with what self-calibration found, over as many frames as the setting says of those that
     # were selected, and with the guess where that finds none.
     passes = _Passes()
     result = run(monkeypatch, passes)
     assert result.intrinsics == pytest.approx(np.array(LENS.intrinsics), abs=0.1)
-    assert "first pass" in result.summary["seconds_by_stage"]
+    assert "self-calibration" in result.summary["seconds_by_stage"]
     run(monkeypatch, passes, settings=settings(2), start=1, stride=3)
     assert passes.counts == [FRAMES, 2]
     assert run(monkeypatch, _Passes(None), end=3).record.slam.camera.given.tolist() == list(GUESS.intrinsics)
 
 
-def test_where_there_is_no_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_self_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that a known camera, frames that come once, and the setting 0 need none.
     passes = _Passes()
     run(monkeypatch, passes, walk(), end=3)
@@ -217,7 +217,7 @@ def test_where_there_is_no_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.long
 def test_a_resumed_run_seeks_no_camera_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that a run which was killed after its first pass goes on with the camera that it found.
+    # Proves that a run which was killed after self-calibration goes on with the camera that it found.
     kept = Checkpoints(tmp_path / "kept", every=0)
     with pytest.raises(Killed):
         run(monkeypatch, _Passes(), callbacks=[KilledAfter(3)], checkpoints=kept)
@@ -228,7 +228,7 @@ def test_a_resumed_run_seeks_no_camera_again(tmp_path: Path, monkeypatch: pytest
     assert result.intrinsics == pytest.approx(np.array(LENS.intrinsics), abs=0.1)
 
 
-def test_what_a_first_pass_meets_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warnings_of_calibration_frames_count_once(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that warnings about the input and answers that were refused count once, though frames are read twice.
     class Warns(SequenceView):
         def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Any:

@@ -1,0 +1,62 @@
+"""Option groups of the command line: dataclasses whose fields are options."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from vggtgeo.cli.option_groups import with_option_groups
+
+
+@dataclass(frozen=True)
+class Shape:
+    width: Annotated[int, typer.Option(min=1, help="Pixels.")] = 4
+    tall: Annotated[bool, typer.Option("--tall/--flat")] = False
+
+
+@dataclass(frozen=True)
+class Times:
+    rate: Annotated[float, typer.Option("-r", "--rate")] = 30.0
+
+
+def command(name: str, output: Annotated[str, typer.Option("-o")] = "out", *, shape: Shape, times: Times) -> None:
+    typer.echo(repr((name, output, shape, times)))
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ([], ("a", "out", Shape(), Times())),
+        (["--width", "7", "-r", "2"], ("a", "out", Shape(7), Times(2.0))),
+        (["--tall", "-o", "b"], ("a", "b", Shape(tall=True), Times())),
+    ],
+)
+def test_fields_are_options(flags: list[str], expected: tuple[object, ...]) -> None:
+    """Options reach the fields of their group, and fields without a flag have their default; oracle: the values."""
+    app = typer.Typer()
+    app.command()(with_option_groups(command))
+    done = CliRunner().invoke(app, ["a", *flags])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.strip() == repr(expected)
+
+
+def test_bounds_of_a_field_hold() -> None:
+    """A value outside the bounds of a field is a usage error that names the option; oracle: the bound."""
+    app = typer.Typer()
+    app.command()(with_option_groups(command))
+    done = CliRunner().invoke(app, ["a", "--width", "0"])
+    assert done.exit_code == 2
+    assert "--width" in done.output
+
+
+def test_order_and_python_calls(capsys: pytest.CaptureFixture[str]) -> None:
+    """Options stand in the order of parameters and fields, and a call from Python takes them by name; oracle: both."""
+    grouped = with_option_groups(command)
+    assert list(inspect.signature(grouped).parameters) == ["name", "output", "width", "tall", "rate"]
+    grouped("b", width=2, rate=5.0)
+    assert capsys.readouterr().out.strip() == repr(("b", "out", Shape(2), Times(5.0)))

@@ -1,0 +1,236 @@
+"""What the 3D view of a page shows, as one compressed block of arrays and a header in JSON.
+
+Coordinates are those of the view: the origin is the mean of the camera path, z is up, lengths are the map's. Points and
+vertices are rounded to 1/65535 of the map's extent (0.3 mm in 20 m).
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+
+from vggtgeo.evaluation import align, associate
+from vggtgeo.figures.plots import view_axes
+from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.errors import InputError
+from vggtgeo.report.decimation import decimated_cloud, decimated_mesh
+from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+
+MAX_POINTS = 500_000
+MAX_FACES = 150_000
+MAX_KEYFRAMES = 200
+MAX_POSES = 5_000
+"""Of the path and of the truth."""
+_IMAGE_WIDTH, _IMAGE_QUALITY = 288, 72
+_SPACING_SAMPLES = 2_000
+_COVERAGE = 2.0
+"""Size of a drawn point in units of the distance to its nearest neighbour: surfaces close, and edges stay sharp."""
+_FRUSTUM = 0.02
+"""Length of a drawn camera in units of the map's extent."""
+_HEADROOM = 0.03
+"""Above the highest camera, in units of the map's extent: what is higher is cut at first, so that a room is open."""
+
+
+@dataclass(frozen=True)
+class Pictured:
+    """A keyframe of the view. pose: float [4, 4], camera -> world. image: JPEG; None if it is not known."""
+
+    name: str
+    pose: np.ndarray
+    timestamp: float
+    image: bytes | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MapScene:
+    """Content of the view. header: plain values. block: the arrays that the header names, compressed (zlib)."""
+
+    header: dict[str, object]
+    block: bytes
+
+    @property
+    def json(self) -> str:
+        """The header as JSON that may stand inside a `<script>` element."""
+        return json.dumps(self.header, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def pictured(keyframes: Sequence[Keyframe]) -> list[Pictured]:
+    """Return at most `MAX_KEYFRAMES` keyframes, evenly spread, with small images."""
+    rows = np.unique(np.linspace(0, len(keyframes) - 1, min(MAX_KEYFRAMES, len(keyframes))).round().astype(int))
+    return [
+        Pictured(
+            f"frame {keyframes[row].frame}",
+            np.linalg.inv(keyframes[row].pose),
+            keyframes[row].timestamp,
+            _jpeg(keyframes[row].image),
+        )
+        for row in rows
+    ]
+
+
+def map_scene(
+    cloud: PointCloud,
+    trajectory: Trajectory,
+    keyframes: Sequence[Pictured],
+    intrinsics: Sequence[float],
+    *,
+    mesh: Mesh | None = None,
+    truth: Trajectory | None = None,
+    uncertainty: PoseUncertainty | None = None,
+    metric: bool = True,
+    truth_in_metres: bool = True,
+    max_points: int = MAX_POINTS,
+) -> MapScene:
+    """Return the scene of a map.
+
+    Args:
+        cloud: the map, world frame.
+        trajectory: camera -> world, at least one pose; defines up.
+        keyframes: cameras that can be selected.
+        intrinsics: fx, fy, cx, cy, pixels.
+        mesh: of the map.
+        truth: camera -> world, aligned to the trajectory here.
+        uncertainty: of the poses of `trajectory`.
+        metric: whether lengths are metres.
+        truth_in_metres: whether those of the truth are; else it is aligned with a scale.
+        max_points: of the view; a larger map is decimated.
+
+    """
+    axes, origin = view_axes(trajectory), trajectory.positions.mean(axis=0)
+    place = lambda points: (np.asarray(points, np.float64) - origin) @ axes.T
+    shown = decimated_cloud(cloud, max_points)
+    points, path = place(shown.points), place(trajectory.positions)
+    low, high = _box(points, path)
+    extent = max(float(np.linalg.norm(high - low)), 1e-6)
+    arrays: dict[str, np.ndarray] = {"palette": _palette()}
+    box = _add_quantised(arrays, "points", points)
+    arrays["colours"] = shown.colours
+    if shown.confidence is not None:
+        arrays["confidence"] = np.rint(255 * np.clip(shown.confidence, 0, 1)).astype(np.uint8)
+    mesh_box = None
+    if mesh is not None and len(mesh.faces):
+        small = decimated_mesh(mesh, MAX_FACES)
+        mesh_box = _add_quantised(arrays, "vertices", place(small.vertices))
+        arrays["faces"], arrays["vertex_colours"] = small.faces.astype(np.uint32), small.colours
+    arrays["path"] = _thinned(path)
+    aligned = _aligned(truth, trajectory, metric and truth_in_metres)
+    if aligned is not None:
+        arrays["truth"] = _thinned(place(aligned.positions))
+    sigma = _sigma_at(uncertainty, keyframes)
+    poses = np.array([keyframe.pose for keyframe in keyframes]).reshape(-1, 4, 4)
+    arrays["cameras"] = place(_frustums(poses, intrinsics, _FRUSTUM * extent)).astype(np.float32)
+    images = [keyframe.image or b"" for keyframe in keyframes]
+    arrays["image_ends"] = np.cumsum([0, *map(len, images)]).astype(np.uint32)
+    arrays["images"] = np.frombuffer(b"".join(images), np.uint8)
+    header: dict[str, object] = {
+        "unit": "m" if metric else "",
+        "points": len(shown),
+        "of": len(cloud),
+        "box": box,
+        "mesh_box": mesh_box,
+        "size": _spacing(points) * _COVERAGE,
+        "extent": extent,
+        "middle": (0.5 * (low + high)).tolist(),
+        "cut": float(path[:, 2].max() + _HEADROOM * extent),
+        "keyframes": [
+            {
+                "name": keyframe.name,
+                "time": round(keyframe.timestamp, 3),
+                "sigma": None if np.isnan(own) else float(own),
+            }
+            for keyframe, own in zip(keyframes, sigma, strict=True)
+        ],
+    }
+    return _packed(header, arrays)
+
+
+def _packed(header: dict[str, object], arrays: dict[str, np.ndarray]) -> MapScene:
+    """Concatenate the arrays, each from a multiple of four bytes, and note where they are."""
+    parts, end, places = [], 0, {}
+    for name, array in arrays.items():
+        data = np.ascontiguousarray(array).tobytes()
+        places[name] = [array.dtype.name, end, array.size]
+        parts += [data, b"\0" * (-len(data) % 4)]
+        end += len(data) + (-len(data) % 4)
+    return MapScene({**header, "arrays": places}, zlib.compress(b"".join(parts), 6))
+
+
+def _add_quantised(arrays: dict[str, np.ndarray], name: str, points: Float[np.ndarray, "n 3"]) -> list[list[float]]:
+    """Add the points as uint16; return the low corner and the step of the rounding."""
+    low = points.min(axis=0, initial=0.0)
+    step = np.maximum((points.max(axis=0, initial=0.0) - low) / 65535, 1e-12)
+    arrays[name] = np.rint((points - low) / step).astype(np.uint16)
+    return [low.tolist(), step.tolist()]
+
+
+def _box(points: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the box around the path and the points without outliers (1 % at each end)."""
+    low, high = path.min(axis=0), path.max(axis=0)
+    if not len(points):
+        return low, high
+    return np.minimum(low, np.quantile(points, 0.01, axis=0)), np.maximum(high, np.quantile(points, 0.99, axis=0))
+
+
+def _spacing(points: np.ndarray) -> float:
+    """Median distance to the nearest neighbour; 0 for fewer than two points."""
+    if len(points) < 2:
+        return 0.0
+    asked = points[:: max(1, len(points) // _SPACING_SAMPLES)]
+    return float(np.median(cKDTree(points).query(asked, k=2)[0][:, 1]))
+
+
+def _palette() -> UInt8[np.ndarray, "256 3"]:
+    return np.asarray(255 * mpl.colormaps["viridis"](np.arange(256))[:, :3], np.uint8)
+
+
+def _thinned(positions: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    rows = np.unique(np.linspace(0, len(positions) - 1, min(MAX_POSES, len(positions))).round().astype(int))
+    return positions[rows].astype(np.float32)
+
+
+def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> Trajectory | None:
+    """The truth during the run in the frame of the estimate; None if their times do not match."""
+    if truth is None:
+        return None
+    try:
+        estimate, matched = associate(trajectory, truth)
+        alignment = align(matched, estimate, "se3" if rigid else "sim3")
+    except InputError:
+        return None
+    inside = (truth.timestamps >= trajectory.timestamps[0]) & (truth.timestamps <= trajectory.timestamps[-1])
+    return alignment.trajectory(truth.select(inside)) if inside.any() else None
+
+
+def _sigma_at(uncertainty: PoseUncertainty | None, keyframes: Sequence[Pictured]) -> np.ndarray:
+    """Standard deviation of each keyframe's position; NaN = unknown."""
+    if uncertainty is None or not len(uncertainty.timestamps):
+        return np.full(len(keyframes), np.nan)
+    times = np.array([keyframe.timestamp for keyframe in keyframes])
+    rows = np.abs(times[:, None] - uncertainty.timestamps).argmin(axis=1)
+    apart = np.abs(times - uncertainty.timestamps[rows]) > 1e-4
+    return np.where(apart, np.nan, uncertainty.translation[rows])
+
+
+def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> Float[np.ndarray, "k 5 3"]:
+    """Camera centre and the four corners of the image plane, world frame."""
+    fx, fy, cx, cy = intrinsics
+    x, y = cx / fx, cy / fy
+    corners = length * np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]])
+    return np.einsum("kij,cj->kci", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
+
+
+def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    scale = min(1.0, _IMAGE_WIDTH / image.shape[1])
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
+    return bytes(cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _IMAGE_QUALITY])[1])

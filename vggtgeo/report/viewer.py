@@ -1,0 +1,92 @@
+"""The 3D view as HTML that needs nothing else: the scene, K3D-jupyter's JavaScript, and a script of ours between them.
+
+K3D-jupyter (MIT) is optional: it draws with WebGL, and its JavaScript comes in its wheel. Without it there is no view.
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from importlib.metadata import distribution
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_text
+from vggtgeo.models.extras import install_hint
+from vggtgeo.report.map_scene import MapScene
+from vggtgeo.report.templates import style, template
+
+INSTALL = install_hint("viewer")
+_HEIGHT = 640
+"""Of the view in a notebook, pixels."""
+
+
+def has_viewer() -> bool:
+    """Whether K3D-jupyter is installed."""
+    return find_spec("k3d") is not None
+
+
+def check_viewer() -> None:
+    """Raise InputError if K3D-jupyter is not installed."""
+    if not has_viewer():
+        raise InputError(f"the 3D view needs the package `k3d`, which is missing; {INSTALL}")
+
+
+def view_html(scene: MapScene) -> str:
+    """Return the view as elements for a page with the style sheet of all pages; raise InputError without K3D."""
+    check_viewer()
+    return template("vggtgeo.report", "viewer.html.j2").render(
+        header=scene.json,
+        block=base64.b64encode(scene.block).decode(),
+        library=_library(),
+        licences=_licences(),
+        script=(files("vggtgeo.report") / "viewer.js").read_text(encoding="utf-8"),
+        scene=scene.header,
+    )
+
+
+@dataclass(frozen=True)
+class MapView:
+    """A 3D view of a map: a notebook displays it, `save` writes it. html: the whole page."""
+
+    html: str
+
+    @classmethod
+    def of(cls, scene: MapScene, title: str) -> MapView:
+        """Return the page of a scene."""
+        return cls(template("vggtgeo.report", "view.html.j2").render(style=style(), title=title, view=view_html(scene)))
+
+    def save(self, path: str | Path) -> None:
+        """Write the page, atomically: one file that needs no network."""
+        write_text(Path(path), self.html)
+
+    def _repr_html_(self) -> str:
+        return f'<iframe srcdoc="{escape(self.html)}" style="width:100%;height:{_HEIGHT}px;border:0"></iframe>'
+
+    def __repr__(self) -> str:
+        return f"MapView({len(self.html) / 1e6:.1f} MB)"
+
+
+@cache
+def _library() -> str:
+    """K3D's JavaScript, compressed. It is found without importing `k3d`, which takes a second."""
+    return base64.b64encode(zlib.compress((_folder() / "standalone.js").read_bytes(), 9)).decode()
+
+
+@cache
+def _licences() -> str:
+    """Of K3D and of what its JavaScript contains (three.js and others), as they ask for."""
+    texts = [text.read_text() for text in distribution("k3d").files or () if text.name == "LICENSE.txt"]
+    return "\n".join([*texts, (_folder() / "standalone.js.LICENSE.txt").read_text()])
+
+
+def _folder() -> Path:
+    spec = find_spec("k3d")
+    assert spec is not None
+    assert spec.submodule_search_locations
+    return Path(spec.submodule_search_locations[0]) / "static"

@@ -1,0 +1,102 @@
+"""Self-calibration: estimate an unknown camera on calibration frames; the run then begins with it.
+
+If camera and poses are estimated together while tracking, each absorbs errors of the other. Matches, tracks and loop
+closures made with a wrong camera stay wrong when the last adjustment finds a better one. So the calibration frames are
+tracked and adjusted first, and the run begins with the camera that was found (`benchmarks/no_calibration.py`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.intrinsics import check_plausible
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputError
+from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
+from vggtgeo.slam.camera.pixel_aspect import are_square
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pipeline import begin
+from vggtgeo.slam.run import finish, run_frames
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+
+MIN_KEYFRAMES = 10
+"""Keyframes that self-calibration without depth needs; as many as a window has: a smaller map is adjusted as a whole
+while tracking, and its few keyframes have little parallax. With depth, as many as the last adjustment needs."""
+MAX_PASSES, SETTLED = 3, 0.03
+"""Passes over the calibration frames, and the relative change of the focal length that ends them. A lens with strong
+distortion needs more than one pass: the first finds a focal length without the lens."""
+MIN_TRACKED = 0.5
+"""Share of the calibration frames that must be tracked; otherwise their camera estimate is not used."""
+
+
+def self_calibrate(
+    frames: Callable[[], Iterable[Frame]], camera: Camera, roles: Roles, settings: SlamSettings
+) -> Slam | None:
+    """Return the state before the first frame with a self-calibrated camera; None if the frames do not determine it.
+
+    The frames are tracked again while the camera changes much from one pass to the next.
+
+    frames: returns the calibration frames, from the first on, each time it is called. camera: the initial guess.
+    """
+    before = None
+    for passes in range(1, MAX_PASSES + 1):
+        last = deque(run_frames(frames(), camera, roles, settings, Clock(), before), maxlen=1)
+        if not last or not _determines_camera(last[0]):
+            return None
+        # Later rounds do not change the camera.
+        once = replace(settings, refinement=replace(settings.refinement, global_rounds=1))
+        found = finish(last[0], roles, once)
+        if not _is_plausible(found, camera):
+            return None
+        before = begin(camera, roles)
+        before = replace(
+            before,
+            camera=replace(
+                before.camera,
+                intrinsics=found.intrinsics,
+                given=found.intrinsics,
+                self_calibrated=True,
+                lens=found.camera.lens,
+            ),
+            notes=(_note(found, passes, camera),),
+        )
+        moved = np.abs(found.intrinsics[:2] / last[0].intrinsics[:2] - 1).max()
+        if moved < SETTLED and (found.camera.lens is None) == (last[0].camera.lens is None):
+            break
+    return before
+
+
+def _determines_camera(slam: Slam) -> bool:
+    tracked = np.mean([record.tracked for record in slam.frames])
+    least = MIN_KEYFRAMES_FOR_CAMERA if slam.metric else MIN_KEYFRAMES
+    return bool(len(slam.keyframes) >= least and tracked >= MIN_TRACKED)
+
+
+def _is_plausible(found: Slam, camera: Camera) -> bool:
+    fx, fy, cx, cy = map(float, found.intrinsics)
+    lens = () if found.camera.lens is None else found.camera.lens.distortion
+    try:
+        check_plausible("the self-calibrated camera", replace(camera, intrinsics=(fx, fy, cx, cy), distortion=lens))
+    except InputError:
+        return False
+    return True
+
+
+def _note(found: Slam, passes: int, camera: Camera) -> str:
+    focal = " and ".join(dict.fromkeys(f"{value:.1f}" for value in found.intrinsics[:2]))
+    times = "" if passes == 1 else f" in {passes} passes"
+    pixels = "" if are_square(found.intrinsics) else ", pixels are not square"
+    text = (
+        f"self-calibration on {len(found.frames)} frames{times}: focal length {focal} px "
+        f"(images of {camera.width} x {camera.height}{pixels})"
+    )
+    if found.camera.lens is None:
+        return text
+    k1, k2, *_ = found.camera.lens.distortion
+    return f"{text}, lens distortion k1 {k1:.3f}, k2 {k2:.3f}; the images are undistorted by it"
