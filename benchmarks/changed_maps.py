@@ -84,13 +84,13 @@ def _write_changed(file: Path, header: dict[str, Any], data: np.ndarray, rng: ra
     """Writes the file with one thing changed, and says what it is."""
     header, data = copy.deepcopy(header), data.copy()
     if rng.random() < 0.75:
-        number = rng.randrange(len(header["arrays"]))
-        kind, first, shape, _ = header["arrays"][number]
+        name = rng.choice(list(header["arrays"]))
+        kind, first, shape, _ = header["arrays"][name]
         way = rng.choice(("nan", "huge", "negative", "zero", "any bits", "a row less", "no row"))
-        what = f"array {number}, {kind} {shape}: {way}"
+        what = f"array {name}, {kind} {shape}: {way}"
         if "row" in way:
             rows = max(shape[0] - 1, 0) if shape and way == "a row less" else 0
-            header["arrays"][number][2] = [rows, *shape[1:]]
+            header["arrays"][name][2] = [rows, *shape[1:]]
         else:
             size = int(np.prod(shape)) * np.dtype(kind).itemsize
             values = data[first : first + size].copy().view(kind)

@@ -8,5 +8,5 @@ def install_hint(extra: str) -> str:
 
 
 def put_back_hint(package: str, version: str) -> str:
-    """What to do where the files of another package lie over those of this one."""
+    """Return how to restore a package whose files another package has overwritten."""
     return f"`pip install --force-reinstall --no-deps {package}=={version}` puts them back"

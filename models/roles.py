@@ -1,8 +1,8 @@
-"""The five perception roles: what each one is asked, and the typed answer it gives.
+"""The five perception roles: their protocols and result types.
 
 Every role is a small `Protocol`, numpy in and numpy out. Classical code, a stub and a network behind ONNX are
-interchangeable: an implementation is chosen by constructing an object. What a role answers is a frozen dataclass
-that checks its shapes when it is made, so that a wrong implementation is caught where it is wrong.
+interchangeable: an implementation is chosen by constructing an object. Results are frozen dataclasses that check their
+shapes on construction, so that an invalid implementation is detected at its source.
 
 | role | protocol | a network that fits |
 |---|---|---|
@@ -55,7 +55,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Features:
-    """The key points of one image and what an implementation needs to match them.
+    """Key points of one image, with descriptors for matching.
 
     pixels: float [M, 2], (x, y). scores: float [M], larger is better; only their order has a meaning.
     descriptors: opaque, for the matcher that made them. M may be 0.
@@ -79,7 +79,7 @@ class PointMatches:
 
     index_i: int [m], key points of view i, each at most once. index_j: int [m], key points of view j, or -1 where
     the target is no key point. pixels_i, pixels_j: float [m, 2]. confidence: float [m] in [0, 1].
-    `pixels_j` may be refined beyond the key point that `index_j` names: use it, not the key point.
+    `pixels_j` may be refined, unlike the key point of `index_j`: use it.
     """
 
     index_i: np.ndarray
@@ -158,12 +158,12 @@ class LineFeatures:
 
 @dataclass(frozen=True)
 class RelativeView:
-    """What is known of view j from view i when their segments are matched.
+    """Known geometry of view j relative to view i, for matching segments.
 
     pose: float [4, 4], camera i -> camera j (metres, or any one scale shared with the depths).
     intrinsics: float [4] of both views.
     depths: float [L_i, 2], depth of the two ends of each segment of i, NaN where unknown; None if none is known.
-    error: how far the pose may move what it predicts in the image, pixels, beyond what a matcher allows anyway.
+    error: error of predictions in the image due to the pose, pixels, added to the tolerance of a matcher.
     """
 
     pose: np.ndarray
@@ -244,7 +244,7 @@ class DepthEstimate:
 
 @runtime_checkable
 class MetricDepth(Protocol):
-    """Gives metric depth: from a sensor, or from the image alone."""
+    """Estimates metric depth: from a sensor, or from the image alone."""
 
     def estimate(
         self,
@@ -258,7 +258,7 @@ class MetricDepth(Protocol):
 
 @runtime_checkable
 class DenseConfidence(Protocol):
-    """Says where an image can be trusted to be localised."""
+    """Estimates how well pixels of an image can be localised."""
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         """Omega, float32 [H, W] in [0, 1], of `image` (uint8 [H, W, 3])."""
@@ -269,7 +269,7 @@ class DenseConfidence(Protocol):
 
 
 class GeometryResult(IntEnum):
-    """How a geometric estimate ended; `message` says what it means and what to do."""
+    """Result code of a geometric estimate; `message` explains it and what to do."""
 
     SUCCESS = 0
     TOO_FEW_MATCHES = 1
@@ -297,14 +297,13 @@ _MESSAGES = {
 
 @dataclass(frozen=True)
 class PoseQuery:
-    """Everything known of a new frame before its pose is.
+    """Everything known about a new frame before its pose.
 
     image: uint8 [H, W, 3] of the frame. intrinsics: float [4].
     points: float [n, 3], world points (metres) that are matched in the frame; pixels: float [n, 2], where.
-    confidence: float [n] in [0, 1]. predicted: float [4, 4], the pose a motion model expects, or None.
-    window_images, window_poses: recent keyframes, newest first, for an implementation that looks at images; may be
-    empty.
-    window_depths: their metric depth, float [H, W] each, NaN = none, for one that finds no scale itself; may be empty.
+    confidence: float [n] in [0, 1]. predicted: float [4, 4], the prediction of a motion model, or None.
+    window_images, window_poses: recent keyframes, newest first, for implementations that use images; may be empty.
+    window_depths: their metric depth, float [H, W] each, NaN = none, for implementations without scale; may be empty.
     """
 
     image: np.ndarray
@@ -380,7 +379,7 @@ class StartGuess:
 
 @runtime_checkable
 class InitialGeometry(Protocol):
-    """Places one new view: in a known world (`locate`), or against a first one (`start`)."""
+    """Estimates the pose of a new view: in a known world (`locate`), or relative to a first view (`start`)."""
 
     def locate(self, query: PoseQuery) -> PoseGuess:
         """Return the pose of the query's frame in the world its points live in. Failure is a result code."""
@@ -395,7 +394,7 @@ class InitialGeometry(Protocol):
     ) -> StartGuess:
         """Return motion and structure from the matches of two views, float [n, 2] each, up to scale.
 
-        images: the two views, uint8 [H, W, 3], for an implementation that looks at them; may be empty.
+        images: the two views, uint8 [H, W, 3], for implementations that use them; may be empty.
         """
         ...
 
@@ -405,7 +404,7 @@ class WindowGuess:
     """Geometry of a window of views, in its own frame and, unless `metric`, of its own scale.
 
     poses: float64 [n, 4, 4], world -> camera. intrinsics: float64 [4], shared. depth: float32 [n, H, W], NaN = none.
-    confidence: float32 [n, H, W] in [0, 1]. found: bool [n], which views were placed (the others repeat a
+    confidence: float32 [n, H, W] in [0, 1]. found: bool [n], views with a valid pose (others repeat a
     neighbour's pose).
     """
 
@@ -427,7 +426,7 @@ class WindowGuess:
 
 @runtime_checkable
 class WindowGeometry(Protocol):
-    """Places all views of a window at once, from their images."""
+    """Estimates all views of a window at once, from their images."""
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
         """Poses, intrinsics (found if None), depth and confidence of `images` (uint8 [H, W, 3], one size)."""

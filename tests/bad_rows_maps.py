@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +10,7 @@ from typing import Any
 import bad_files as bad
 import numpy as np
 from bad_row import Row, rows
+from changed_file import with_header
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
 
@@ -103,16 +101,7 @@ def headed(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], Path]:
 
     def make(folder: Path) -> Path:
         made = changed(lambda slam: slam)(folder)
-        with zipfile.ZipFile(folder / "office.map") as archive:
-            header, data = (
-                json.loads(np.load(io.BytesIO(archive.read("header.npy"))).tobytes()),
-                archive.read("data.npy"),
-            )
-        change(header)
-        with zipfile.ZipFile(folder / "office.map", "w") as archive, io.BytesIO() as content:
-            np.save(content, np.frombuffer(json.dumps(header).encode(), np.uint8))
-            archive.writestr("header.npy", content.getvalue())
-            archive.writestr("data.npy", data)
+        with_header(folder / "office.map", change)
         return made
 
     return make

@@ -5,9 +5,9 @@ import math
 import cv2
 import numpy as np
 import pytest
+from reported import raises
 
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError
 
 WIDTH, HEIGHT = 160, 120
 INTRINSICS = (131.0, 129.0, 79.0, 61.0)
@@ -93,28 +93,28 @@ def test_guess_sees_sixty_degrees_across_the_longer_side(width: int, height: int
 
 
 @pytest.mark.parametrize(
-    ("intrinsics", "message"),
+    ("intrinsics", "named"),
     [
-        ((0.0, 500.0, 320.0, 240.0), "must be positive"),
-        ((500.0, -1.0, 320.0, 240.0), "must be positive"),
-        ((math.nan, 500.0, 320.0, 240.0), "must be finite"),
-        ((500.0, 500.0, math.inf, 240.0), "must be finite"),
+        ((0.0, 500.0, 320.0, 240.0), 0),
+        ((500.0, -1.0, 320.0, 240.0), -1),
+        ((math.nan, 500.0, 320.0, 240.0), "nan"),
+        ((500.0, 500.0, math.inf, 240.0), "inf"),
     ],
 )
-def test_impossible_intrinsics_are_refused(intrinsics: tuple[float, float, float, float], message: str) -> None:
+def test_impossible_intrinsics_are_refused(intrinsics: tuple[float, float, float, float], named: object) -> None:
     # Proves that no camera is made of impossible intrinsics, and that the error names the argument.
-    with pytest.raises(InputError, match=f"`intrinsics`.*{message}"):
+    with raises("intrinsics", named):
         Camera(intrinsics, 640, 480)
 
 
 def test_impossible_distortion_and_size_are_refused() -> None:
     # Proves the same for a wrong number of coefficients, NaN among them, an empty image, and one of another size.
-    with pytest.raises(InputError, match="`distortion` has 3 coefficients"):
+    with raises("distortion", 3):
         Camera(INTRINSICS, WIDTH, HEIGHT, (0.1, 0.2, 0.3))
-    with pytest.raises(InputError, match=r"`distortion`.*finite"):
+    with raises("distortion", "nan"):
         Camera(INTRINSICS, WIDTH, HEIGHT, (0.1, math.nan, 0.0, 0.0))
-    with pytest.raises(InputError, match="0 x 120"):
+    with raises("0 x 120"):
         Camera(INTRINSICS, 0, HEIGHT)
     undistorter = Camera(INTRINSICS, WIDTH, HEIGHT, DISTORTIONS["barrel"]).undistorter()
-    with pytest.raises(InputError, match="`image` is 80 x 60 pixels; the camera's images are 160 x 120"):
+    with raises("image", "80 x 60", "160 x 120"):
         undistorter.image(np.zeros((60, 80, 3), np.uint8))

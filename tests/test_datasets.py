@@ -181,7 +181,7 @@ def test_images_named_by_time(tmp_path: Path, names: tuple[str, ...], times: lis
 
 def test_a_guess_is_marked_and_said(tmp_path: Path) -> None:
     # Proves that without intrinsics the camera is the guess, marked unknown, with a warning that tells what to do.
-    with pytest.warns(InputWarning, match=r"no intrinsics found.*--intrinsics"):
+    with warns("--intrinsics"):
         sequence = open_sequence(tiny.images(tmp_path, calibration=False))
     assert sequence.camera == Camera.guess(tiny.WIDTH, tiny.HEIGHT)
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 from recorded_run import recorded_run
-from reported import raises
+from reported import raises, warns
 from scipy.spatial.transform import Rotation
 from small_disk import small_disk
 from test_stereo import keyframe_of, slots_of
@@ -30,7 +30,6 @@ from vggtgeo.export import FORMATS, export
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.io.errors import InputWarning
 from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.results.scene import SCENE, Scene, write_scene
 from vggtgeo.slam.sparse_map.covisibility import Pair
@@ -335,7 +334,7 @@ def test_no_export_mixes_its_images_with_those_of_a_recording(folder: Path, tmp_
     for to in ("nerfstudio", "colmap", "nerfstudio"):
         export(folder, to, tmp_path / "new")
     shutil.copy(recording / "images/mine.jpg", tmp_path / "new/images")
-    with pytest.raises(vg.InputError, match=r"mine\.jpg` is an image that no export wrote"):
+    with raises("mine.jpg"):
         export(folder, "nerfstudio", tmp_path / "new")
 
 
@@ -367,7 +366,7 @@ def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) ->
     depth, picture = next((copy / "depth").glob("*.depth.png")), sorted((copy / "images").iterdir())[-1]
     whole = depth.read_bytes()
     cv2.imwrite(str(depth), np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(vg.InputError, match=r"depth.png` .*uint8 of shape \(4, 4, 3\)"):
+    with raises("depth.png", "(4, 4, 3)"):
         export(copy, "nerfstudio", target)
     depth.write_bytes(whole)
     for content, message in ((b"", picture.name), (None, "images/")):
@@ -394,7 +393,7 @@ def test_targets_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None
         with pytest.raises(vg.InputError, match=r"/file` is not a folder"):
             export(copy, "tum", target)
     (copy / "map.ply").unlink()
-    with pytest.raises(vg.InputError, match=r"map\.ply`"):
+    with raises("map.ply"):
         export(copy, "las")
     assert sorted(copy.rglob("*")) == [path for path in before if path.name != "map.ply"]
 
@@ -453,7 +452,7 @@ def test_a_run_without_points_or_surfaces_is_refused(folder: Path, tmp_path: Pat
         with pytest.raises(vg.InputError, match=sentence):
             export(copy, name)
         assert not (copy / "export" / name).exists()
-    with pytest.warns(InputWarning, match="the verdict of the run is failed: only 3 % of the frames were tracked"):
+    with warns("3 %"):
         export(copy, "tum")
     assert (copy / "export/tum/trajectory.txt").is_file()
 
@@ -463,7 +462,7 @@ def test_an_export_says_what_it_lacks_and_what_its_error_is_of(folder: Path, tmp
     # Oracle: the sentences.
     copy = _changed(folder, tmp_path)
     shutil.rmtree(copy / "depth")
-    with pytest.warns(InputWarning, match="`--save-depth`"):
+    with warns("--save-depth"):
         export(copy, "nerfstudio")
     done = CliRunner().invoke(make_app(), ["export", str(copy), "--to", "colmap"])
     assert re.search(r", 0\.\d+ px mean reprojection error over points$", done.stdout.strip()), done.stdout
@@ -471,9 +470,9 @@ def test_an_export_says_what_it_lacks_and_what_its_error_is_of(folder: Path, tmp
 
 def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
     # Proves the errors of an empty folder, an unknown format, and a scene of another layout, or damaged.
-    with pytest.raises(vg.InputError, match=r"`summary\.json`"):
+    with raises("summary.json"):
         export(tmp_path, "colmap")
-    with pytest.raises(vg.InputError, match=r"`to` .*colmap.*'obj'"):
+    with raises("to", "colmap", "'obj'"):
         export(folder, "obj")
     assert set(FORMATS) == {"colmap", "nerfstudio", "ply", "glb", "las", "tum", "kitti"}
     replace(SCENE, version=99).write(tmp_path / "scene.npz", 0)

@@ -65,7 +65,7 @@ def test_a_picture_is_written_as_a_whole_or_not_at_all(tmp_path: Path, suffix: s
     file = tmp_path / f"rgb/1{suffix}"
     write_picture(file, np.zeros((4, 4, 3), np.uint8))
     before = file.read_bytes()
-    with small_disk(4096), pytest.raises(OSError, match=f"rgb/1{suffix}"):
+    with small_disk(4096), raises(f"rgb/1{suffix}", error=OSError):
         write_picture(file, np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8))
     assert file.read_bytes() == before
     assert os.listdir(file.parent) == [file.name]
@@ -127,5 +127,5 @@ def test_json_refuses_nan(tmp_path: Path) -> None:
 
 def test_appending_is_refused(tmp_path: Path) -> None:
     # Proves that a mode which cannot be atomic is named.
-    with pytest.raises(ValueError, match="`mode` is 'a'"), atomic_open(tmp_path / "log", "a"):
+    with raises("mode", "'a'", error=ValueError), atomic_open(tmp_path / "log", "a"):
         pass

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from reported import raises
 
 from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.point_cloud import PointCloud
@@ -48,7 +49,7 @@ def test_an_empty_cloud_can_be_saved(tmp_path: Path) -> None:
 
 def test_nan_never_reaches_a_map() -> None:
     # Proves that a cloud with NaN is refused when it is made.
-    with pytest.raises(InputError, match="`points` has a NaN"):
+    with raises("points"):
         PointCloud(np.full((1, 3), np.nan), np.zeros((1, 3), np.uint8))
 
 

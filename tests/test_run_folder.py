@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import tiny_sequences as tiny
-from reported import raises
+from reported import raises, warns
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import make_app
@@ -303,7 +303,7 @@ def test_a_disk_that_fills_up_names_the_file_and_keeps_old_and_poses(
     assert {name: after[name] for name in before} == before
     assert len(after["unfinished/trajectory.txt"].splitlines()) == 2
     monkeypatch.setattr("vggtgeo.io.files.os.fsync", full)
-    with pytest.raises(OSError, match=r"No space left on device.*map.ply"):
+    with raises("map.ply", error=OSError):
         write_text(tmp_path / "map.ply", "points")
 
 
@@ -353,7 +353,7 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     found = cv2.imread(str(tmp_path / "depth/000007.depth.png"), cv2.IMREAD_UNCHANGED)
     assert found.tolist() == [[5000, 0], [0, 2500]]
     assert "scale of this run is free" in (tmp_path / "depth/README.txt").read_text()
-    with pytest.warns(InputWarning, match="`depth`"):
+    with warns("depth"):
         write_depth(tmp_path / "none", [keyframe], [None])
     assert not (tmp_path / "none").exists()
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from reported import raises
 from synthetic_room import room
 from vggtgeo.models.roles import DenseConfidence, LineDetector, MetricDepth, PointMatcher, WindowGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
@@ -62,9 +63,9 @@ def test_an_unknown_image_is_refused(oracle: SimulatedOracle) -> None:
 
 def test_wrong_settings_are_named(oracle: SimulatedOracle) -> None:
     # A negative deviation is refused by name.
-    with pytest.raises(ValueError, match="`noise`"):
+    with raises("noise", error=ValueError):
         SimulatedMast3r(oracle, noise=-1.0)
-    with pytest.raises(ValueError, match="`error`"):
+    with raises("error", error=ValueError):
         SimulatedMoge(oracle, error=float("nan"))
 
 

@@ -70,7 +70,7 @@ def export(
     say: Callable[[str], None] = lambda _: None,
     tolerance: float | None = None,
 ) -> Report:
-    """Write the network as `output` (.onnx); `say` is told what is going on.
+    """Write the network as `output` (.onnx); `say` receives progress messages.
 
     tolerance: largest difference that is accepted; None for `TOLERANCE` or `HALF_TOLERANCE`.
 
@@ -276,7 +276,7 @@ def _folder_beside(output: Path) -> Iterator[Path]:
 
 
 def _move(folder: Path, output: Path) -> None:
-    """Put the files in their place, the graph last: whoever finds it finds its weights."""
+    """Move the files to their place, the graph last, so that its weights exist with it."""
     output.unlink(missing_ok=True)
     files = sorted(folder.iterdir(), key=lambda file: file.name == output.name)
     for file in files:

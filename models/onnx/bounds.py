@@ -1,9 +1,8 @@
-"""What a network may answer: each role's values within bounds, and a count of what was refused.
+"""Bounds of network outputs for each role, with counts of what was rejected.
 
-A file keeps its contract by its shapes; its values may still be anything. Here is what the values of a role can be, in
-an indoor world, whatever the network: depth from 5 cm to 100 m, confidence in [0, 1], everything finite. What is
-outside is taken away before the estimator sees it (no depth, no match, no segment, no view), and counted, so that the
-verdict can say so. A network that fails to run at all still ends the run.
+A contract checks shapes; these classes check values, as an indoor world allows them: depth from 5 cm to 100 m,
+confidence in [0, 1], everything finite. Values outside are removed before the estimator uses them (no depth, no match,
+no segment, no view), and counted for the verdict. A network that fails to run still ends the run.
 """
 
 from __future__ import annotations
@@ -33,15 +32,15 @@ from vggtgeo.models.roles import (
 )
 
 NEAREST, FARTHEST = 0.05, 100.0
-"""Metres: depths of an indoor world, a sports hall included."""
+"""Minimum and maximum depth of an indoor world, a sports hall included, metres."""
 AVERAGE = 0.5
-"""Confidence in the place of one that is none: that of a pixel like any other."""
+"""Confidence that replaces an invalid one: that of an average pixel."""
 
 
 @dataclass
 class Refusals:
-    """Of one role: asked, answers asked for; without, those of which nothing was left; values and refused, numbers in
-    all answers, and those of them that were out of bounds. Nothing is computed from it but the verdict.
+    """Counts of one role: asked, requests; without, those of which nothing remained; values and refused, numbers in all
+    answers, and those out of bounds. Used by the verdict only.
     """
 
     asked: int = 0
@@ -58,13 +57,13 @@ class Refusals:
 
     @property
     def share(self) -> float:
-        """Of what was asked for, how much was refused: of answers or of values, whichever is more."""
+        """Return the rejected share, of answers or of values, whichever is larger."""
         return max(self.without / max(self.asked, 1), self.refused / max(self.values, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class BoundedDepth:
-    """A `MetricDepth` whose depth lies between `NEAREST` and `FARTHEST`, with a positive deviation."""
+    """A `MetricDepth` with depth between `NEAREST` and `FARTHEST` and a positive deviation."""
 
     source: MetricDepth
     refusals: Refusals = field(default_factory=Refusals)
@@ -97,7 +96,7 @@ class BoundedDepth:
 
 @dataclass(frozen=True, eq=False)
 class BoundedConfidence:
-    """A `DenseConfidence` in [0, 1]; `AVERAGE` where the source's is not."""
+    """A `DenseConfidence` in [0, 1]; `AVERAGE` where that of the source is invalid."""
 
     source: DenseConfidence
     refusals: Refusals = field(default_factory=Refusals)
@@ -118,7 +117,7 @@ class BoundedConfidence:
 
 @dataclass(frozen=True, eq=False)
 class BoundedLines:
-    """A `LineDetector` whose segments lie in the image."""
+    """A `LineDetector` with segments inside the image."""
 
     source: LineDetector
     refusals: Refusals = field(default_factory=Refusals)
@@ -138,7 +137,7 @@ class BoundedLines:
 
 @dataclass(frozen=True, eq=False)
 class BoundedLineMatcher:
-    """A `LineMatcher` that knows no segment of an image for which its network had no answer."""
+    """A `LineMatcher` without segments for an image on which its network failed."""
 
     source: LineMatcher
     refusals: Refusals = field(default_factory=Refusals)
@@ -165,7 +164,7 @@ class BoundedLineMatcher:
 
 @dataclass(frozen=True, eq=False)
 class BoundedPoints:
-    """A `PointMatcher` whose matches lie in bounds that its own types check; an answer that is none gives no match."""
+    """A `PointMatcher` without matches if its network fails; bounds are checked by `PointMatches`."""
 
     source: PointMatcher
     refusals: Refusals = field(default_factory=Refusals)
@@ -194,9 +193,7 @@ class BoundedPoints:
 
 @dataclass(frozen=True, eq=False)
 class BoundedWindow:
-    """A `WindowGeometry` whose answer is none where it is not finite; what is out of bounds in a view makes it one that
-    is not found.
-    """
+    """A `WindowGeometry` that fails for values that are not finite; views with values out of bounds are not found."""
 
     source: WindowGeometry
     refusals: Refusals = field(default_factory=Refusals)

@@ -1,4 +1,4 @@
-"""What the ONNX file of each network takes and gives; exporters write such files, adapters read them.
+"""Inputs and outputs of the ONNX file of each network, for exporters and adapters.
 
 | network | role | paper |
 |---|---|---|
@@ -9,7 +9,7 @@
 | `mast3r_encoder`, `mast3r_decoder` | point matches | Leroy et al., ECCV 2024 |
 | `alike`, `xfeat` | point matches | Zhao et al., IEEE TMM 2022; Potje et al., CVPR 2024 |
 
-Shapes are written as in a paper: a number is fixed, a letter is any size but the same wherever it stands, `Patches` is
+Shapes are written as in a paper: a number is fixed, a letter is any size, equal at all its places, `Patches` is
 the number of tokens of an H x W image. A file may leave sizes open; those it fixes must agree.
 """
 
@@ -22,9 +22,9 @@ import numpy as np
 METADATA_NETWORK = "vggtgeo.network"
 """Key of the file's metadata that names its network, one of `CONTRACTS`."""
 METADATA_WEIGHTS = "vggtgeo.weights"
-"""Key of the file's metadata that tells where the weights come from."""
+"""Key of the file's metadata for the origin of the weights."""
 RANDOM_WEIGHTS = "random"
-"""The value of `METADATA_WEIGHTS` of a file whose results mean nothing."""
+"""Value of `METADATA_WEIGHTS` of a file with random weights."""
 PARITY_SUFFIX = ".parity.npz"
 """`FILE.onnx.parity.npz` holds `input.NAME` and `output.NAME` arrays that PyTorch computed with the same weights."""
 
@@ -51,7 +51,7 @@ Dimension = int | str | Patches
 
 @dataclass(frozen=True)
 class Tensor:
-    """One input or output: its name, its shape, the element types it may have, and whether a file may lack it."""
+    """An input or output: name, shape, allowed element types, and whether it may be missing."""
 
     name: str
     shape: tuple[Dimension, ...]
@@ -64,7 +64,7 @@ class Tensor:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """What the network wants for an RGB image with values in [0, 1]: (image - mean) / std, channel by channel."""
+    """Normalisation of an RGB image with values in [0, 1]: (image - mean) / std per channel."""
 
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -78,9 +78,9 @@ class Normalisation:
 
 @dataclass(frozen=True)
 class Contract:
-    """What one network's file takes and gives, and how an image is prepared for it.
+    """Inputs and outputs of a network's file, and preparation of an image.
 
-    role: in words. plays: the fields of `vggtgeo.Roles` that it can be, alone or with another file. multiple: H and W
+    role: as text. plays: the fields of `vggtgeo.Roles` that it can fill, alone or with another file. multiple: H and W
     are multiples of this. optional tensors may be missing; other tensors beside those named may be outputs (they are
     not read) but not inputs.
     """
@@ -139,7 +139,7 @@ MOGE2 = Contract(
         Tensor("metric_scale", (1,)),
     ),
 )
-"""RGB in [0, 1], normalised inside. `points` are those of the camera's frame but for a shift in z and the scale;
+"""RGB in [0, 1], normalised inside. `points` are in the camera's frame up to a shift in z and a scale;
 `mask` is a probability."""
 
 LETR = Contract(

@@ -1,7 +1,7 @@
 """ALIKE (Zhao et al., IEEE Transactions on Multimedia 2022) and XFeat (Potje et al., CVPR 2024) as point matchers.
 
-Both answer an image with maps: a score of each pixel and descriptors, of each pixel or of each 8 x 8 block. Key points
-and their vectors are taken of the maps here, and matched as SIFT's are.
+Both return maps of an image: a score per pixel, and descriptors per pixel or per 8 x 8 block. Key points and their
+vectors are extracted from the maps here, and matched as those of SIFT.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Features
 
 _RADIUS = 2
-"""Pixels around a key point in which no other may be, as both networks are trained and published."""
+"""Radius of non-maximum suppression, pixels, as published for both networks."""
 
 
 @dataclass(frozen=True, eq=False)

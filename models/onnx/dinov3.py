@@ -18,7 +18,7 @@ PREFIX = 5
 
 @dataclass(frozen=True)
 class DescriptorGrid:
-    """Unit descriptors of patches, float32 [h, w, C], and how the image lies on them."""
+    """Unit descriptors of patches, float32 [h, w, C], and the fit of the image."""
 
     grid: np.ndarray
     fit: Fit
@@ -76,12 +76,12 @@ class DinoFeatures:
     def _run(self, image: np.ndarray, fit: Fit) -> Outputs:
         found = self.session.run({"image": DINOV3.normalisation.apply(fit.resize(image))[None]})
         patches = found["attention"][0, :, 0, PREFIX:]
-        if patches.min() < 0 or not patches.any():  # its rows are shares, which add up to 1
+        if patches.min() < 0 or not patches.any():  # its rows sum to 1
             raise NetworkValueError(
-                f"`{self.session.path}` gave an `attention` of {patches.min():.3g} to {patches.max():.3g}; expected "
-                "shares, at least 0 and not all of them 0"
+                f"`{self.session.path}` gave an `attention` of {patches.min():.3g} to {patches.max():.3g}; it must be "
+                "at least 0 and not all 0"
             )
-        # Half the bits are plenty for descriptors that are compared by angle, and halve a cache of them.
+        # Half precision suffices for descriptors that are compared by angle, and halves the cache.
         return {
             "attention": found["attention"][0, :, 0, :],
             "patch_descriptors": found["patch_descriptors"][0].astype(np.float16),
@@ -96,5 +96,5 @@ def saliency(attention: np.ndarray) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """`vectors` [..., C] at length 1; those of no length stay zero."""
+    """Return `vectors` [..., C] normalised to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.float32(1e-9))

@@ -1,4 +1,4 @@
-"""How an image fits a network's input: resized, with a border where the shapes differ, and the way back."""
+"""Resizing of an image to a network's input, with a border for another aspect, and back."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Fit:
 
     @classmethod
     def of(cls, image_size: tuple[int, int], network_size: tuple[int, int]) -> Fit:
-        """Stretched to the whole input where that changes the aspect by less than 5 %, else with a border."""
+        """Return the fit: stretched if that changes the aspect by less than 5 %, else with a border."""
         (height, width), (rows, columns) = image_size, network_size
         across, down = columns / width, rows / height
         if max(across, down) <= _MOST_STRETCH * min(across, down):
@@ -36,7 +36,7 @@ class Fit:
 
     @property
     def scale(self) -> np.ndarray:
-        """Return float64 [2] (x, y): network pixels an image pixel."""
+        """Return float64 [2] (x, y): network pixels per image pixel."""
         return np.array(self.content_size[::-1]) / np.array(self.image_size[::-1])
 
     @property
@@ -57,11 +57,11 @@ class Fit:
         return cv2.copyMakeBorder(content, top, bottom, left, right, cv2.BORDER_CONSTANT, value=_BORDER)
 
     def to_network(self, pixels: np.ndarray) -> np.ndarray:
-        """Return where image pixels float [..., 2] lie in the network's input."""
+        """Return pixels [..., 2] of the network's input for pixels of the image."""
         return self.scale * (pixels + 0.5) - 0.5 + self.offset
 
     def to_image(self, pixels: np.ndarray) -> np.ndarray:
-        """Return where pixels float [..., 2] of the network's input lie in the image."""
+        """Return pixels [..., 2] of the image for pixels of the network's input."""
         return (pixels - self.offset + 0.5) / self.scale - 0.5
 
     def map_to_image(self, values: np.ndarray, nearest: bool = False) -> np.ndarray:
@@ -72,13 +72,13 @@ class Fit:
         return cv2.resize(np.asarray(content, np.float32), self.image_size[::-1], interpolation=way)
 
     def intrinsics_to_image(self, intrinsics: np.ndarray) -> np.ndarray:
-        """(fx, fy, cx, cy) of the image, float64 [4], from those of the network's input."""
+        """Return (fx, fy, cx, cy) of the image, float64 [4], from those of the network's input."""
         focal = np.asarray(intrinsics[:2], np.float64) / self.scale
         return np.concatenate([focal, self.to_image(np.asarray(intrinsics[2:], np.float64))])
 
 
 def at_multiples(size: tuple[int, int], multiple: int, width: int | None = None) -> tuple[int, int]:
-    """(height, width) close to `size`, or of its shape with the given `width`, in multiples of `multiple`."""
+    """Return (height, width) close to `size`, or of its aspect with this `width`, in multiples of `multiple`."""
     factor = 1.0 if width is None else width / size[1]
     height, width = (max(1, round(factor * side / multiple)) * multiple for side in size)
     return height, width

@@ -1,7 +1,7 @@
-"""What the bytes of an ONNX file tell without opening it: the files of its weights, and whether those are random.
+"""Read facts of an ONNX file without opening it: the files of its weights, and whether those are random.
 
-An entry of metadata or of external data is a protobuf message of a key (field 1) and a value (field 2), both text; so
-the key with its tags and length is found by a search, and no package that knows ONNX is needed.
+An entry of metadata or of external data is a protobuf message of a key (field 1) and a value (field 2), both text; so a
+search for the key with its tags and length suffices, without a package for ONNX.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ SHORT_SIDE = 512
 
 @dataclass(frozen=True, eq=False)
 class LetrDetector:
-    """A `LineDetector`. score: least probability of a segment. shortest: least length, pixels. count: most segments."""
+    """A `LineDetector`. score: minimum probability; shortest: minimum length, pixels; count: maximum number."""
 
     session: Session
     cache: OutputCache = field(default_factory=MemoryCache)
@@ -37,7 +37,7 @@ class LetrDetector:
         outputs = self.cache.get((self.session,), ("lines",), (image,), lambda: self._run(image, fit))
         ends, scores = decode_lines(outputs["pred_logits"][0], outputs["pred_lines"][0], fit.network_size)
         size = np.array(fit.network_size[::-1], np.float64)
-        # Segments end a little outside of the image at most; what lies a whole image away is none.
+        # Segments may end slightly outside the image; those a whole image away are invalid.
         near = ((ends > -size) & (ends < 2 * size)).all(axis=(1, 2))
         keep = near & (scores >= self.score)
         return tidy(image, fit.to_image(ends[keep]), scores[keep], self.shortest, self.count)

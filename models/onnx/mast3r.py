@@ -23,7 +23,7 @@ _WANTED = ("descriptors_1", "descriptors_2", "descriptor_confidence_1", "descrip
 
 @dataclass(frozen=True, eq=False)
 class Mast3rView:
-    """What the matcher keeps of an image: itself, its fit, and its key points in the network's pixels, int [M, 2]."""
+    """An image, its fit, and its key points in the network's pixels, int [M, 2]."""
 
     image: np.ndarray
     fit: Fit
@@ -35,10 +35,10 @@ class Mast3rMatcher:
     """A `PointMatcher`. Key points: the strongest corner of each cell of the network's image; a match's target is any
     pixel, so `index_j` is -1.
 
-    spacing: side of a cell, network pixels. tolerance: how far from its start the way back may end, network pixels.
-    stride: of the coarse search for nearest neighbours. corner: least corner strength (the smaller eigenvalue of the
-    structure tensor of an image in [0, 1]), which leaves blank walls without key points. kept: images whose encoder
-    features stay on the device.
+    spacing: side of a cell, network pixels. tolerance: maximum forward-backward error, network pixels. stride: of the
+    coarse search for nearest neighbours. corner: minimum corner strength (smaller eigenvalue of the structure tensor of
+    an image in [0, 1]), so that blank walls have no key points. kept: number of images whose encoder features stay on
+    the device.
     """
 
     encoder: Session
@@ -59,12 +59,11 @@ class Mast3rMatcher:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(height, width) of the network's images, as the decoder's outputs have it."""
+        """Return (height, width) of the network's images, from the decoder's outputs."""
         height, width = self.decoder.outputs["descriptors_1"].shape[1:3]
         if height is None or width is None:
             raise NetworkFileError(
-                f"`{self.decoder.path}` leaves the size of its outputs open, expected fixed ones; export it with a "
-                "height and a width"
+                f"`{self.decoder.path}` must have outputs of fixed size; export it with a height and a width"
             )
         return height, width
 

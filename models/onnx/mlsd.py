@@ -1,4 +1,4 @@
-"""M-LSD tiny (Gu et al., AAAI 2022) as a line detector: a map of segment centres, and where their ends are."""
+"""M-LSD tiny (Gu et al., AAAI 2022) as a line detector: maps of segment centres and displacements of ends."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _MAP = 256
 class MlsdDetector:
     """A `LineDetector`. The image is stretched to 512 x 512, as in training.
 
-    score: least value of a centre, in [0, 1]. least_length: of a segment in the 256 x 256 map, pixels. shortest: of a
-    segment in the image, pixels. count: most segments.
+    score: minimum value of a centre, in [0, 1]. least_length: minimum length in the 256 x 256 map, pixels. shortest:
+    minimum length in the image, pixels. count: maximum number of segments.
     """
 
     session: Session

@@ -20,10 +20,10 @@ _GRID = 64
 
 @dataclass(frozen=True, eq=False)
 class MogeDepth:
-    """A `MetricDepth` from the image alone; the sensor's depth is not looked at.
+    """A `MetricDepth` from the image alone; the sensor's depth is ignored.
 
-    tokens: how finely the network looks, where the file lets one choose (1200 to 3600; more is finer and slower).
-    threshold: least mask of a valid pixel. sigma: relative standard deviation of the depth.
+    tokens: resolution of the network, if the file leaves it open (1200 to 3600; more is finer and slower). threshold:
+    minimum mask of a valid pixel. sigma: relative standard deviation of the depth.
     """
 
     session: Session

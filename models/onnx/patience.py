@@ -1,4 +1,4 @@
-"""How long a network may take over one answer: a loop in its graph may have no end, and nothing else would end it."""
+"""Timeout of network runs: a loop in a graph may be endless."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ import onnxruntime
 
 _log = logging.getLogger(__name__)
 TOLD = 15.0
-"""Seconds until a call that goes on is told."""
+"""Seconds until a running call is logged."""
 LONGEST = 7200.0
-"""Seconds of a call. VGGT takes minutes for ten views on six processors, and work that is slow is not to be lost."""
+"""Maximum seconds of a call; VGGT takes minutes for ten views on six processors."""
 _EVERY = 1.0
-"""Seconds between two looks at the calls that go on: they cost nothing then, as a timer for each would."""
+"""Seconds between two checks of running calls; cheaper than a timer for each."""
 
 
 @dataclass(eq=False)
 class Call:
-    """One call of a network. options: what it is run with. ended: whether it had to be ended."""
+    """One call of a network. options: of its run. ended: whether it was ended by the timeout."""
 
     path: Path
     options: onnxruntime.RunOptions
@@ -36,12 +36,12 @@ class Call:
 
     @property
     def seconds(self) -> float:
-        """Return how long it goes on."""
+        """Return the time since the call began, seconds."""
         return time.monotonic() - self.began
 
     def run(self, work: Callable[[], None]) -> None:
-        """Do the call's `work`. In the main thread Ctrl-C ends it at once: Python hears of a signal there alone, and
-        not while compiled code runs there, so that the work is done in another one.
+        """Run `work`; in the main thread, in a thread of its own, so that Ctrl-C ends it at once: Python handles
+        signals only in the main thread, and not while compiled code runs there.
         """
         if threading.current_thread() is not threading.main_thread():
             work()
@@ -49,7 +49,7 @@ class Call:
         try:
             _beside().submit(work).result()
         except BaseException:  # whatever a signal raises
-            self.options.terminate = True  # between two nodes of the graph; nobody waits for that
+            self.options.terminate = True  # between two nodes of the graph
             raise
 
 
@@ -60,15 +60,13 @@ _watching: list[threading.Thread] = []
 
 @contextmanager
 def watched(path: Path) -> Iterator[Call]:
-    """Return a call of the network in `path`, which is ended where it takes longer than `LONGEST`, whichever thread
-    waits.
-    """
+    """Yield a call of the network in `path`, which is ended after `LONGEST`, in any thread."""
     options = onnxruntime.RunOptions()
     options.log_severity_level = 4  # the exception reports what is wrong, once
     call = Call(path, options)
     with _lock:
         _calls.add(call)
-        if not (_watching and _watching[0].is_alive()):  # none yet, or a fork left it behind
+        if not (_watching and _watching[0].is_alive()):  # none yet, or lost by a fork
             _watching[:] = [threading.Thread(target=_watch, name="networks", daemon=True)]
             _watching[0].start()
     try:
@@ -80,12 +78,12 @@ def watched(path: Path) -> Iterator[Call]:
 
 @cache
 def _beside() -> ThreadPoolExecutor:
-    """Return the one thread of the calls of the main thread: CUDA keeps memory for each thread that calls."""
+    """Return the thread for calls of the main thread; one only, since CUDA keeps memory for each calling thread."""
     return ThreadPoolExecutor(1, thread_name_prefix="network")
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_beside.cache_clear)  # a fork leaves the thread behind
+    os.register_at_fork(after_in_child=_beside.cache_clear)  # a forked process lacks the thread
 
 
 def _watch() -> None:

@@ -1,4 +1,4 @@
-"""Where networks run: on CUDA where this onnxruntime has it and can start it, else on the CPU."""
+"""Choice of the device: CUDA if this onnxruntime has it and can start it, else the CPU."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from vggtgeo.models.onnx.file_checks import NetworkFileError
 GPU_PACKAGE = "onnxruntime-gpu"
 Provider = Literal["auto", "cuda", "cpu"]
 NAMES = {"cuda": "CUDAExecutionProvider", "cpu": "CPUExecutionProvider"}
-"""What onnxruntime calls them."""
+"""Names in onnxruntime."""
 CUDA_OPTIONS = {"arena_extend_strategy": "kSameAsRequested", "use_tf32": "0"}
-"""The arena otherwise doubles itself, and several networks share one device. Products of float32 are computed in
-float32, as on the CPU: in TF32, onnxruntime's own choice, maps of M-LSD differ by 3 % of their range, others by 1e-3.
+"""The arena grows as needed, since several networks share one device. Products of float32 use float32, as on the CPU:
+in TF32, the default of onnxruntime, maps of M-LSD differ by 3 % of their range, others by 1e-3.
 """
 _FATAL, _WARNING = 4, 2
-"""Levels of onnxruntime's log; the second is its own default."""
+"""Levels of onnxruntime's log; the second is its default."""
 
 
 def choose_provider(provider: Provider) -> str:
-    """Return the device, "cuda" or "cpu"; raises `NetworkFileError` if CUDA is asked for and this onnxruntime has none.
+    """Return the device, "cuda" or "cpu"; raise `NetworkFileError` if CUDA is requested and not available.
 
-    Warns where the package for CUDA is installed and out of use.
+    Warns if the package for CUDA is installed but not in use.
     """
     if provider == "cpu" or NAMES["cuda"] in onnxruntime.get_available_providers():
         return "cpu" if provider == "cpu" else "cuda"
@@ -43,23 +43,23 @@ def choose_provider(provider: Provider) -> str:
 
 
 def _covered() -> str:
-    """Return a sentence where `onnxruntime` was installed after `onnxruntime-gpu`; nothing elsewhere.
+    """Return a message if `onnxruntime` was installed over `onnxruntime-gpu`, else "".
 
-    Both hold the module of that name, and pip puts one over the other in an order of its own.
+    Both packages have the same module, and pip installs them in any order.
     """
     try:
         found = metadata.version(GPU_PACKAGE)
     except metadata.PackageNotFoundError:
         return ""
     return (
-        f"{GPU_PACKAGE} {found} is installed, and the files of the package onnxruntime lie over its own; "
+        f"{GPU_PACKAGE} {found} is installed, but its files are overwritten by those of the package onnxruntime; "
         f"{put_back_hint(GPU_PACKAGE, found)}"
     )
 
 
 @cache
 def load_cuda_libraries() -> str:
-    """Load CUDA's libraries from where pip puts them, which the system's loader does not search; what was missing."""
+    """Load CUDA's libraries from pip's folders, which the system's loader does not search; return what is missing."""
     said = io.StringIO()
     if hasattr(onnxruntime, "preload_dlls"):  # from 1.21 on
         with contextlib.redirect_stdout(said):
@@ -69,7 +69,7 @@ def load_cuda_libraries() -> str:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Without what onnxruntime writes to the terminal for every network that does not come onto the GPU."""
+    """Suppress messages of onnxruntime for networks that do not start on the GPU."""
     onnxruntime.set_default_logger_severity(_FATAL)
     try:
         yield
@@ -78,14 +78,14 @@ def quiet() -> Iterator[None]:
 
 
 def check_started(provider: Provider, device: str, used: str) -> None:
-    """Say that CUDA did not start: onnxruntime falls back without a word.
+    """Report that CUDA did not start: onnxruntime falls back silently.
 
-    Raises `NetworkFileError` if CUDA is what was asked for, else warns.
+    Raises `NetworkFileError` if CUDA was requested, else warns.
 
     Args:
-        provider: what was asked for.
-        device: what `choose_provider` made of it.
-        used: where the network runs.
+        provider: the requested one.
+        device: result of `choose_provider`.
+        used: device of the network.
 
     """
     if device != "cuda" or used == "cuda":

@@ -15,7 +15,7 @@ _BLOCK = 256
 def reciprocal(
     first: np.ndarray, second: np.ndarray, starts: np.ndarray, stride: int = 2
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Targets int64 [m, 2] (x, y) in `second`, and how far the way back ends from its start, float64 [m] pixels.
+    """Return targets int64 [m, 2] (x, y) in `second`, and the forward-backward errors, float64 [m], pixels.
 
     first, second: float32 [H, W, D], unit descriptors. starts: int [m, 2], pixels (x, y) of `first`.
     """

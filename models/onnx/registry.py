@@ -1,4 +1,4 @@
-"""The networks one can use: what for, by whom, on which terms, from where, and under which file name."""
+"""Registry of supported networks: role, publication, licence, source and file name."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from vggtgeo.models.onnx.contracts import CONTRACTS, Contract
 class HubFile:
     """An ONNX file that its authors publish on the Hugging Face hub. sha256: of the file, hexadecimal.
 
-    The SHA-256 pins the content, whatever a branch holds by now: a file that was replaced is refused. revision: the
-    commit that holds it, where one is known; else a branch.
+    The SHA-256 pins the content: a replaced file is an error. revision: the commit, if known, else a branch.
     """
 
     repository: str

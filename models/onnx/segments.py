@@ -1,4 +1,4 @@
-"""What every network of line segments needs after it has answered."""
+"""Post-processing of line segments of networks."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from vggtgeo.models.roles import Segments
 def tidy(image: np.ndarray, endpoints: np.ndarray, scores: np.ndarray, shortest: float, count: int) -> Segments:
     """Return segments cut off at the border of `image` (uint8 [H, W, 3]), directed by their brighter side, best first.
 
-    endpoints: float [L, 2, 2], pixels. scores: float [L]. Those of which less than `shortest` pixels are inside are
-    dropped, and all but the best `count`.
+    endpoints: float [L, 2, 2], pixels. scores: float [L]. The best `count` with at least `shortest` pixels inside are
+    kept.
     """
     height, width = image.shape[:2]
     ends = cut_off(np.asarray(endpoints, np.float64).reshape(-1, 2, 2), (width, height))
@@ -25,7 +25,7 @@ def cut_off(endpoints: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return the parts of segments float64 [L, 2, 2] inside an image of `size` (width, height), along the segments
     themselves.
 
-    Clipping x and y apart would turn a segment. Both ends are one point where nothing of a segment is inside (Liang and
+    Clipping x and y separately would rotate a segment. Both ends are equal for a segment outside (Liang and
     Barsky, "A new concept and method for line clipping", ACM TOG 3(1), 1984).
     """
     start, way = endpoints[:, 0], endpoints[:, 1] - endpoints[:, 0]
@@ -42,10 +42,10 @@ def cut_off(endpoints: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def directed(gray: np.ndarray, endpoints: np.ndarray, samples: int = 16, reach: float = 3.0) -> np.ndarray:
-    """`endpoints` [L, 2, 2] with ends swapped so that the brighter side lies where LSD has it: on the left.
+    """Return `endpoints` [L, 2, 2] with ends swapped so that the brighter side is on the left, as LSD has it.
 
-    gray: uint8 [H, W]. The sides are compared `reach` pixels from the segment; left is meant as the image shows it,
-    going from end 0 to end 1. Line descriptors and gates compare directions, which a network leaves to chance.
+    gray: uint8 [H, W]. The sides are compared `reach` pixels from the segment; left is as seen in the image from end 0
+    to end 1. Line descriptors and gates compare directions, which are arbitrary in networks.
     """
     if not len(endpoints):
         return endpoints

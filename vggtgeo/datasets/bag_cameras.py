@@ -1,8 +1,8 @@
 """The camera of a bag's images, by its messages of `sensor_msgs/CameraInfo`.
 
-A bag may hold those of several cameras, and some that were never calibrated: what is not used is told, and why. Images
-of a part of the sensor, and those whose pixels were put together, have the matrix that ROS gives them
-(`image_geometry`, `PinholeCameraModel`): shifted by the region's corner, then divided by the pixels that make one.
+A bag may have messages of several cameras, and of uncalibrated ones: those not used are reported with the reason. The
+matrix of images of a region of interest or with binning follows ROS (`image_geometry`, `PinholeCameraModel`): shifted
+by the region's corner, then divided by the binning.
 """
 
 import re
@@ -20,26 +20,27 @@ from vggtgeo.io.errors import InputError, InputWarning
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _LENSES, _FISHEYE = (0, 4, 5, 8), 4
-"""How many coefficients a lens may have."""
+"""Numbers of coefficients that a lens may have."""
 _STEADY = 0.02
-"""Relative change of the focal length up to which it is one camera; autofocus changes it by less."""
+"""Maximum relative change of the focal length of one camera; autofocus changes it by less."""
 
 _RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)", re.IGNORECASE)
-"""Topics of images whose lens was undone (package image_proc): their matrix is `P`."""
+"""Topics of rectified images (package image_proc), whose matrix is `P`."""
 
 
 def is_beside(info: str, images: str) -> bool:
-    """Return whether a topic of `CameraInfo` lies in the folder of a topic of images."""
+    """Return whether a topic of `CameraInfo` is in the namespace of a topic of images."""
     return images.startswith(info.rpartition("/")[0] + "/")
 
 
 def camera_of(
     path: Path, infos: Mapping[str, Sequence[Any]], colour: str, size: tuple[int, int], frame: str = ""
 ) -> Camera | None:
-    """Of the topic whose name shares most with that of the images, `colour`, if it is of their size; None where there
-    is none. infos: messages by topic. frame: that the images state, "" for none: a camera of another folder of topics
-    and of another frame is not theirs. InputWarnings for those beside the images that are not used, for a camera of
-    another folder of topics, and for one that changes; InputError for numbers that are no camera.
+    """Return the camera of the topic whose name is most similar to that of the images, `colour`, if its size fits.
+
+    infos: messages by topic. frame: of the images, "" for none; a camera of another namespace and another frame is
+    ignored. Warns of cameras in the images' namespace that are not used, of a camera of another namespace, and of
+    changing intrinsics; raises InputError for invalid intrinsics.
     """
     shared = lambda name: next((n for n, (a, b) in enumerate(zip(name, colour, strict=False)) if a != b), len(name))
     for name in sorted(infos, key=shared, reverse=True):
@@ -58,15 +59,15 @@ def camera_of(
             continue
         if not _matrix(first)[0, 0]:  # as the message's definition has it
             if beside:
-                _warn(f"{where} says that the camera is not calibrated (its focal length is 0): not used")
+                _warn(f"{where} is not calibrated (its focal length is 0): not used")
             continue
         if not beside:
             _warn(f"{where} is taken for the camera of `{colour}`; give --intrinsics fx,fy,cx,cy if it is another's")
         whole = (first.width, first.height) == size
         if whole and (_size(first) != size or _shift(first).any()):
             _warn(
-                f"{where} tells of a part of the sensor, or of pixels that were put together, and the images are as "
-                "large as its whole: used as it is for the whole"
+                f"{where} has a region of interest or binning, but the images have the full size: used for the full "
+                "size"
             )
         camera = _camera(where, first, size, whole, bool(_RECTIFIED.search(colour)))
         warn_of_other_size(where, camera)
@@ -93,19 +94,19 @@ def _shift(message: Any) -> np.ndarray:
 
 
 def _size(message: Any) -> tuple[int, int]:
-    """Of the images that a message speaks of: a region of zeros is all of the sensor."""
+    """Return the image size of a message; a region of zeros is the whole sensor."""
     region = np.array([message.roi.width or message.width, message.roi.height or message.height])
     width, height = (region // _binning(message)).tolist()
     return width, height
 
 
 def _projection(message: Any) -> np.ndarray:
-    """Return the matrix of images whose lens was undone; zeros where the message does not tell."""
+    """Return the matrix of rectified images; zeros if the message has none."""
     return np.reshape(message.P if hasattr(message, "P") else message.p, (3, 4))[:, :3]
 
 
 def _of_images(message: Any, matrix: np.ndarray) -> np.ndarray:
-    """Return the matrix of the images, of that of the whole sensor."""
+    """Return the matrix of the images, given that of the whole sensor."""
     matrix = np.array(matrix, float)
     matrix[:2, 2] -= _shift(message)
     matrix[:2] /= _binning(message)[:, None]
@@ -113,7 +114,7 @@ def _of_images(message: Any, matrix: np.ndarray) -> np.ndarray:
 
 
 def _camera(where: str, message: Any, size: tuple[int, int], whole: bool, rectified: bool) -> Camera:
-    """whole: the images show all of the sensor. rectified: their lens was undone."""
+    """Return the camera of a message. whole: of the whole sensor. rectified: without distortion."""
     lens = np.asarray(message.D if hasattr(message, "D") else message.d, float).tolist()
     rectified = rectified and bool(_projection(message)[0, 0])
     matrix, lens = (_projection(message), []) if rectified else (_matrix(message), lens)
@@ -123,7 +124,7 @@ def _camera(where: str, message: Any, size: tuple[int, int], whole: bool, rectif
     try:
         return Camera(pinhole_of(matrix), *size, check_distortion(lens), fisheye=fisheye)
     except InputError as error:
-        raise InputError(f"{where}: {error}; record the right one, or give the images without it") from None
+        raise InputError(f"{where}: {error}; record a valid one, or remove it") from None
 
 
 def _without_zeros(lens: list[float], counts: Sequence[int]) -> list[float]:

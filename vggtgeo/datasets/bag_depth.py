@@ -1,4 +1,4 @@
-"""The camera of a bag's depth, where it is another than that of the images.
+"""The camera of a bag's depth, if it differs from that of the images.
 
 RealSense, Kinect and their like take depth with a camera of its own beside the colour camera. Drivers register it to
 the images (topics `aligned_depth_to_color`, `depth_registered`), or leave it as it is. What a bag states decides: the
@@ -37,14 +37,14 @@ def depth_camera_of(
     transforms: Callable[[], Iterable[Any]],
     extrinsics: np.ndarray | None,
 ) -> DepthCamera | None:
-    """Return the camera of the depth; None where it is that of the images, or nothing says otherwise.
+    """Return the camera of the depth; None if it is that of the images, or the bag does not say.
 
     first: messages of the two topics. infos: of `CameraInfo`, by topic. cameras: of the images, and width and height of
     the depth. transforms: reads the messages of tf. extrinsics: [4, 4], depth -> colour, as RealSense publishes it.
 
     Raises:
-        InputError: the depth is of another camera, and the bag does not tell its intrinsics, those of the images, or
-            how the two lie.
+        InputError: the depth is of another camera, and the bag lacks its intrinsics, those of the images, or the
+            extrinsics.
 
     """
     image, size = cameras
@@ -67,7 +67,7 @@ def depth_camera_of(
 
 
 def _may_be_of_depth(info: str, messages: Sequence[Any], chosen: Chosen, frame: str) -> bool:
-    """Return one beside both topics is that of the depth if it states its frame, or none."""
+    """Return whether a camera beside both topics may be the depth's: it has the depth's frame, or none."""
     if not messages or not is_beside(info, chosen.depth):
         return False
     return not is_beside(info, chosen.colour) or frame_name(messages[0].header.frame_id) in ("", frame)

@@ -1,4 +1,4 @@
-"""What a message of a bag holds: an image in colour or grey, or depth."""
+"""Decode messages of a bag: images in colour or grey, and depth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +12,8 @@ from vggtgeo.io.errors import InputError
 
 
 class Coding(NamedTuple):
-    """How an encoding of `sensor_msgs/Image` holds a pixel. channels: numbers a pixel. change: OpenCV's, to RGB, None
-    for none. bits: 8 or 16.
+    """An encoding of `sensor_msgs/Image`. channels: values per pixel. change: OpenCV's conversion to RGB, or None.
+    bits: 8 or 16.
     """
 
     channels: int
@@ -37,7 +37,7 @@ _ORDERS: dict[str, tuple[int, int | None]] = {
     "bayer_grbg": (1, cv2.COLOR_BayerGB2RGB),
 }
 _PLAIN = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
-"""Encodings that tell no order of colours: OpenCV's."""
+"""Encodings without an order of colours: OpenCV's order."""
 COLOUR: dict[str, Coding] = {
     **{f"{order}{bits}": Coding(*coding, bits) for bits in (8, 16) for order, coding in _ORDERS.items()},
     **{f"{bits}UC{count}": Coding(count, change, bits) for bits in (8, 16) for count, change in _PLAIN.items()},
@@ -49,28 +49,28 @@ COLOUR: dict[str, Coding] = {
     "nv21": Coding(1, cv2.COLOR_YUV2RGB_NV21),
 }
 _OF_PAIRS = 2
-"""Numbers a pixel of encodings that give each pair of pixels one colour."""
+"""Values per pixel of encodings with one colour per pair of pixels (4:2:2)."""
 _OF_SQUARES = ("nv12", "nv21")
-"""Encodings that give each two by two pixels one colour, in rows behind those of the grey values: half as many."""
+"""Encodings with one colour per 2 x 2 pixels (4:2:0), in rows behind the grey values: half as many."""
 _HEAD = 12
-"""Bytes before the PNG of a `compressedDepth`: a format, and two numbers that floats were coded by."""
+"""Bytes before the PNG of a `compressedDepth`: a format, and two parameters of the quantisation."""
 _PNG = b"\x89PNG"
 
 
 @dataclass(frozen=True)
 class Unread:
-    """A message that is damaged. reason: why it cannot be read."""
+    """A damaged message. reason: why it cannot be read."""
 
     reason: str
 
 
 def encoding_of(message: Any) -> str:
-    """Return the name of an image's encoding, or of what it was before it was compressed."""
+    """Return the encoding of an image, before compression."""
     return str(message.encoding if hasattr(message, "encoding") else message.format.split(";")[0].strip())
 
 
 def kind_of(message: Any) -> str:
-    """What kind of image a message holds, in words."""
+    """Return the kind of image of a message, as text."""
     if message is None:
         return "no message"
     if isinstance(message, Unread):
@@ -79,13 +79,13 @@ def kind_of(message: Any) -> str:
 
 
 def image_of(message: Any, place: Path, min_bits: int = 8) -> ImageFile:
-    """Return the image in a message, see `read_image_file`; InputError where there is none. place: for that."""
+    """Return the image of a message, as `read_image_file`; raise InputError if it is invalid. place: for messages."""
     if isinstance(message, Unread):
         raise InputError(f"`{place}` is damaged: {message.reason}")
     if not hasattr(message, "encoding"):
         return _compressed_image(message, place, min_bits)
     if message.encoding not in COLOUR:
-        raise InputError(f"`{place}`: its encoding is {message.encoding}; known are {', '.join(COLOUR)}")
+        raise InputError(f"`{place}`: `encoding` is {message.encoding}; it must be one of {', '.join(COLOUR)}")
     coding = COLOUR[message.encoding]
     odd = coding.channels == _OF_PAIRS and message.width % 2
     if odd or (message.encoding in _OF_SQUARES and (message.width % 2 or message.height % 2)):
@@ -116,20 +116,20 @@ def _compressed_image(message: Any, place: Path, min_bits: int) -> ImageFile:
 
 
 def metres_of(message: Any, place: Path) -> np.ndarray:
-    """Depth, float32 [H, W], NaN for none; InputError where it cannot be decoded. place: of the message, for that."""
+    """Return depth, float32 [H, W], NaN for none; raise InputError if it is invalid. place: for messages."""
     if isinstance(message, Unread):
         raise InputError(f"`{place}` is damaged: {message.reason}")
     return _raw_metres(message, place) if hasattr(message, "encoding") else _compressed_metres(message, place)
 
 
 def _pixels(message: Any, place: Path, kind: np.dtype[Any], channels: int, rows: int) -> np.ndarray:
-    """What a message holds, [rows, W, channels], if it holds what it says: cameras' drivers pad rows, and no more."""
+    """Return the values of a message, [rows, W, channels], after a check of their size; drivers pad rows."""
     data, size = np.asarray(message.data, np.uint8), f"{message.width} x {message.height} pixels"
     row = message.width * channels * kind.itemsize
     if not row or not message.height or message.step < row or message.step * rows != len(data):
         raise InputError(
             f"`{place}` has {len(data)} bytes, and declares {size} of {message.encoding}, {message.step} bytes a row: "
-            "they do not belong together"
+            "they are inconsistent"
         )
     inside = np.ascontiguousarray(data.reshape(rows, message.step)[:, :row])
     return inside.view(kind).reshape(rows, message.width, channels)

@@ -20,8 +20,8 @@ def frame_name(name: str) -> str:
 
 
 def motion_between(messages: Iterable[Any], source: str, target: str) -> Float[np.ndarray, "4 4"] | None:
-    """Return float64 [4, 4], coordinates of the frame `source` -> those of `target`; None where the transforms do not
-    join the two, or those that do change with time, as between two bodies that move.
+    """Return float64 [4, 4], coordinates of the frame `source` -> those of `target`; None if no transforms connect
+    them, or they change with time (two moving bodies).
     """
     steps: dict[str, dict[str, np.ndarray]] = {}
     moving = set()

@@ -4,7 +4,7 @@ Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage
 depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
 any other; depth with a camera of its own is registered by what the bag states of it, `bag_depth.py`), the camera's
 `CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
-name contains `truth`, `gt`, `vicon` or `mocap`. What is chosen of several is told.
+name contains `truth`, `gt`, `vicon` or `mocap`. A choice among several is reported.
 """
 
 import warnings
@@ -50,9 +50,7 @@ def is_bag(path: Path) -> bool:
 
 
 def no_whole_bag(folder: Path) -> str | None:
-    """Return a sentence about several bags of ROS 1, and one about the files of a ROS 2 bag that were copied without
-    the one that tells what they hold; None where there are none such.
-    """
+    """Return why a folder is not one bag: several ROS 1 bags, or a ROS 2 bag without its metadata; None otherwise."""
     if not folder.is_dir() or (folder / METADATA).is_file():
         return None
     bags = sorted(path.name for path in folder.iterdir() if path.suffix == ".bag")
@@ -88,11 +86,12 @@ class RosBag:
 
     @classmethod
     def open(cls, path: Path, depth: bool = True) -> Self:
-        """Looks through the topics. depth: False to leave it alone.
+        """Choose the topics. depth: False to ignore depth.
 
         Raises:
-            InputError: there are no colour images, the depth is of another camera and the bag does not tell how to
-                register it, or rosbags is not installed.
+            InputError: there are no colour images, the depth is of another camera and the bag has no extrinsics, or
+            rosbags
+                is not installed.
 
         """
         with _reader(path) as reader:
@@ -127,9 +126,7 @@ class RosBag:
         return self._read(range(len(self))[start:end:stride])
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the poses of a topic that is called truth; they are those of what was tracked, markers on the camera,
-        say.
-        """
+        """Return the poses of a topic of ground truth: of the tracked body (markers on the camera, for example)."""
         if not self.poses:
             return None
         with _reader(self.path) as reader:
@@ -211,12 +208,12 @@ def _tell_of_parts(path: Path) -> None:
 
 
 def _place(path: Path, topic: str, number: int) -> Path:
-    """Return how messages call one of a bag."""
+    """Return a name of one message, for errors."""
     return Path(f"{path}, {topic}, {number}")
 
 
 def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, ...], tuple[int, int]]:
-    """Of the images: all times, and width and height of the first that can be read."""
+    """Return all times of the images, and width and height of the first that can be read."""
     times, size, wrong, over = [], None, "", 0
     for number, (time, message) in enumerate(_messages(reader, topic)):
         times.append(time)
@@ -241,9 +238,7 @@ def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, .
 
 
 def _depth_is_usable(reader: Any, path: Path, topic: str, images: tuple[float, ...], size: tuple[int, int]) -> bool:
-    """Return whether depth of the images' size has a valid pixel, and is of their times; an InputWarning for what is
-    not.
-    """
+    """Return whether depth has the images' size and times and a valid pixel; warn otherwise."""
     times, valid, wrong = [], False, ""
     for number, (time, message) in enumerate(_messages(reader, topic)):
         times.append(time)
@@ -262,7 +257,7 @@ def _depth_is_usable(reader: Any, path: Path, topic: str, images: tuple[float, .
             continue
         valid = bool(np.isfinite(depth).any())
     if not valid:
-        _warn(f"`{path}`: none of the {len(times)} depth images has a valid pixel{wrong}; reading the images only")
+        _warn(f"`{path}`: no depth image of {len(times)} has a valid pixel{wrong}; reading the images only")
         return False
     ordered = np.sort(times)
     after = np.searchsorted(ordered, images).clip(1, max(len(ordered) - 1, 1))
@@ -275,7 +270,7 @@ def _depth_is_usable(reader: Any, path: Path, topic: str, images: tuple[float, .
 
 
 def _infos(reader: Any, topics: Mapping[str, str]) -> dict[str, list[Any]]:
-    """Return the whole messages of the topics of `CameraInfo`."""
+    """Return the undamaged messages of the `CameraInfo` topics."""
     kinds = [name for name, kind in topics.items() if kind == CAMERA_INFO]
     messages = {name: [message for _, message in _messages(reader, name)] for name in kinds}
     return {name: [one for one in found if not isinstance(one, Unread)] for name, found in messages.items()}
@@ -289,7 +284,7 @@ def _depth_camera(
     infos: Mapping[str, Sequence[Any]],
     camera: Camera | None,
 ) -> DepthCamera | None:
-    """See `depth_camera_of`; None, too, where no depth image can be read, which is told elsewhere."""
+    """Return `depth_camera_of`; None if no depth image can be read."""
     for number, (_, message) in enumerate(_messages(reader, chosen.depth)):
         try:
             height, width = metres_of(message, _place(path, chosen.depth, number)).shape
@@ -302,12 +297,12 @@ def _depth_camera(
 
 
 def _transforms(reader: Any) -> Iterator[Any]:
-    """Return the messages of tf that are whole."""
+    """Return the undamaged messages of tf."""
     return _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
 
 
 def _extrinsics(reader: Any) -> np.ndarray | None:
-    """Return depth -> colour as RealSense's driver publishes it, the rotation by columns; None where it does not."""
+    """Return depth -> colour as RealSense's driver publishes it (rotation by columns); None if it does not."""
     named = [one for one in reader.connections if one.topic.endswith("depth_to_color")]
     message = next(_whole(reader, [one for one in named if one.msgtype.endswith("/Extrinsics")]), None)
     if message is None:
@@ -319,7 +314,7 @@ def _extrinsics(reader: Any) -> np.ndarray | None:
 
 def _whole(reader: Any, connections: list[Any]) -> Iterator[Any]:
     for connection, _, raw in reader.messages(connections=connections) if connections else ():
-        with suppress(Exception):  # whatever a damaged message makes the package raise
+        with suppress(Exception):  # a damaged message may raise anything
             yield reader.deserialize(raw, connection.msgtype)
 
 
@@ -332,7 +327,7 @@ def _told_registered(chosen: Chosen, other: DepthCamera) -> str:
 
 
 def _others(topics: Mapping[str, str]) -> str:
-    """What a bag without images has, for the message."""
+    """Return the content of a bag without images, for the message."""
     names = ", ".join(f"`{name}` ({kind})" for name, kind in list(topics.items())[:6] if kind not in IMAGES)
     return f"; other topics: {names}" if names else ""
 
@@ -345,11 +340,11 @@ def _reader(path: Path) -> Iterator[Any]:
     except ImportError:
         raise InputError(f"bags of ROS need the package rosbags; {install_hint('bags')}") from None
     if not path.is_dir() and not path.is_file():  # a pipe has no end
-        raise InputError(f"`{path}` is no regular file; give a bag of ROS")
+        raise InputError(f"`{path}` is not a regular file; give a bag of ROS")
     if path.suffix == ".bag" and path.is_file():  # else all of it is read in the search of a line's end
         with path.open("rb") as file:
             if not file.read(len(_BEGINS)) == _BEGINS:
-                raise InputError(f"`{path}` is no bag of ROS: it does not begin with `{_BEGINS.decode()}`")
+                raise InputError(f"`{path}` is not a bag of ROS: it must begin with `{_BEGINS.decode()}`")
     place = path.parent if path.suffix in ROS_2 else path
     if reason := no_whole_bag(place):
         raise InputError(reason)
@@ -364,8 +359,8 @@ def _reader(path: Path) -> Iterator[Any]:
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
-    """Return time of each message's header, seconds, and the message; the recorder's time where the header has none,
-    and `Unread` for a message that is damaged.
+    """Return time, s, and content of each message; the recorder's time if the header has none, and `Unread` for a
+    damaged message.
     """
     connections = [connection for connection in reader.connections if connection.topic == topic]
     for connection, stamp, raw in reader.messages(connections=connections):
@@ -380,7 +375,7 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
 
 
 def _first(reader: Any, topic: str) -> Any:
-    """Return the first message of a topic that is whole; a damaged one, or None, where it has no other."""
+    """Return the first undamaged message of a topic, else a damaged one, else None."""
     damaged = None
     for _, message in _messages(reader, topic):
         if not isinstance(message, Unread):
@@ -400,7 +395,7 @@ def _pose(message: Any) -> tuple[float, ...]:
 def _around(
     time: float, waiting: list[tuple[float, Any]], later: Iterator[tuple[float, Any]]
 ) -> list[tuple[float, Any]]:
-    """Return the depth messages near `time`, read on as far as needed."""
+    """Return the depth messages near `time`, reading further as needed."""
     kept = [entry for entry in waiting if entry[0] >= time - _DELAY]
     while not kept or kept[-1][0] <= time + _DELAY:
         entry = next(later, None)

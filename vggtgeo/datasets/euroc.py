@@ -29,14 +29,16 @@ from vggtgeo.io.errors import InputError, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
 _MOST_DIGITS = 20
-"""Of a time in nanoseconds, with room; Python refuses to read numbers of thousands."""
+"""Maximum digits of a time in nanoseconds; Python refuses to parse thousands of digits."""
 _TRUTH = ("state_groundtruth_estimate0", "leica0", "vicon0")
 _MODEL = re.compile(r"^\s*distortion_model\s*:\s*['\"]?([\w-]+)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Euroc(FolderSequence):
-    """One flight, left camera. Truth: `state_groundtruth_estimate0`, poses of the body, moved to the camera."""
+    """One flight, left camera. Ground truth: `state_groundtruth_estimate0`, poses of the body, transformed to the
+    camera.
+    """
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -45,10 +47,10 @@ class Euroc(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Read the list of the left camera's images; the IMU's file is left out with an InputWarning."""
+        """List the left camera's images; warn that the IMU is not used."""
         base = _base(folder)
         if base is None:
-            raise InputError(f"`{folder}` has no `mav0/cam0/data.csv`; expected a sequence of EuRoC")
+            raise InputError(f"`{folder}` must have `mav0/cam0/data.csv`, as a sequence of EuRoC")
         if (base / "imu0" / "data.csv").is_file():
             warnings.warn(
                 f"`{folder}`: the IMU is not used; images alone leave the scale free", NoteWarning, stacklevel=3

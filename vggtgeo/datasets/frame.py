@@ -1,4 +1,4 @@
-"""What every reader gives: frames one after another, the camera, and the truth where there is one."""
+"""Interface of all readers: frames, camera, and ground truth if there is one."""
 
 import numbers
 from collections.abc import Iterator
@@ -16,13 +16,13 @@ from vggtgeo.io.given import check_kind
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image of a sequence, as the camera took it (distortion not yet removed).
+    """One image of a sequence, with the distortion of its lens.
 
     Fields:
-        index: position in the whole sequence, counted from 0, whatever was skipped.
+        index: position in the whole sequence, from 0, skipped frames included.
         timestamp: seconds.
         image: uint8 [H, W, 3], RGB.
-        depth: float32 [H, W], z in metres, NaN where there is none; None for a sequence without depth.
+        depth: float32 [H, W], z in metres, NaN = none; None for a sequence without depth.
         name: the file's name, for messages.
 
     Example:
@@ -46,38 +46,37 @@ class Frame:
 
 @runtime_checkable
 class Sequence(Protocol):
-    """Frames with one camera. The truth is for the report only: nothing that estimates may ask for it."""
+    """Frames with one camera. Ground truth is for evaluation only: estimators must not use it."""
 
     @property
     def name(self) -> str:
-        """For titles and messages."""
+        """Return the name, for titles and messages."""
         ...
 
     @property
     def camera(self) -> Camera:
-        """Return the camera of all frames; `camera.known` is False where its intrinsics are a guess."""
+        """Return the camera of all frames; `camera.known` is False if its intrinsics are a guess."""
         ...
 
     @property
     def has_depth(self) -> bool:
-        """True where frames carry depth: then every frame has an array, all NaN where its file failed."""
+        """Return whether frames have depth: every frame then has an array, all NaN if its file is invalid."""
         ...
 
     def __len__(self) -> int:
-        """Return frames listed; unreadable ones count. A video gives its container's estimate."""
+        """Return the number of frames, unreadable ones included; of a video, the container's estimate."""
         ...
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
         """Return the frames at positions start, start + stride, ... below end, read one by one as they are asked
         for.
 
-        What cannot be read is skipped with an InputWarning that names it. InputError for a selection that is
-        not one, or holds no frame.
+        Warns of files that cannot be read, which are skipped; raises InputError for an invalid or empty selection.
         """
         ...
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses, camera -> world; None where there is no truth."""
+        """Return the true poses, camera -> world; None without ground truth."""
         ...
 
 
@@ -94,16 +93,14 @@ def check_selection(name: str, count: int, start: int, end: int | None, stride: 
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:
-    """Raise InputError for a frame whose image or depth is none, whose size is not that of the camera's images, or
-    whose time is none.
-    """
-    given: Any = frame  # of a caller: annotations promise what nobody has checked
+    """Raise InputError for a frame with an invalid image, depth or time, or another size than the camera's images."""
+    given: Any = frame  # of a user: annotations are not checked
     image, depth, time = given.image, given.depth, given.timestamp
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(f"`{frame.name}` has an image {described(image)}; it must be uint8 [H, W, 3], RGB")
     if not isinstance(time, numbers.Real) or not -LATEST <= given.timestamp <= LATEST:
         shown = time if isinstance(time, float) else f"{time!r:.60}"
-        raise InputError(f"`{frame.name}` has the time {shown}; expected a number of seconds")
+        raise InputError(f"`{frame.name}` has the time {shown}; it must be a number of seconds")
     if depth is not None:
         check_depth(f"the depth of `{frame.name}`", depth, image)
     height, width = image.shape[:2]
@@ -115,7 +112,7 @@ def check_frame(frame: Frame, camera: Camera) -> None:
 
 
 def check_depth(name: str, depth: Any, image: np.ndarray) -> None:
-    """Raise InputError for depth that is no array of metres of the size of its image."""
+    """Raise InputError unless depth is an array of metres with the size of its image."""
     if isinstance(depth, np.ma.MaskedArray):
         raise InputError(f"{name} is masked; give an array with NaN where there is none: `depth.filled(np.nan)`")
     if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f":
@@ -125,5 +122,5 @@ def check_depth(name: str, depth: Any, image: np.ndarray) -> None:
 
 
 def described(given: Any) -> str:
-    """Type and shape of an array, the type of anything else."""
+    """Return type and shape of an array, the type of another value."""
     return f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else f"of the type `{type(given).__name__}`"

@@ -1,7 +1,7 @@
 """ICL-NUIM in its TUM-compatible form: `rgb/N.png`, `depth/N.png`, `*.gt.freiburg`, mostly with `associations.txt`.
 
-Its camera has a negative fy: the picture's y axis points up. The images are read as they are, with fy positive, which
-mirrors the world; so the truth is mirrored, too, and errors are what they were. Source: A. Handa et al., "A benchmark
+Its camera has a negative fy: the image's y axis points up. Images are read unchanged with a positive fy, which mirrors
+the world; so the ground truth is mirrored as well, and errors are the same. Source: A. Handa et al., "A benchmark
 for RGB-D visual odometry, 3D reconstruction and SLAM", ICRA 2014.
 """
 
@@ -33,9 +33,9 @@ class IclNuim(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `associations.txt` and no `rgb.txt`, and this is ICL-NUIM's: beside its truth, or
-        a list that counts frames, depth first; or pairs of numbered images beside its truth. Lists of times are
-        anybody's, as ORB-SLAM2 takes them.
+        """Return whether `folder` has ICL-NUIM's `associations.txt` and no `rgb.txt`: with its ground truth, or a list
+        of frame numbers, depth first; or pairs of numbered images with its ground truth. A list of times may be of any
+        program.
         """
         file, truth = folder / _LIST, bool(files_like(folder, "*.gt.freiburg"))
         if (folder / "rgb.txt").is_file():
@@ -50,7 +50,7 @@ class IclNuim(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Read the list of pairs, or pairs the images by their numbers where there is none."""
+        """Read the list of pairs, or pair the images by their numbers without one."""
         pairs = read_pairs(folder / _LIST, "N") if (folder / _LIST).is_file() else _numbered(folder)
         if not pairs:
             raise InputError(f"`{folder}` has neither `{_LIST}` nor images `rgb/N.png` with `depth/N.png`")
@@ -65,14 +65,14 @@ class IclNuim(FolderSequence):
 
 
 def icl_camera(folder: Path, width: int, height: int) -> Camera:
-    """Return the published camera, fy positive; a guess, with an InputWarning, for images of another size."""
+    """Return the published camera, fy positive; a guess, with a warning, for images of another size."""
     if (width, height) != _SIZE:
         return guess_with_warning(str(folder), width, height)
     return Camera(_CAMERA, width, height)
 
 
 def icl_truth(folder: Path) -> Trajectory | None:
-    """Return the poses of `*.gt.freiburg` or `groundtruth.txt`, of the mirrored world; None where neither is there."""
+    """Return the poses of `*.gt.freiburg` or `groundtruth.txt` in the mirrored world; None without either."""
     there = [*files_like(folder, "*.gt.freiburg"), folder / "groundtruth.txt"]
     file = next((file for file in there if file.is_file()), None)
     if file is None:
@@ -83,7 +83,7 @@ def icl_truth(folder: Path) -> Trajectory | None:
 
 
 def _numbered(folder: Path) -> list[tuple[float, str, str]]:
-    """Number, image and depth of each pair `rgb/N.png`, `depth/N.png`, as `read_pairs` has them."""
+    """Return number, image and depth of each pair `rgb/N.png`, `depth/N.png`, as `read_pairs` does."""
     images = [path for path in files_like(folder / "rgb", "*.png") if path.stem.isdecimal()]
     both = [path for path in images if (folder / "depth" / path.name).is_file()]
     return [(float(path.stem), f"rgb/{path.name}", f"depth/{path.name}") for path in both]

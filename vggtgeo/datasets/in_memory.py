@@ -1,4 +1,4 @@
-"""Frames that come from anywhere: a list, a generator, a camera that is running."""
+"""Frames of any iterable: a list, a generator, a live camera."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_whole
 
 _LAST = 2**53
-"""Number of a frame, far beyond any."""
+"""Maximum number of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameStream:
-    """Frames of one camera, read once, as they come."""
+    """Frames of one camera, read once."""
 
     camera: Camera
     has_depth: bool
@@ -37,16 +37,16 @@ class FrameStream:
 
 
 def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: float = 30.0) -> FrameStream:
-    """Return frames from any iterable, which is asked for one frame more than is needed at once.
+    """Return frames of any iterable, which is read one frame ahead.
 
     Args:
         frames: of `Frame`; or images, uint8 [H, W, 3] RGB; or pairs of an image and depth, float [H, W] metres with NaN
-            for none. They are copied: a camera may hand out one array, filled anew for each.
-        camera: of all frames; None guesses from the size of the first image (then the intrinsics are estimated).
+            for none. They are copied: a camera may reuse one array.
+        camera: of all frames; None: a guess from the size of the first image, and intrinsics are estimated.
         rate: frames a second, for images without a time of their own.
 
     Raises:
-        InputError: there is no frame, or one is nothing of these.
+        InputError: there is no frame, or one has another type.
 
     """
     if not isinstance(frames, Iterable):
@@ -86,7 +86,7 @@ def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
 
 
 def _tell_of_depth(frame: Frame) -> bool:
-    """Return whether a frame has depth and none of it is one, which is told: NaN is none, as it should be."""
+    """Warn of depth without a value in range, and return whether that is so; all NaN is valid."""
     depth = frame.depth
     if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or np.isnan(depth).all():
         return False
@@ -119,12 +119,12 @@ def _frame(item: Any, index: int, rate: float) -> Frame:
 
 
 def copied(frame: Frame) -> Frame:
-    """Return the frame with arrays of its own; InputError for one that is too large."""
+    """Return the frame with copies of its arrays; raise InputError if they are too large."""
     return replace(frame, image=_own(frame.name, frame.image), depth=_own(frame.name, frame.depth))
 
 
 def _own(name: str, given: Any) -> Any:
-    """Return a copy of an image or of depth; InputError for one that is too large."""
+    """Return a copy of an image or of depth; raise InputError if it is too large."""
     if not isinstance(given, np.ndarray) or given.ndim < 2:
         return given
     height, width = given.shape[:2]

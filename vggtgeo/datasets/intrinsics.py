@@ -1,4 +1,4 @@
-"""Where a camera comes from: a file in the folder, published values, the user's flag, or a guess."""
+"""Sources of a camera: a file in the folder, published values, the user's option, or a guess."""
 
 import math
 import re
@@ -15,26 +15,25 @@ from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 from vggtgeo.io.text_files import whole_text
 
 NARROWEST, WIDEST = 1.0, 170.0
-"""Degrees: fields of view that a pinhole camera may have."""
+"""Minimum and maximum field of view of a pinhole camera, degrees."""
 FARTHEST_CENTRE = 10.0
-"""Sizes of the image that a principal point may be away: nearer ones may belong to a piece of a larger image."""
+"""Maximum coordinate of a principal point, in image sizes: a cropped image may have it outside."""
 LEAST_VALID = 0.5
-"""Share of the undistorted image that must come from the image: of the lenses of docs and benchmarks the worst keeps
-more than 0.8."""
+"""Minimum share of the undistorted image that is inside the original; lenses of benchmarks keep more than 0.8."""
 MOST_ASPECT = 4.0
-"""Ratio of the focal lengths, either way: pixels of cameras are square; of interlaced and anamorphic ones, 1 to 2."""
+"""Maximum ratio of the focal lengths, either way; 1 for square pixels, up to 2 for interlaced and anamorphic ones."""
 _OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
 _FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
-"""What ROS, Kalibr, EuRoC and RealSense call the two lenses that are read."""
+"""Names of the two lens models in ROS, Kalibr, EuRoC and RealSense."""
 MAX_BYTES = 100_000
-"""Of a file with a few numbers and comments."""
+"""Maximum size of a file with a few numbers and comments."""
 CALIBRATION = "calibration.txt"
 FISHEYE = "fisheye"
-"""Last word of such a file, behind four coefficients of Kannala and Brandt."""
+"""Last word of such a file, after four coefficients of Kannala and Brandt."""
 MATRIX = "camera-intrinsics.txt"
 _SAYS_CAMERA = re.compile(r"(intrinsic|calib|camera|(^|[_.-])k(?=[_.-])).*\.(txt|csv)$|^k$", re.IGNORECASE)
 JSON = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
-"""Names that recorders give to it."""
+"""Names of cameras that recorders write."""
 
 # Colour cameras of the TUM RGB-D benchmark, 640 x 480 (fx fy cx cy, k1 k2 p1 p2 k3), from
 # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; freiburg3 is published undistorted.
@@ -49,12 +48,12 @@ _FREIBURG_NAME = re.compile(r"freiburg([123])|(?:^|[_-])fr([123])(?:[_-]|$)", re
 
 
 def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
-    """`"fx,fy,cx,cy"` as numbers, pixels; InputError where it is not four numbers, focal lengths positive."""
+    """Return `"fx,fy,cx,cy"` as numbers, pixels; raise InputError unless four numbers, focal lengths positive."""
     return check_intrinsics(_numbers("`intrinsics`", text, "fx,fy,cx,cy"))
 
 
 def intrinsics_of(file: Path, values: object) -> tuple[float, float, float, float]:
-    """`values` as fx, fy, cx, cy; InputError with the name of the file where they cannot be."""
+    """Return `values` as fx, fy, cx, cy; raise InputError naming the file if they are invalid."""
     try:
         return check_intrinsics(values)
     except InputError as error:
@@ -62,7 +61,7 @@ def intrinsics_of(file: Path, values: object) -> tuple[float, float, float, floa
 
 
 def pinhole_of(matrix: np.ndarray) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy, pixels, of a matrix of intrinsics [3, 3]; InputError for one of anything else."""
+    """Return fx, fy, cx, cy, pixels, of a matrix of intrinsics [3, 3]; raise InputError for another matrix."""
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     values = check_intrinsics((fx, fy, cx, cy))
     if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6):
@@ -71,7 +70,7 @@ def pinhole_of(matrix: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def is_fisheye(where: str, model: str) -> bool:
-    """Return whether the word for a lens is that of a fisheye; InputError for one of neither kind. where: it stands."""
+    """Return whether a lens model is a fisheye; raise InputError for an unknown model. where: for messages."""
     if model.lower() not in (*_OPENCV, *_FISHEYES):
         known = ", ".join((*_OPENCV[1:], *_FISHEYES))
         raise InputError(f"{where} is {model[:40]}; read are {known}: undistort the images")
@@ -79,10 +78,11 @@ def is_fisheye(where: str, model: str) -> bool:
 
 
 def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
-    """Return the camera of `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, or `fx fy cx cy k1 k2 k3 k4
-    fisheye`), else of
-    `camera-intrinsics.txt` (3 x 3), else of a JSON file as Open3D's and RealSense's recorders write it, in `folder`,
-    else None. InputError where such a file is there but wrong.
+    """Return the camera of a file in `folder`, None without one.
+
+    Files: `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, or `fx fy cx cy k1 k2 k3 k4 fisheye`), else
+    `camera-intrinsics.txt` (3 x 3), else JSON of Open3D's and RealSense's recorders. Raises InputError for an invalid
+    file.
     """
     readers = {CALIBRATION: _read_calibration, MATRIX: _read_matrix, **dict.fromkeys(JSON, _read_json_camera)}
     for name, read in readers.items():
@@ -101,8 +101,8 @@ def camera_or_guess(folder: Path, width: int, height: int) -> Camera:
 
 
 def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
-    """Return the camera of `metadata.json` beside the images of an export of Record3D; None where that is another's
-    file, or with an InputWarning one that cannot be read or has no camera where it should.
+    """Return the camera of `metadata.json` of an export of Record3D; None, with a warning, if the file is invalid; None
+    if it is another program's.
     """
     file = folder / "metadata.json"
     try:
@@ -123,8 +123,8 @@ def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
 
 
 def record3d_intrinsics(content: Mapping[str, Any]) -> tuple[float, ...] | None:
-    """fx, fy, cx, cy of what Record3D says of a recording: the middle of the frames' own, which autofocus changes a
-    little, else of the matrix `K`, by columns; None where neither is what the app writes.
+    """Return fx, fy, cx, cy of Record3D's metadata: the median over frames (autofocus changes them slightly), else the
+    matrix `K`, by columns; None if neither is valid.
     """
     frames, matrix = content.get("perFrameIntrinsicCoeffs"), content.get("K")
     try:
@@ -137,9 +137,8 @@ def record3d_intrinsics(content: Mapping[str, Any]) -> tuple[float, ...] | None:
 
 
 def _camera_of_another_name(folder: Path, width: int, height: int) -> Camera | None:
-    """Return the camera of a text file whose name says that it is one (`intrinsics.K.txt`, `cam_K.txt`), and which
-    holds the four numbers or the matrix of a pinhole and nothing else, with an InputWarning; None where no file, or
-    more than one, is like that.
+    """Return the camera of the only text file with a camera's name (`intrinsics.K.txt`, `cam_K.txt`) that contains just
+    the four numbers or the matrix of a pinhole, with a warning; None otherwise.
     """
     named = sorted(path for path in folder.iterdir() if _SAYS_CAMERA.search(path.name) and path.is_file())
     cameras = {path: found for path in named if (found := _bare_pinhole(path, width, height)) is not None}
@@ -172,12 +171,11 @@ def _bare_pinhole(file: Path, width: int, height: int) -> Camera | None:
 
 
 def check_plausible(where: str, camera: Camera) -> None:
-    """InputError for a camera that cannot have taken images of this size: its unit is no pixel, or its distortion folds
-    the image.
+    """Raise InputError for a camera that is implausible for its image size.
 
     Raises:
-        InputError: a field of view beyond 1 to 170 degrees (a pinhole's image is nowhere near 180), a principal point
-            ten times the image's size away, or a distortion that leaves less than half of the image.
+        InputError: a field of view outside 1 to 170 degrees, a principal point ten image sizes away, or a distortion
+            that keeps less than half of the image.
 
     """
     (fx, fy, cx, cy), width, height = camera.intrinsics, camera.width, camera.height
@@ -219,7 +217,7 @@ def published_camera(name: str, width: int, height: int) -> Camera | None:
 
 
 def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float = 1.0) -> Camera:
-    """Return a guessed camera, `known` False, and a GuessedCameraWarning that says so."""
+    """Return a guessed camera, `known` False, with a GuessedCameraWarning."""
     camera = Camera.guess(width, height, pixel_aspect)
     focal = " and ".join(dict.fromkeys(f"{value:.0f}" for value in camera.intrinsics[:2]))
     warnings.warn(
@@ -259,8 +257,8 @@ def _read_matrix(file: Path, width: int, height: int) -> Camera:
 
 
 def _read_json_camera(file: Path, width: int, height: int) -> Camera:
-    """Of Open3D: `width`, `height` and `intrinsic_matrix`, nine numbers column by column; of RealSense: `fx`, `fy`,
-    `ppx`, `ppy`, or `cx`, `cy`.
+    """Read a camera of Open3D (`width`, `height` and `intrinsic_matrix`, nine numbers by columns) or RealSense (`fx`,
+    `fy`, `ppx`, `ppy`, or `cx`, `cy`).
     """
     content = read_json(file)
     if not isinstance(content, dict):
@@ -268,7 +266,7 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
     check_size(file, (content.get("width", width), content.get("height", height)), (width, height))
     matrix = content.get("intrinsic_matrix")
     if isinstance(matrix, list) and len(matrix) == 9:
-        by_row = matrix[6:8] == [0, 0] and matrix[2] != 0  # somebody's own script
+        by_row = matrix[6:8] == [0, 0] and matrix[2] != 0  # of a user's script
         found = [matrix[0], matrix[4], *(matrix[2:6:3] if by_row else matrix[6:8])]
     else:
         found = [content.get(name, content.get(other)) for name, other in _JSON_NAMES]
@@ -281,8 +279,8 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
 
 
 def _of_realsense(file: Path, content: Mapping[str, Any]) -> tuple[float, ...]:
-    """k1 k2 p1 p2 k3 of `coeffs`, where its `model` is OpenCV's; of another one they are told and left out: the inverse
-    one, which undoes what a lens did.
+    """Return k1 k2 p1 p2 k3 of `coeffs` if its `model` is OpenCV's; warn of another model (the inverse one), which is
+    ignored.
     """
     given = content.get("coeffs")
     if given is None:
@@ -307,7 +305,7 @@ def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
     if len(words := text.split()) >= 4 and all(map(_DECIMAL_COMMA.fullmatch, words)):
         raise InputError(f"{where}: found {text.strip()!r}; write decimals with a point: {expected}")
     try:
-        if "_" in text:  # which Python takes within a number
+        if "_" in text:  # which Python accepts within a number
             raise ValueError(text)
         return tuple(float(word) for word in text.replace(",", " ").split())
     except ValueError:

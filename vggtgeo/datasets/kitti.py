@@ -28,12 +28,12 @@ _LINES = {"image_2": ("P2",), "image_0": ("P0",), "image_02": ("P_rect_02", "P2"
 
 @dataclass(frozen=True)
 class Kitti(FolderSequence):
-    """One drive. Truth: `poses.txt` in the folder, or `poses/NN.txt` beside the sequences; those of the left grey
-    camera, moved to the colour camera where that is read.
+    """One drive. Ground truth: `poses.txt` in the folder, or `poses/NN.txt` beside the sequences; poses of the left
+    grey camera, transformed to the colour camera if that is read.
     """
 
     baseline: float = 0.0
-    """Metres along x from the left grey camera, which the truth belongs to, to this one."""
+    """Metres along x from the left grey camera, that of the ground truth, to this one."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -88,7 +88,7 @@ class Kitti(FolderSequence):
 
 
 def _times(folder: Path, place: Path) -> list[float]:
-    """Of every line of the drive; none where no list is there."""
+    """Return the times of all lines; empty without a list."""
     seconds, stamps = folder / "times.txt", place.parent / "timestamps.txt"
     file = next((file for file in (seconds, stamps) if file.is_file()), None)
     if file is None:
@@ -96,7 +96,7 @@ def _times(folder: Path, place: Path) -> list[float]:
     times = read_matrices(file, 1)[:, 0].tolist() if file == seconds else _moments(file)
     if not times:
         raise InputError(
-            f"`{file}` has no time; give that of the drive, or take the file away (then {RATE:g} frames a second)"
+            f"`{file}` has no time; give that of the drive, or remove the file (then {RATE:g} frames a second)"
         )
     return times
 
@@ -108,12 +108,12 @@ def _moments(file: Path) -> list[float]:
     try:
         moments = [datetime.fromisoformat(line[:26]) for line in lines]
         return [(moment - moments[0]).total_seconds() for moment in moments]
-    except (ValueError, TypeError) as error:  # a time with a zone, and one without, have no difference
+    except (ValueError, TypeError) as error:  # times with and without a time zone
         raise InputError(f"`{file}`: {error}; expected lines `2011-09-26 13:02:25.594360389`") from None
 
 
 def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, float]:
-    """Return the camera, and its distance from the left grey one: the fourth number of `P` is `-fx b`."""
+    """Return the camera, and its baseline from the left grey one: the fourth number of `P` is `-fx b`."""
     for file in (
         folder / "calib.txt",
         folder / "calib_cam_to_cam.txt",
@@ -134,14 +134,14 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
 
 
 def _calibration(file: Path) -> dict[str, str]:
-    """Its lines `KEY: VALUES`."""
+    """Return lines `KEY: VALUES` by key."""
     lines = whole_text(file).splitlines() if file.is_file() else []
     parts = [line.partition(":") for line in lines]
     return {key.strip(): rest for key, _, rest in parts}
 
 
 def _is_unrectified(file: Path, values: Mapping[str, str], name: str, width: int, height: int) -> bool:
-    """Return whether images have the size before the rectification, as in the drives `_extract`."""
+    """Return whether images have the size before rectification, as in the drives `_extract`."""
     original, rectified = (
         tuple(numbers_of(values.get(key, "").split(), f"`{file}`: `{key}`"))
         for key in (f"S_{name[-2:]}", f"S_rect_{name[-2:]}")

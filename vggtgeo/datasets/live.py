@@ -1,4 +1,4 @@
-"""A camera that is running: a webcam (`webcam:0`) or a stream by its address (`rtsp://...`, `http://...`)."""
+"""Live cameras: a webcam (`webcam:0`) or a stream by its address (`rtsp://...`, `http://...`)."""
 
 import math
 import re
@@ -16,19 +16,20 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
 _WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
-"""Of a number that OpenCV has a place for; another name is one of a file, which is not there."""
+"""Digits of a webcam's number."""
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://.+", re.IGNORECASE)
 
 
 def is_live(text: str) -> bool:
-    """Return whether `text` names a webcam or a stream, no file."""
+    """Return whether `text` names a webcam or a stream, not a file."""
     return _WEBCAM.fullmatch(text) is not None or _ADDRESS.fullmatch(text) is not None
 
 
 @dataclass(frozen=True)
 class LiveCamera:
-    """Frames as they come, without depth and truth, until the stream ends or the run is interrupted. Its length is 0:
-    not known. Time is that of arrival.
+    """Frames of a live camera, without depth and ground truth, until the stream ends or the run is interrupted.
+
+    The length is unknown (0). Times are those of arrival.
     """
 
     source: str
@@ -37,7 +38,7 @@ class LiveCamera:
 
     @classmethod
     def open(cls, source: str) -> Self:
-        """Take one frame for the size of the images; InputError where no camera answers."""
+        """Open a camera and read one frame for the size; raise InputError if no camera answers."""
         capture = _capture(source)
         try:
             there, image = capture.read()
@@ -45,12 +46,12 @@ class LiveCamera:
         finally:
             capture.release()
         if not there:
-            raise InputError(f"`{_public(source)}` gives no frame: is the camera there, and free?")
+            raise InputError(f"`{_public(source)}` gives no frame: is the camera connected, and not in use?")
         height, width = image.shape[:2]
-        if _ADDRESS.fullmatch(source) and math.isfinite(count) and count > 0:  # a camera that is running knows no end
+        if _ADDRESS.fullmatch(source) and math.isfinite(count) and count > 0:  # a live camera has no length
             warnings.warn(
-                f"`{_public(source)}` is a recording of {count:.0f} frames, and the time of each would be that of its "
-                "arrival: fetch it first (`curl -O ADDRESS`), and give the file",
+                f"`{_public(source)}` is a recording of {count:.0f} frames, whose times would be those of arrival: "
+                "download it first (`curl -O ADDRESS`), and give the file",
                 InputWarning,
                 stacklevel=3,
             )
@@ -65,22 +66,22 @@ class LiveCamera:
 
     @property
     def name(self) -> str:
-        """Return the source, without a password in it."""
+        """Return the source without its password."""
         return _public(self.source)
 
     def __len__(self) -> int:
         return 0
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """Return the frames start, start + stride, ... below end, as they come. What arrives while nobody asks may be
-        lost.
+        """Return the frames start, start + stride, ... below end as they arrive; frames that are not requested in time
+        are lost.
         """
         if stride < 1 or start < 0 or (end is not None and end <= start):
             raise InputError(f"`start` is {start}, `end` {end}, `stride` {stride}; they must select a frame")
         return self._read(start, end, stride)
 
     def ground_truth(self) -> Trajectory | None:
-        """None."""
+        """Return None: there is no ground truth."""
         return None
 
     def _read(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
@@ -110,12 +111,12 @@ def _public(source: str) -> str:
 def _capture(source: str) -> cv2.VideoCapture:
     webcam = _WEBCAM.fullmatch(source)
     logging: Any = cv2.utils.logging
-    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the error below says what its warnings would
+    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the error below replaces its warnings
     try:
         capture = cv2.VideoCapture(int(webcam.group(1) or 0) if webcam else source)
     finally:
         logging.setLogLevel(level)
     if not capture.isOpened():
         capture.release()
-        raise InputError(f"`{_public(source)}` cannot be opened: is the camera there, and its address right?")
+        raise InputError(f"`{_public(source)}` cannot be opened: is the camera connected, and the address right?")
     return capture

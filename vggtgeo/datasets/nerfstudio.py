@@ -8,7 +8,7 @@
 | `camera_model`, `is_fisheye` | the lens: a pinhole, distorted or not, or a fisheye of `k1` ... `k4` |
 | `camera_angle_x` | field of view, radians, where there is no focal length |
 
-The poses are those of another program (COLMAP, ARKit), often of free scale: no independent truth.
+The poses are those of another program (COLMAP, ARKit), often of free scale, not an independent ground truth.
 """
 
 import math
@@ -40,12 +40,12 @@ _FISHEYE = "OPENCV_FISHEYE"
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 _SAME_SHAPE = 0.01
 _ONE_CAMERA = 0.02
-"""Relative difference of focal lengths up to which the frames have one camera; autofocus changes it by less."""
+"""Maximum relative difference of the focal lengths of one camera; autofocus changes them by less."""
 
 
 @dataclass(frozen=True)
 class Nerfstudio(FolderSequence):
-    """Images with `transforms.json`. Truth: its poses. The file has no times: 30 frames a second, or as is said."""
+    """Images with `transforms.json`, 30 frames a second or the given rate. Ground truth: its poses."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -54,7 +54,7 @@ class Nerfstudio(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the frames by the numbers in the names of their images: the file has them in any order."""
+        """List the frames by the numbers in their images' names; their order in the file is arbitrary."""
         file = folder / FILE
         content = _object(read_json(file), f"`{file}`")
         frames = [
@@ -64,7 +64,7 @@ class Nerfstudio(FolderSequence):
         if not images:
             raise InputError(f"`{file}` lists no frames; expected `frames` with `file_path` and `transform_matrix`")
         if len(images) < len(frames):
-            text = f"{len(frames) - len(images)} of its frames name an image once more: the last pose of each is read"
+            text = f"{len(frames) - len(images)} of its frames repeat an image: the last pose of each is used"
             warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=3)
         order = sorted(images, key=lambda path: natural_key(str(path.relative_to(folder))))
         rows = [
@@ -76,7 +76,7 @@ class Nerfstudio(FolderSequence):
         return cls.listed(folder, rows, camera, coding, as_images=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth, enlarged to the images where it is smaller, as a phone's is."""
+        """Return the depth, enlarged to the images."""
         return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
@@ -85,12 +85,12 @@ class Nerfstudio(FolderSequence):
         frames = {_image(self.folder, file, frame): frame for frame in read_json(file)["frames"]}
         poses = [_pose(file, frames[one.image]) for one in self.files if one.image in frames]
         times = [one.timestamp for one in self.files if one.image in frames]
-        with np.errstate(invalid="ignore"):  # of poses with infinities, which are left out
+        with np.errstate(invalid="ignore"):  # of infinite poses, which are left out
             return trajectory_of(times, np.array(poses) @ FROM_OPENGL, file) if poses else None
 
     @property
     def truth_in_metres(self) -> bool:
-        """Return where depth in metres belongs to the poses (phones); those of COLMAP have no unit."""
+        """Return whether the poses are metric, as those with depth (phones); COLMAP's are not."""
         return any(one.depth is not None for one in self.files)
 
 
@@ -107,7 +107,7 @@ def _listed(value: object, what: str) -> list[Any]:
 
 
 def _image(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path:
-    """Return the image of a frame; some writers leave its ending out, and some images were converted since."""
+    """Return the image of a frame; its suffix may be missing, or changed by a conversion."""
     return _below(folder, file, "file_path", frame.get("file_path"), sorted(IMAGE_SUFFIXES))
 
 
@@ -119,8 +119,8 @@ def _depth(folder: Path, file: Path, frame: Mapping[str, Any]) -> Path | None:
 
 
 def _below(folder: Path, file: Path, key: str, name: object, endings: Collection[str] = ()) -> Path:
-    """Return a file below the folder: a list from a stranger opens nothing else. One that was listed elsewhere, before
-    somebody copied the folder, is searched by its name, here and in `images`; one that is nowhere, with other endings.
+    """Return a file below the folder; others are never opened. A path of another place, before the folder was copied,
+    is searched by its name, here and in `images`, also with other suffixes.
     """
     path = Path(name.replace("\\", "/")) if isinstance(name, str) else Path()
     if not path.name or "\0" in str(path):
@@ -140,7 +140,7 @@ def _below(folder: Path, file: Path, key: str, name: object, endings: Collection
 
 
 def _pose(file: Path, frame: Mapping[str, Any]) -> np.ndarray:
-    """Return float64 [4, 4] with OpenGL's axes; a last row may be missing."""
+    """Return a pose [4, 4] with OpenGL's axes; its last row may be missing."""
     try:
         pose = np.array(frame.get("transform_matrix"), np.float64)
     except (TypeError, ValueError):
@@ -153,7 +153,7 @@ def _pose(file: Path, frame: Mapping[str, Any]) -> np.ndarray:
 
 
 def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], width: int, height: int) -> Camera:
-    """Return the camera of the file, or the middle of those of its frames, for images of this size."""
+    """Return the camera of the file, or the median of those of its frames, for images of this size."""
     fisheye = _is_fisheye(file, content)
     across, down = (
         float(size) if stated is None else _positive(file, key, stated)
@@ -193,7 +193,7 @@ def _warn_of_unread(file: Path, content: Mapping[str, Any], frames: list[Mapping
 
 
 def _is_fisheye(file: Path, content: Mapping[str, Any]) -> bool:
-    """By `camera_model` (nerfstudio) and `is_fisheye` (instant-ngp), which must not contradict each other."""
+    """Return whether the lens is a fisheye, by `camera_model` (nerfstudio) and `is_fisheye` (instant-ngp)."""
     model, stated = str(content.get("camera_model", "")).upper(), content.get("is_fisheye")
     if model not in (*_PINHOLES, _FISHEYE):
         known = ", ".join((*_PINHOLES[1:], _FISHEYE))
@@ -219,7 +219,7 @@ def _focal(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any
 
 
 def _number(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], key: str) -> float | None:
-    """Of the whole file, else the middle of the frames', else None; told where focal lengths differ."""
+    """Return a number of the file, else the median of the frames', else None; warn if focal lengths differ."""
     if content.get(key) is not None:
         return _finite(file, key, content[key])
     own = [_finite(file, key, frame[key]) for frame in frames if frame.get(key) is not None]

@@ -7,8 +7,8 @@
 | `depth_00012.png` | `depth/TIME.png`, or `corrected_depth/` | depth, millimetres, of fewer pixels and the same view |
 | `conf_00012.png` | `confidence/TIME.png` | trust in it: 0 is low, larger is more |
 
-What Polycam corrected on the phone (a second estimate of the poses, lenses undone) is preferred. Thumbnails and meshes
-beside are not read. Poses are those of ARKit, which are no independent truth.
+Polycam's corrected data (refined poses, undistorted images) are preferred. Thumbnails and meshes are not read. Poses
+are those of ARKit, not an independent ground truth.
 """
 
 import re
@@ -35,14 +35,14 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 _FRAME = re.compile(r"frame_(\d{1,9})\.(jpe?g|png)", re.IGNORECASE)
 _MICROSECOND = 1e-6
 _ONE_CAMERA = 0.02
-"""Relative difference of focal lengths up to which the frames have one camera; autofocus changes it by less."""
+"""Maximum relative difference of the focal lengths of one camera; autofocus changes them by less."""
 _SAME_SHAPE = 0.01
 _UNKNOWN = np.full((4, 4), np.nan)
 
 
 class _Stated(NamedTuple):
-    """What a file of JSON says of its image: time, seconds, NaN where it does not; camera: fx, fy, cx, cy; size: width
-    and height, where stated; pose float64 [4, 4], camera -> world, axes of OpenGL, NaN where it is none.
+    """Content of a JSON file of one image: time, seconds, NaN if unknown; camera, fx, fy, cx, cy; size, width and
+    height, if stated; pose float64 [4, 4], camera -> world, OpenGL's axes, NaN if invalid.
     """
 
     time: float
@@ -62,7 +62,7 @@ class _Part(NamedTuple):
 
 @dataclass(frozen=True)
 class PhoneExport(FolderSequence):
-    """Images of a phone, each with a file that states its camera, pose and time. Truth: ARKit's own poses.
+    """Images of a phone, each with a file of camera, pose and time. Ground truth: ARKit's poses.
 
     poses: float64 [4, 4], camera -> world, by image. confidence: files by that of the depth.
     """
@@ -71,25 +71,25 @@ class PhoneExport(FolderSequence):
     confidence: Mapping[Path, Path] = field(default_factory=dict, compare=False, repr=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth, enlarged to the images; what the phone does not trust is none."""
+        """Return the depth, enlarged to the images, without that of low confidence."""
         depth = read_depth(path, self.depth_format)
         if path in self.confidence:
             leave_out_doubtful(depth, self.confidence[path])
         return enlarged(depth, (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
-        """ARKit's poses, camera -> world; the files have them with the axes of OpenGL."""
+        """Return ARKit's poses, camera -> world; the files have OpenGL's axes."""
         if not self.files:
             return None
         poses = np.array([self.poses[file.image] for file in self.files])
-        with np.errstate(invalid="ignore"):  # of poses that are none, which are left out
+        with np.errstate(invalid="ignore"):  # of invalid poses, which are left out
             return trajectory_of([file.timestamp for file in self.files], poses @ FROM_OPENGL, self.folder)
 
     @classmethod
     def _of_parts(cls, folder: Path, parts: Iterable[_Part], read: Callable[[Path], _Stated]) -> Self:
         known = [(part, stated) for part in parts if (stated := _read(part, read)) is not None]
         if not known:
-            raise InputError(f"`{folder}` has no image beside a file of its camera that can be read")
+            raise InputError(f"`{folder}` has no image with a valid file of its camera")
         times = _times(folder, [stated.time for _, stated in known])
         frames = [(time, part.image, existing(part.depth)) for time, (part, _) in zip(times, known, strict=True)]
         trusted = {part.depth: part.confidence for part, _ in known if part.confidence.is_file()}
@@ -111,7 +111,7 @@ class Scanner3d(PhoneExport):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images by their numbers; InputError where none has a camera."""
+        """List the images by their numbers; raise InputError if none has a camera."""
         parts = [
             _Part(image, *(image.with_name(f"{what}_{number}{end}") for what, end in _SCANNER_PARTS))
             for number, image in _frames(folder).items()
@@ -125,12 +125,12 @@ class Polycam(PhoneExport):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder`, or `keyframes` in it, has images beside their cameras."""
+        """Return whether `folder`, or `keyframes` in it, has images with their cameras."""
         return _keyframes(folder) is not None
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images by their times; InputError where none has a camera."""
+        """List the images by their times; raise InputError if none has a camera."""
         place = _keyframes(folder)
         if place is None:
             raise InputError(
@@ -170,7 +170,7 @@ def _is_of_polycam(place: Path, corrected: str) -> bool:
 
 
 def _read(part: _Part, read: Callable[[Path], _Stated]) -> _Stated | None:
-    """None where the file of an image is missing or damaged, with a warning: the image is left out."""
+    """Read the file of an image; None, with a warning, if it is invalid: the image is left out."""
     try:
         return read(part.stated)
     except InputError as error:
@@ -181,7 +181,7 @@ def _read(part: _Part, read: Callable[[Path], _Stated]) -> _Stated | None:
 def _of_scanner(file: Path) -> _Stated:
     content = _object(file)
     values = _numbers(file, content, "intrinsics", 9).reshape(3, 3)
-    values = values if values[0, 2] or values[1, 2] else values.T  # by columns, as ARKit itself has it
+    values = values if values[0, 2] or values[1, 2] else values.T  # by columns, as ARKit has it
     pose = (
         np.array(content.get("cameraPoseARFrame", ()), np.float64) if _is_list(content, "cameraPoseARFrame") else None
     )
@@ -196,7 +196,7 @@ def _of_polycam(file: Path) -> _Stated:
     camera = intrinsics_of(file, [content.get(key) for key in ("fx", "fy", "cx", "cy")])
     pose = np.eye(4)
     pose[:3] = [[_number(content, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-    # What was corrected has no times of its own.
+    # Corrected cameras have no times.
     other = file.parent.parent / "cameras" / file.name
     time = _number(content, "timestamp")
     if np.isnan(time) and other != file and other.is_file():
@@ -234,12 +234,12 @@ def _times(folder: Path, stated: list[float]) -> list[float]:
     """Return those of the files where they rise, else 30 frames a second."""
     if np.isfinite(stated).all() and all(before < after for before, after in pairwise(stated)):
         return stated
-    _warn(f"`{folder}`: the times of its images do not rise; {FRAMES_PER_SECOND:g} frames a second are taken")
+    _warn(f"`{folder}`: the times of its images do not increase; {FRAMES_PER_SECOND:g} frames a second are assumed")
     return [index / FRAMES_PER_SECOND for index in range(len(stated))]
 
 
 def _camera(folder: Path, stated: list[_Stated], width: int, height: int) -> Camera:
-    """Return the middle of the intrinsics of all frames: autofocus changes them by a few tenths of a per cent."""
+    """Return the median of the intrinsics of all frames; autofocus changes them by a few tenths of a per cent."""
     rows = np.array([one.camera for one in stated])
     middle = np.median(rows, axis=0)
     low, high = rows[:, 0].min(), rows[:, 0].max()

@@ -7,8 +7,8 @@
 | camera | `camera_matrix.csv` | `lowres_wide_intrinsics/*.pincam` |
 | poses | `odometry.csv` | `lowres_wide.traj` |
 
-The depth has 256 x 192 pixels of the same field of view; it is enlarged to the images without interpolation. Poses are
-those of ARKit, which are no independent truth: differences from them are not errors.
+The depth has 256 x 192 pixels of the same view; it is enlarged to the images without interpolation. Poses are those of
+ARKit, not an independent ground truth: differences from them are not errors.
 """
 
 import warnings
@@ -34,18 +34,18 @@ from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.text_files import whole_text
 
 LARGEST = 960
-"""Pixels of the longer side: the depth has 256, and 1920 pixels of image cost four times as much."""
+"""Maximum pixels of the longer side: the depth has 256, and images of 1920 cost four times as much."""
 _LEAST_CONFIDENCE = 1
-"""Of 0 (low), 1 and 2; Polycam writes 0, 127 and 255."""
+"""Minimum of 0 (low), 1 and 2; Polycam writes 0, 127 and 255."""
 _CONFIDENCE = "confidence"
 _LISTS = "odometry.csv", "camera_matrix.csv"
-"""What Stray Scanner writes beside the video."""
+"""Files of Stray Scanner beside the video."""
 _MOST_DELAY = 0.02
 
 
 @dataclass(frozen=True)
 class StrayScanner:
-    """A folder of Stray Scanner. Truth: ARKit's own odometry."""
+    """A folder of Stray Scanner. Ground truth: ARKit's odometry."""
 
     folder: Path
     name: str
@@ -61,7 +61,7 @@ class StrayScanner:
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Open the video; images are reduced to at most 960 pixels, by a whole number."""
+        """Open the video; images are reduced to at most 960 pixels, by an integer factor."""
         absent = [folder / name for name in _LISTS if not (folder / name).is_file()]
         if absent:
             raise InputError(
@@ -69,7 +69,7 @@ class StrayScanner:
                 "give `rgb.mp4` alone, as a video"
             )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", InputWarning)  # the video alone has no intrinsics; the folder has
+            warnings.simplefilter("ignore", InputWarning)  # the video has no intrinsics, but the folder has
             video = VideoFile.open(folder / "rgb.mp4", depth=False)
         width, height = video.camera.width, video.camera.height
         reduction = -(-max(width, height) // LARGEST)
@@ -90,7 +90,7 @@ class StrayScanner:
         has_depth = bool(files_like(folder / "depth", "*.png"))
         if has_depth and not (folder / _CONFIDENCE).is_dir():
             warnings.warn(
-                f"`{folder}` has no folder `{_CONFIDENCE}`: its depth is used whatever the phone thought of it",
+                f"`{folder}` has no folder `{_CONFIDENCE}`: all depth is used",
                 InputWarning,
                 stacklevel=3,
             )
@@ -106,7 +106,7 @@ class StrayScanner:
         return (self._frame(frame) for frame in self.video.frames(start, end, stride))
 
     def ground_truth(self) -> Trajectory | None:
-        """ARKit's poses, camera -> world, which the app writes with the axes of OpenCV."""
+        """Return ARKit's poses, camera -> world, which the app writes with OpenCV's axes."""
         rows = _odometry(self.folder)
         return trajectory_of(rows[:, 0], poses_of(rows[:, 2:5], rows[:, 5:9]), self.folder / "odometry.csv")
 
@@ -130,11 +130,11 @@ class StrayScanner:
 
 
 def leave_out_doubtful(depth: np.ndarray, file: Path) -> None:
-    """Make NaN of depth that the phone does not trust; where that is not known all stays, with an InputWarning."""
+    """Replace depth of low confidence by NaN; warn if the confidence cannot be read, and keep all depth."""
     try:
         trust = read_codes(file)
         if trust.shape != depth.shape:
-            raise InputError(f"`{file}`: found the shape {trust.shape}; its depth has {depth.shape}")
+            raise InputError(f"`{file}` has shape {trust.shape}, its depth {depth.shape}")
     except InputError as error:
         warnings.warn(f"{error}; all depth of the frame is used", InputWarning, stacklevel=4)
     else:
@@ -152,7 +152,7 @@ class ArkitScenes(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images and pairs each with the depth nearest in time."""
+        """List the images, and pair each with the depth nearest in time."""
         images = _timed(folder / "lowres_wide")
         if not images:
             raise InputError(f"`{folder}/lowres_wide` has no images named `..._SECONDS.png`")
@@ -161,11 +161,11 @@ class ArkitScenes(FolderSequence):
         return cls.listed(folder, frames, lambda *size: _pincam(folder, *size), as_images=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth, enlarged to the images where it is smaller."""
+        """Return the depth, enlarged to the images."""
         return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
-        """ARKit's poses: the file holds world -> camera, an axis with the angle as its length, and a translation."""
+        """Return ARKit's poses; the file has world -> camera as rotation vectors and translations."""
         file = self.folder / "lowres_wide.traj"
         if not file.is_file():
             return None
@@ -177,7 +177,7 @@ class ArkitScenes(FolderSequence):
 
 
 def _odometry(folder: Path) -> np.ndarray:
-    """Rows: time, frame, x, y, z, qx, qy, qz, qw."""
+    """Return rows of time, frame, x, y, z, qx, qy, qz, qw."""
     file = folder / "odometry.csv"
     text = [line for line in whole_text(file).splitlines() if line.strip()]
     header = text[0].split(",") if text else []
@@ -205,7 +205,7 @@ def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
 
 
 def _pincam(folder: Path, width: int, height: int) -> Camera:
-    """Return the middle of the intrinsics of all frames: autofocus changes them by a few tenths of a per cent."""
+    """Return the median of the intrinsics of all frames; autofocus changes them by a few tenths of a per cent."""
     files = files_like(folder / "lowres_wide_intrinsics", "*.pincam")
     if not files:
         raise InputError(f"`{folder}/lowres_wide_intrinsics` has no `.pincam` file: width height fx fy cx cy")

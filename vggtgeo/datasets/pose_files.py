@@ -1,4 +1,4 @@
-"""Poses and cameras as the benchmarks write them: matrices, rows of CSV, fields of YAML."""
+"""Files of poses and cameras of benchmarks: matrices, CSV, YAML, JSON."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
 _MOST_STRETCH = 0.1
-"""Of the axes of a pose in a file: few digits, or a scale of a per cent, are mended."""
+"""Maximum error of the lengths of a pose's axes; smaller ones (few digits, a scale of 1 %) are corrected."""
 
 
 def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
@@ -37,7 +37,7 @@ def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray
 
 
 def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
-    """Return one matrix; InputError where the file is not there, or holds another count of numbers."""
+    """Return one matrix; raise InputError if the file is missing or has another number of values."""
     text = read_text(file)
     try:
         return np.array(text.replace(",", " ").split(), np.float64).reshape(shape)
@@ -48,11 +48,10 @@ def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
 def trajectory_of(
     times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path, of: str = "truth"
 ) -> Trajectory | None:
-    """Return camera -> world at `times`; poses with NaN or infinity, or without a rotation, as files have them where
-    tracking was lost, are left out with an InputWarning; so are those of a time that was there, and lines out of order
-    are sorted, as those of a file of TUM. of: what they are, for that.
+    """Return camera -> world at `times`, sorted by time; None if no pose is valid.
 
-    None where no pose is left.
+    Warns of poses that are left out: with NaN or infinity (lost tracking), without a rotation, or with a repeated
+    time. of: a noun for the warnings.
     """
     poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     times = np.asarray(times, np.float64)[: len(poses)]
@@ -95,8 +94,8 @@ def trajectory_of_rows(
 
 
 def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
-    """Matrices of positions [n, 3] and quaternions [n, 4], x y z w; zeros for the rotation where a quaternion is none:
-    its length is not about 1.
+    """Return matrices of positions [n, 3] and quaternions [n, 4], x y z w; the rotation is 0 if the length of a
+    quaternion is not about 1.
     """
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -112,7 +111,7 @@ def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray
 def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
     """Return the list of numbers after `key:` in a YAML file as the benchmarks write them: `key: [1, 2, 3]`.
 
-    InputError where it is not there, or has not `count` of them (None: any count will do).
+    Raises InputError if it is missing, or does not have `count` values (None: any number).
     """
     found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", read_text(file), re.MULTILINE)
     if found is None:
@@ -124,12 +123,12 @@ def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
 
 
 def states_list(file: Path, key: str) -> bool:
-    """Return whether the YAML file has a list `key: [...]`."""
+    """Return whether a YAML file has a list `key: [...]`."""
     return re.search(rf"^\s*{re.escape(key)}\s*:\s*\[", read_text(file), re.MULTILINE) is not None
 
 
 def numbers_of(words: Sequence[str], what: str) -> list[float]:
-    """Words as numbers; what: they are, for the InputError where one is none."""
+    """Return words as numbers; raise InputError naming `what` if one is not a number."""
     try:
         return [float(word) for word in words]
     except ValueError:
@@ -137,26 +136,26 @@ def numbers_of(words: Sequence[str], what: str) -> list[float]:
 
 
 def read_text(file: Path) -> str:
-    """Return the text of a file, other letters than those of UTF-8 replaced; InputError where it cannot be read."""
+    """Return the text of a file, invalid UTF-8 replaced; raise InputError if it cannot be read."""
     try:
         if file.exists() and not file.is_file():  # a pipe has no end
-            raise InputError(f"`{file}` is no regular file")
+            raise InputError(f"`{file}` is not a regular file")
         return whole_text(file)
     except OSError as error:
         raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None
 
 
 def read_json(file: Path) -> Any:
-    """Return the content of a JSON file; InputError where it is none."""
+    """Return the content of a JSON file; raise InputError if it is not valid JSON."""
     return json_in(read_text(file), file)
 
 
 def json_in(content: str | bytes, where: Path) -> Any:
-    """What a text of JSON says; InputError where it is none. where: it stands, for that."""
+    """Return the content of JSON text; raise InputError naming `where` if it is not valid JSON."""
     try:
         return json.loads(content, parse_int=_whole)
-    except (ValueError, RecursionError) as error:  # too many brackets are no error of the syntax
-        raise InputError(f"`{where}` is no JSON: {error}") from None
+    except (ValueError, RecursionError) as error:  # of too many brackets
+        raise InputError(f"`{where}` is not valid JSON: {error}") from None
 
 
 def same_size(stated: Sequence[object], size: tuple[int, int]) -> bool:
@@ -177,12 +176,12 @@ def check_size(file: Path, stated: Sequence[object], size: tuple[int, int]) -> N
 
 
 _MOST_DIGITS = 300
-"""Of a whole number that float64 holds, whatever its digits are."""
+"""Digits of an integer that float64 can represent."""
 
 
 def _whole(digits: str) -> float:
-    """Return a whole number; as a float, infinite at last, where it has so many digits that none can be made of it
-    later: readers look for what is not finite, and not for an overflow.
+    """Return an integer; a float, possibly infinite, if it has too many digits: readers check for finite values, not
+    for overflow.
     """
     return int(digits) if len(digits) <= _MOST_DIGITS else float(digits)
 
@@ -197,6 +196,6 @@ def have_rotations(poses: np.ndarray) -> np.ndarray:
 
 
 def _orthonormal(poses: np.ndarray) -> np.ndarray:
-    """Return the nearest rotations: files with few digits, or with a scale of 1 +- 1e-3, are no exact ones."""
+    """Return the nearest rigid motions: files have few digits, or a scale of 1 +- 1e-3."""
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     return np.concatenate([np.concatenate([u @ vt, poses[:, :3, 3:]], axis=2), poses[:, 3:]], axis=1)

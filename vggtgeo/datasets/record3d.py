@@ -8,8 +8,8 @@ zip archive, or the same unpacked, or what it exports as "EXR + JPG".
 | `rgbd/0.depth` | `depth/0.exr` | depth, float32 metres; in a `.r3d` compressed with LZFSE |
 | `rgbd/0.conf` | | trust in it, uint8, 0 to 2, compressed likewise; not of every phone |
 
-LZFSE is decoded by the package imagecodecs, EXR by OpenEXR (extra `phones`). Poses are those of ARKit, which are no
-independent truth.
+LZFSE is decoded by the package imagecodecs, EXR by OpenEXR (extra `phones`). Poses are those of ARKit, not an
+independent ground truth.
 """
 
 import math
@@ -50,12 +50,12 @@ SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"
 _IMAGE = re.compile(r"rgbd?/(\d{1,9})\.(jpe?g|png)")
 _LEAST_CONFIDENCE = 1
-"""Of 0 (low), 1 and 2."""
+"""Minimum of 0 (low), 1 and 2."""
 
 
 @dataclass(frozen=True)
 class Record3d(FolderSequence):
-    """A recording of Record3D. `folder`: the archive, or the folder of its parts. Truth: ARKit's own poses.
+    """A recording of Record3D. `folder`: the archive, or the unpacked folder. Ground truth: ARKit's poses.
 
     depth_size: width and height of the depth, which is enlarged to the images.
     """
@@ -64,13 +64,13 @@ class Record3d(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether there is `metadata` beside `rgbd`, in a folder or a zip archive, or `metadata.json` beside
-        EXR; or it is a file that ends with `.r3d`.
+        """Return whether a folder or a zip archive has `metadata` and `rgbd`, or `metadata.json` and EXR; or the file's
+        suffix is `.r3d`.
         """
         if folder.is_dir():
             exported = (folder / EXPORTED).is_file() and next((folder / "depth").glob("*.exr"), None) is not None
             return exported or ((folder / METADATA).is_file() and (folder / "rgbd").is_dir())
-        if folder.suffix.lower() == SUFFIX:  # one that is cut short is no zip archive any more
+        if folder.suffix.lower() == SUFFIX:  # a truncated one is not a zip archive
             return folder.is_file()
         try:
             if not (folder.is_file() and zipfile.is_zipfile(folder)):
@@ -82,17 +82,17 @@ class Record3d(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images; InputError where there is none. Depth that cannot be read is told, and left out."""
+        """List the images; raise InputError if there are none, and warn of depth that cannot be read."""
         try:
             names = _names(folder)
         except UNREADABLE as error:
             raise InputError(
-                f"`{folder}` is damaged or cut short, a recording of Record3D is a whole zip archive ({error}); share "
-                "it from the app again"
+                f"`{folder}` is damaged or truncated, must be a zip archive of Record3D ({error}); share it "
+                "from the app again"
             ) from None
         numbered = {int(match.group(1)): folder / name for name in sorted(names) if (match := _IMAGE.fullmatch(name))}
         if not names & {METADATA, EXPORTED} or not numbered:
-            raise InputError(f"`{folder}` is no recording of Record3D: expected `{METADATA}` and `rgbd/0.jpg`, ...")
+            raise InputError(f"`{folder}` must be a recording of Record3D, with `{METADATA}` and `rgbd/0.jpg`, ...")
         numbers = sorted(numbered)
         images = [numbered[number] for number in numbers]
         depths = [_depth_of(image) for image in images]
@@ -108,29 +108,29 @@ class Record3d(FolderSequence):
 
     @property
     def file(self) -> Path:
-        """Of the metadata."""
+        """Return the file of the metadata."""
         return self.folder / (EXPORTED if (self.folder / EXPORTED).is_file() else METADATA)
 
     def metadata(self) -> Mapping[str, Any]:
-        """What the file of the metadata holds; InputError where it is no JSON object."""
+        """Return the metadata; raise InputError unless they are a JSON object."""
         where = self.file
         content = json_in(self._content(where, MOST_TEXT), where)
         if not isinstance(content, dict):
-            raise InputError(f"`{where}` holds no object of JSON; expected one with `K`, `fps` and `poses`")
+            raise InputError(f"`{where}` must be a JSON object with `K`, `fps` and `poses`")
         return content
 
     def holds(self, path: Path) -> bool:
-        """Return whether the archive, or the folder, has such a part."""
+        """Return whether the archive or folder has this file."""
         if self.folder.is_dir():
             return path.is_file()
         return path.relative_to(self.folder).as_posix() in self._archive.NameToInfo
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """Return the image in a part of the archive."""
+        """Return the image in a file of the archive."""
         return image_in(self._content(path), path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth in a part of the archive, enlarged to the images; what is not trusted is none."""
+        """Return the depth in a file of the archive, enlarged to the images, without that of low confidence."""
         if path.suffix == ".exr":
             return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
         shape = self.camera.height, self.camera.width
@@ -143,23 +143,21 @@ class Record3d(FolderSequence):
         return enlarged(depth, (self.camera.width, self.camera.height), path)
 
     def ground_truth(self) -> Trajectory | None:
-        """ARKit's poses, camera -> world; the file has them with OpenGL's axes. None where it has none."""
+        """Return ARKit's poses, camera -> world, None without any; the file has OpenGL's axes."""
         poses, where = self.metadata().get("poses"), self.file
         if not (isinstance(poses, list) and poses):
             return None
         try:
             rows = np.array(poses, np.float64).reshape(len(poses), 7)
         except (ValueError, TypeError):
-            raise InputError(f"`{where}`: a pose has not 7 numbers, a quaternion and a place") from None
+            raise InputError(f"`{where}`: `poses` must have 7 numbers each, a quaternion and a position") from None
         numbers = [int(file.image.stem) for file in self.files]
         there = [row for row, number in enumerate(numbers) if number < len(rows)]
         found = poses_of(rows[:, 4:], rows[:, :4])[[numbers[row] for row in there]] @ FROM_OPENGL
         return trajectory_of([self.files[row].timestamp for row in there], found, where)
 
     def _content(self, path: Path, most: int = MAX_BYTES) -> bytes:
-        """Return all bytes of a part, by its path in the folder or, as if it were one, in the archive; no more than
-        `most`.
-        """
+        """Return the content of a file in the folder or archive; at most `most` bytes."""
         if self.folder.is_dir():
             return file_content(path, most)
         try:
@@ -174,11 +172,11 @@ class Record3d(FolderSequence):
 
     @cached_property
     def _archive(self) -> zipfile.ZipFile:
-        """Open as long as the sequence lives: its list of contents takes longer to read than an image."""
+        """Keep the archive open: its directory takes longer to read than an image."""
         return zipfile.ZipFile(self.folder)
 
     def _unpacked(self, path: Path, item_bytes: int) -> bytes:
-        """Return the bytes that LZFSE made smaller: at most one of these items for each pixel of the image."""
+        """Return decompressed bytes (LZFSE): at most one item per pixel of the image."""
         most = item_bytes * self.camera.width * self.camera.height
         packed = self._content(path)
         try:
@@ -191,7 +189,7 @@ class Record3d(FolderSequence):
 
 
 def _names(place: Path) -> frozenset[str]:
-    """Of the parts."""
+    """Return the names of the files."""
     if place.is_dir():
         parts = [place / METADATA, place / EXPORTED]
         parts += [path for name in ("rgbd", "rgb", "depth") for path in (place / name).glob("*")]
@@ -201,7 +199,7 @@ def _names(place: Path) -> frozenset[str]:
 
 
 def _depth_of(image: Path) -> Path:
-    """Return where the depth of an image would be."""
+    """Return the path of an image's depth."""
     if image.parent.name == "rgbd":
         return image.with_suffix(".depth")
     return image.parent.parent / "depth" / f"{image.stem}.exr"
@@ -217,7 +215,7 @@ def _decoder() -> Callable[..., Any]:
 
 
 def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image: tuple[int, int]) -> np.ndarray:
-    """Return an array of that size, rows and columns, or, where it is (0, 0), in the shape of an image."""
+    """Return an array of this size (rows, columns), or, for (0, 0), with the aspect of an image."""
     each = np.dtype(kind).itemsize
     rows, columns = size
     if not all(size):
@@ -231,7 +229,7 @@ def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image
 
 
 def _depth_size(metadata: Mapping[str, Any]) -> tuple[int, int]:
-    """Return width and height; (0, 0) where older versions of the app do not say."""
+    """Return width and height; (0, 0) for older versions of the app."""
     width, height = metadata.get("dw"), metadata.get("dh")
     if isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
         return width, height
@@ -239,7 +237,7 @@ def _depth_size(metadata: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _times(metadata: Mapping[str, Any], numbers: list[int]) -> list[float]:
-    """Return seconds of each image: those of the file, where they rise, else by its frames a second."""
+    """Return the times of the images, seconds: those of the file if they increase, else by its frame rate."""
     stamps = metadata.get("frameTimestamps")
     if isinstance(stamps, list) and len(stamps) > numbers[-1]:
         times = [stamps[number] for number in numbers]
@@ -255,7 +253,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -> Camera | None:
-    """Of the metadata; None where they have none, or one of other images, which is told."""
+    """Return the camera of the metadata; None without one, or, with a warning, for another image size."""
     size = metadata.get("w"), metadata.get("h")
     if None not in size and not same_size(size, (width, height)):
         warnings.warn(

@@ -23,7 +23,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class ReducedSequence:
-    """`source` with smaller images and depth; `camera` is that of what comes out."""
+    """`source` with smaller images and depth; `camera` is that of the reduced images."""
 
     source: Sequence
     camera: Camera
@@ -59,8 +59,8 @@ def reduced(source: FrameStream, max_pixels: int) -> FrameStream: ...
 
 
 def reduced(source: Sequence | FrameStream, max_pixels: int) -> Sequence | FrameStream:
-    """Return the same frames with at most about `max_pixels` pixels each, their camera with them; the source itself,
-    where its images have no more, or where `max_pixels` is 0.
+    """Return the frames and camera reduced to about `max_pixels` pixels; the source itself if its images are smaller,
+    or if `max_pixels` is 0.
     """
     camera = reduced_camera(source.camera, max_pixels)
     if camera == source.camera:
@@ -71,7 +71,7 @@ def reduced(source: Sequence | FrameStream, max_pixels: int) -> Sequence | Frame
 
 
 def reduced_camera(camera: Camera, max_pixels: int) -> Camera:
-    """Return the camera of images that were reduced to about `max_pixels` pixels; 0: of the images as they are."""
+    """Return the camera of images reduced to about `max_pixels` pixels; 0: unchanged."""
     factor = math.sqrt(max_pixels / (camera.width * camera.height))
     if factor >= 1 or not max_pixels:
         return camera
@@ -84,6 +84,6 @@ def _reduced_frames(frames: Iterator[Frame], camera: Camera, smaller: Camera) ->
         check_frame(frame, camera)
         image = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
         depth = frame.depth
-        if depth is not None:  # a mean over an edge would be a depth that is nowhere
+        if depth is not None:  # a mean over an edge would be on no surface
             depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
         yield replace(frame, image=image, depth=depth)

@@ -1,9 +1,9 @@
-"""Colour and depth as recorders and scripts write them: folders `rgb/0.png` and `depth/0.png` side by side, or both in
-one folder, told apart by a word of their names (`color_0.jpg`, `depth_0.png`).
+"""Colour and depth of recorders and scripts: folders `rgb/0.png` and `depth/0.png`, or both in one folder,
+distinguished by a word of their names (`color_0.jpg`, `depth_0.png`).
 
-Open3D's recorders write `color/`, `depth/` and `intrinsic.json`; many of one's own write `rgb/` and `depth/`, and no
-camera. Depth is in millimetres, as Open3D, RealSense and Kinect have it, or in metres where it is of floats (TIFF, PFM,
-`.npy`), unless `with_depth_scale` says otherwise.
+Open3D's recorders write `color/`, `depth/` and `intrinsic.json`; scripts of users often write `rgb/` and `depth/`
+without a camera. Depth is in millimetres (Open3D, RealSense, Kinect), or in metres if it is of floats (TIFF, PFM,
+`.npy`), unless `with_depth_scale` sets another unit.
 """
 
 import re
@@ -25,33 +25,33 @@ from vggtgeo.io.errors import InputError, InputWarning
 COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
 DEPTH = ("depth", "depths")
 INVERSE = {"inv", "inverse", "disp", "disparity", "disparities"}
-"""In a name: that what it holds is no depth, though it may be called `inverse_depth`."""
+"""Words of names of files that are not depth, even `inverse_depth`."""
 CONFIDENCE = {"conf", "confidence"}
-"""In a name: that what it holds is trust in depth, neither an image nor depth."""
+"""Words of names of files of confidence, neither images nor depth."""
 _SAYS_NOTHING = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
-"""Endings of the names of folders: `rgb_png`, `depth_images`."""
+"""Endings of folder names without meaning: `rgb_png`, `depth_images`."""
 MOST_LOOSE, MOST_LOOSE_BESIDE_DEPTH = 0.1, 0.5
-"""Of the images in the folder of colour: so few beside it are none of the recording; where there is a folder of as many
-depths, too, it is clear what the recording is."""
+"""Maximum share of images beside the folder of colour that are not of the recording; more if there is a folder of as
+many depths."""
 LEAST_WITH_DEPTH = 0.5
-"""Depths an image, for a folder of both to be one of RGB-D: a picture called `depth` is none yet."""
+"""Minimum depths per image of a folder of both: a single image called `depth` is not enough."""
 
 
 @dataclass(frozen=True)
 class RgbdFolders(FolderSequence):
-    """Images in one folder and, in a second one or in the same, their depth. Truth: `groundtruth.txt` (TUM format).
+    """Images in one folder, and their depth in a second one or the same. Ground truth: `groundtruth.txt` (TUM format).
 
-    A depth belongs to the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), of the nearest
-    time within 0.02 s where names are times, or of the same place in the list. Times are as in a folder of images.
-    Depth of fewer pixels, as of a phone's LiDAR, is enlarged to the images if it has their shape.
+    Depth is paired with the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), of the
+    nearest time within 0.02 s if names are times, or of the same position. Times are as in a folder of images. Depth of
+    fewer pixels (a phone's LiDAR) is enlarged to images of the same aspect.
     """
 
     depth_of_fewer_pixels = True
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has images in a folder named as one of `COLOUR`, and hardly any of its own; or names
-        of its own images say which are depth.
+        """Return whether `folder` has images in a folder of `COLOUR`, and few of its own; or names of its own images
+        distinguish depth.
         """
         colour = _folder(folder, COLOUR)
         if colour is None:
@@ -62,7 +62,7 @@ class RgbdFolders(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images and finds their depths; InputError where the two cannot be paired."""
+        """List the images and find their depths; raise InputError if they cannot be paired."""
         colour, (images, depths) = _listed(folder)
         if (file := list_of(folder)) and lists_no_times(file):
             _warn(
@@ -98,7 +98,7 @@ class RgbdFolders(FolderSequence):
 
 
 def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
-    """Return the folder of the images, and the files of images and of depths."""
+    """Return the folder of the images, and the files of images and depths."""
     colour = _folder(folder, COLOUR)
     if colour is None:
         both = _told_apart(folder)
@@ -120,7 +120,7 @@ def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
 
 
 def _told_apart(folder: Path) -> tuple[list[Path], list[Path]] | None:
-    """Return images and depths of one folder, by the words of their names; None where hardly any name says depth."""
+    """Return images and depths of one folder, by the words of their names; None if few names say depth."""
     inverse = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_inverse(path)]
     depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_depth(path) and path not in inverse]
     others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *INVERSE, *CONFIDENCE}]
@@ -150,8 +150,8 @@ def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str] = IMAGE
 
 
 def _there(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the first of the folders `names`, in small or capital letters, that is there; `rgb_png` is `rgb`, too, and
-    depth is what says so: `aligned_depth_to_color`.
+    """Return the first existing folder of `names`, in any case; `rgb_png` counts as `rgb`, and any name with the word
+    depth as depth (`aligned_depth_to_color`).
     """
     folders = _folders(folder)
     there = {_SAYS_NOTHING.sub("", path.name.lower()): path for path in folders}
@@ -164,7 +164,7 @@ def _there(folder: Path, names: Sequence[str]) -> Path | None:
 
 
 def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path | None]:
-    """Return the depth of each image, None where it has none."""
+    """Return the depth of each image, None without one."""
     if shift := _shift(images, depths):
         _warn(
             f"`{folder}`: there are as many depths as images, and their numbers are {abs(shift)} "
@@ -193,7 +193,7 @@ def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path
 
 
 def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path]) -> list[Path | None] | None:
-    """Pairs by a key of the names; None where it does not tell files apart, or pairs less than half of them."""
+    """Return pairs by a key of the names; None if keys are not distinct, or pair less than half of the files."""
     keys = [[key(path) for path in paths] for paths in (images, depths)]
     if any(None in own or len(set(own)) < len(own) for own in keys):
         return None
@@ -204,9 +204,7 @@ def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path
 
 
 def _shift(images: list[Path], depths: list[Path]) -> int:
-    """By how much all numbers of depths are above those of as many images, which begin to count elsewhere; 0 where they
-    are the same, or differ in another way.
-    """
+    """Return the constant difference between the numbers of depths and of as many images; 0 if there is none."""
     numbers = [[_number(path) for path in paths] for paths in (images, depths)]
     if len(images) != len(depths) or len(images) < 2 or any(None in own for own in numbers):
         return 0
@@ -215,7 +213,7 @@ def _shift(images: list[Path], depths: list[Path]) -> int:
 
 
 def _tell_of_others(folder: Path, colour: Path) -> None:
-    """Other folders that are named as one of images is: a half of the recording, maybe."""
+    """Warn of other folders with names of image folders, which may be a part of the recording."""
     others = [path for name in COLOUR if (path := _there(folder, [name])) and path != colour and image_files(path)]
     for path in dict.fromkeys(others):
         _warn(
@@ -240,7 +238,7 @@ def _stem(path: Path) -> str:
 
 
 def _number(path: Path) -> str | None:
-    """Return the last number in a name that is no time."""
+    """Return the last number in a name that is not a time."""
     numbers = re.findall(r"\d+", path.stem)
     return str(int(numbers[-1])) if numbers and _seconds([path]) is None else None
 

@@ -8,9 +8,9 @@
 | `intrinsic/intrinsic_color.txt`, `..._depth.txt` | `_info.txt` or `info.txt` | of both cameras |
 | `intrinsic/extrinsic_color.txt`, `..._depth.txt` | the same | where stated, the rig -> the camera |
 
-The colour images are larger than the depth and of another camera; each is brought to the intrinsics of the depth, whose
-pixels are fewer, so that no depth is made up. Where the extrinsics say that the cameras are at two places, depth and
-poses are moved to the colour camera.
+The colour images are larger than the depth and of another camera; they are resampled to the intrinsics of the depth,
+so that no depth is invented. If the extrinsics of the cameras differ, depth and poses are transformed to the colour
+camera.
 Source: A. Dai et al., "ScanNet", CVPR 2017.
 """
 
@@ -39,7 +39,7 @@ _COLOUR = frozenset({".jpg", ".jpeg", ".png"})
 
 @dataclass(frozen=True)
 class ScanNet(FolderSequence):
-    """One scan. Truth: the pose files, camera -> world; those of lost frames hold infinities and are left out."""
+    """One scan. Ground truth: the pose files, camera -> world, without those of lost frames (infinities)."""
 
     colour: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
     """Intrinsics of the colour images as they lie on the disk."""
@@ -59,7 +59,7 @@ class ScanNet(FolderSequence):
         place = folder / "color"
         images = image_files(place, _COLOUR) if place.is_dir() else files_like(folder, "frame-*.color.*")
         if not images:
-            raise InputError(f"`{place}` has no images; expected a scan of ScanNet, exported")
+            raise InputError(f"`{place}` has no images; it must be an exported scan of ScanNet")
         frames = [
             (_number(image, index) / FRAMES_PER_SECOND, image, _depth(folder, image))
             for index, image in enumerate(images)
@@ -77,13 +77,13 @@ class ScanNet(FolderSequence):
         return cls.listed(folder, frames, camera, as_images=False, colour=colour, motion=motion)
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """Return the image as the depth camera would see it: an affine change of pixels, reduced with an average."""
+        """Return the image with the intrinsics of the depth camera, resampled with an average."""
         read = read_image_file(path, min_bits)
         image = read.image
         fx, fy, cx, cy = self.camera.intrinsics
         gx, gy, dx, dy = self.colour
         blur = max(gx / fx, 1.0), max(gy / fy, 1.0)
-        if max(blur) > 1.0:  # without it, thin structures would come and go from frame to frame
+        if max(blur) > 1.0:  # against aliasing of thin structures
             image = cv2.GaussianBlur(image, (0, 0), 0.5 * blur[0], sigmaY=0.5 * blur[1])
         change = np.array([[gx / fx, 0.0, dx - cx * gx / fx], [0.0, gy / fy, dy - cy * gy / fy]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -92,7 +92,7 @@ class ScanNet(FolderSequence):
         return replace(read, image=np.asarray(seen, np.uint8))
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth where the colour camera is, with the intrinsics of the depth camera."""
+        """Return the depth at the colour camera, with the intrinsics of the depth camera."""
         depth = super().load_depth(path)
         if depth.shape != (self.camera.height, self.camera.width) or self._at_one_place:
             return depth
@@ -114,7 +114,7 @@ class ScanNet(FolderSequence):
             return None
         poses = np.array([read_matrix(file, (4, 4)) for _, file in there])
         if not self._at_one_place:
-            with np.errstate(invalid="ignore"):  # of lost frames, which hold infinities
+            with np.errstate(invalid="ignore"):  # of lost frames, which have infinities
                 poses = poses @ np.linalg.inv(self.motion)
         return trajectory_of([time for time, _ in there], poses, self.folder / "pose")
 
@@ -136,7 +136,7 @@ def _depth(folder: Path, image: Path) -> Path | None:
 
 
 def _info(folder: Path) -> Path | None:
-    """Return the file of both cameras that SensReader in C++ writes; another program's `info.txt` is none."""
+    """Return the file of both cameras that SensReader in C++ writes; None for another program's `info.txt`."""
     own, other = folder / "_info.txt", folder / "info.txt"
     if own.is_file():
         return own
@@ -144,13 +144,13 @@ def _info(folder: Path) -> Path | None:
 
 
 def _intrinsics(folder: Path, camera: str) -> tuple[float, float, float, float]:
-    """Of `color` or `depth`."""
+    """Return the intrinsics of `color` or `depth`."""
     file, matrix = _calibration(folder, "intrinsic", camera)
     return intrinsics_of(file, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
 
 
 def _extrinsics(folder: Path, camera: str) -> np.ndarray:
-    """Return the rig -> the camera; the identity where nothing is stated."""
+    """Return the transformation rig -> camera; the identity by default."""
     file, matrix = _calibration(folder, "extrinsic", camera, np.eye(4))
     if not have_rotations(matrix[None])[0] or not np.isfinite(matrix).all():
         raise InputError(f"`{file}`: the extrinsics of the {camera} camera are {matrix.tolist()}; expected a motion")
@@ -158,7 +158,7 @@ def _extrinsics(folder: Path, camera: str) -> np.ndarray:
 
 
 def _calibration(folder: Path, what: str, camera: str, unstated: np.ndarray | None = None) -> tuple[Path, np.ndarray]:
-    """Return a matrix [4, 4] of either layout, and the file where it stands. unstated: for one that is not there."""
+    """Return a matrix [4, 4] of either layout, and its file. unstated: default if it is missing."""
     file, info = folder / "intrinsic" / f"{what}_{camera}.txt", _info(folder)
     if file.is_file() or info is None:
         return file, unstated if unstated is not None and not file.is_file() else read_matrix(file, (4, 4))

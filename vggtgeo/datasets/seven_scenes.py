@@ -1,12 +1,12 @@
 """7-Scenes folders: `frame-XXXXXX.color.png|jpg`, `.depth.png`, `.pose.txt`, numbered at 30 frames/s.
 
-Source: J. Shotton et al., "Scene coordinate regression forests", CVPR 2013. As published, the folder has no
-intrinsics, the depth (where 65535 means none, too) is not registered to the colour image, and poses are those of the
-depth camera. Such a folder has no file of intrinsics, or one of the depth camera (f = 585, as in the copy that comes
-with TSDF Fusion): its depth is registered and its poses are moved to the colour camera, with a Kinect's extrinsics as
-others use them for these scenes (calibration of LIRIS,
-https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html). They are those of another Kinect: near
-objects stay some pixels off.
+Source: J. Shotton et al., "Scene coordinate regression forests", CVPR 2013. As published, a folder has no
+intrinsics, depth (65535 means none as well) is not registered to the colour image, and poses are those of the depth
+camera. A folder without intrinsics, or with those of the depth camera (f = 585, as in the copy of TSDF Fusion), is
+registered: depth and poses are transformed to the colour camera by the extrinsics of a Kinect that are usual for these
+scenes (calibration of LIRIS,
+https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html). They are those of another
+Kinect: near objects have errors of some pixels.
 """
 
 import re
@@ -46,7 +46,7 @@ _TO_COLOUR = np.array(
 
 @dataclass(frozen=True)
 class SevenScenes(FolderSequence):
-    """One sequence. Truth: `groundtruth-colour.txt` (TUM format) if present, else the pose files.
+    """One sequence. Ground truth: `groundtruth-colour.txt` (TUM format) if present, else the pose files.
 
     as_published: depth and pose files are those of the depth camera.
     """
@@ -60,7 +60,7 @@ class SevenScenes(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the frames; of a folder of sequences, those of the first, with an InputWarning where it has more."""
+        """List the frames; of a folder of sequences, those of the first, with a warning if it has more."""
         if not _colour_files(folder):
             folder = _first_sequence(folder)
         numbered = _colour_files(folder)
@@ -72,7 +72,7 @@ class SevenScenes(FolderSequence):
         return replace(whole, as_published=whole.camera is _AS_PUBLISHED)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth in the colour camera."""
+        """Return the depth, registered to the colour camera."""
         depth = super().load_depth(path)
         return self._registration(depth) if self.as_published else depth
 

@@ -20,17 +20,17 @@ from vggtgeo.io.errors import InputError
 
 _LOG = "_COLMAP_SfM.log"
 _LINES = 5
-"""Of a pose in the log: its numbers, and four rows of a matrix camera -> world."""
+"""Lines of a pose in the log: numbers, and four rows of a matrix camera -> world."""
 _MOST_DIGITS = 9
 
 _AXES = ["X", "Y", "Z"]
 _LEAST_CORNERS = 3
-"""Of a polygon."""
+"""Minimum corners of a polygon."""
 
 
 @dataclass(frozen=True)
 class TanksAndTemples(FolderSequence):
-    """One scene. Truth: COLMAP's poses, in the scanner's metres where `SCENE_trans.txt` is there; 30 a second."""
+    """One scene, 30 frames a second. Ground truth: COLMAP's poses, metric if `SCENE_trans.txt` exists."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -51,7 +51,7 @@ class TanksAndTemples(FolderSequence):
         return cls.listed(folder, frames, lambda *size: camera_or_guess(folder, *size))
 
     def ground_truth(self) -> Trajectory | None:
-        """COLMAP's poses of the images, a similarity applied where the scanner's frame is known."""
+        """Return COLMAP's poses, transformed to the scanner's frame if that is known."""
         file = next(iter(files_like(self.folder, f"*{_LOG}")), None)
         if file is None:
             return None
@@ -63,12 +63,12 @@ class TanksAndTemples(FolderSequence):
 
     @property
     def truth_in_metres(self) -> bool:
-        """Return those of COLMAP alone have no unit."""
+        """Return whether the poses are metric; COLMAP's alone are not."""
         return (self.folder / f"{self._scene()}_trans.txt").is_file()
 
     def scanned_points(self) -> Float[np.ndarray, "n 3"] | None:
         """Return the laser scan within its volume (`SCENE.ply`, `SCENE.json`), metres, in the world of `ground_truth`;
-        None where a file is missing, or `SCENE_trans.txt`, without which the poses are not in the scanner's frame.
+        None if a file is missing, or `SCENE_trans.txt`, the transformation to the scanner's frame.
         """
         scene = self._scene()
         if scene is None or not all((self.folder / f"{scene}{end}").is_file() for end in ("_trans.txt", ".ply")):
@@ -84,20 +84,18 @@ class TanksAndTemples(FolderSequence):
         return inside
 
     def judged(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Return which points lie in the volume that the scan is compared in; all where no `SCENE.json` tells."""
+        """Return which points are in the volume of comparison; all without `SCENE.json`."""
         file = self.folder / f"{self._scene()}.json"
         return inside_crop(file, points) if file.is_file() else np.ones(len(points), bool)
 
     def _scene(self) -> str | None:
-        """Return the name that the files begin with."""
+        """Return the common prefix of the files' names."""
         file = next(iter(files_like(self.folder, f"*{_LOG}")), None)
         return None if file is None else file.name.removesuffix(_LOG)
 
 
 def _similarity(file: Path) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix of a file; InputError where it is no scale, rotation and translation: what it makes of the
-    poses would be no poses, and the log would get the blame.
-    """
+    """Return the matrix of a file; raise InputError unless it is a similarity transformation."""
     matrix = read_matrix(file, (4, 4))
     turn = matrix[:3, :3]
     with np.errstate(all="ignore"):
@@ -105,7 +103,7 @@ def _similarity(file: Path) -> Float[np.ndarray, "4 4"]:
         even = np.isfinite(matrix).all() and np.allclose(squares, squares[0, 0] * np.eye(3), atol=0.01 * squares[0, 0])
         scales = bool(even and squares[0, 0] > 0 and np.linalg.det(turn) > 0)
     if not scales or not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-3):
-        raise InputError(f"`{file}` is no scale, rotation and translation of the world: found {matrix.tolist()}")
+        raise InputError(f"`{file}` must be a scale, rotation and translation of the world, got {matrix.tolist()}")
     return matrix
 
 
@@ -119,9 +117,7 @@ def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"
 
 
 def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return which points lie in the volume of a scene's `SCENE.json`: a polygon across an axis, between two bounds on
-    it.
-    """
+    """Return which points are in the volume of `SCENE.json`: a polygon across an axis, between two bounds on it."""
     crop = read_json(file)
     try:
         axis = _AXES.index(str(crop["orthogonal_axis"]).upper())
@@ -175,7 +171,7 @@ def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:
 
 
 def _floats(words: list[str]) -> list[float]:
-    """Return the words as numbers; none where one is no number."""
+    """Return the words as numbers; empty if one is not a number."""
     try:
         return [float(word) for word in words]
     except ValueError:

@@ -1,4 +1,4 @@
-"""Trajectories as other programs write them: TUM, poses of KITTI, truth of EuRoC; told apart by their columns."""
+"""Trajectory files of TUM, KITTI and EuRoC, distinguished by their number of columns."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vggtgeo.io.errors import InputError, NoteWarning
 
 _KITTI, _EUROC = 12, 17
 _ROUNDING = 1e-5
-"""Of rotations as they are printed: those stay as they are, for the errors to be what other programs make of them."""
+"""Rounding of printed rotations, which stay unchanged so that errors equal those of other programs."""
 _NANOSECONDS = 1e17
 """Times above it: seconds since 1970 are below 1e10, nanoseconds above 1e18."""
 
@@ -22,13 +22,13 @@ _NANOSECONDS = 1e17
 def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = None) -> Trajectory:
     """Return the trajectory in a file of
 
-    - 8 columns, `timestamp tx ty tz qx qy qz qw` (TUM); times in nanoseconds, as ORB-SLAM3 writes them of EuRoC, are
-      taken for what they are, with an InputWarning,
-    - 12 columns, the upper three rows of camera -> world (KITTI). They have no times: theirs are those of `clock` where
-      that has as many poses, else, without a clock, their numbers,
+    - 8 columns, `timestamp tx ty tz qx qy qz qw` (TUM); times in nanoseconds (ORB-SLAM3 with EuRoC) are
+      converted, with a warning,
+    - 12 columns, the upper three rows of camera -> world (KITTI). They have no times: the times
+      of `clock`, which must have as many poses, or their numbers without one,
     - 17 columns, EuRoC's `state_groundtruth_estimate0/data.csv`: the poses of the IMU.
 
-    InputError as of `Trajectory.load_tum`, and for poses without times beside a clock of another count.
+    Raises InputError as `Trajectory.load_tum`, and for poses without times if `clock` has another number of poses.
     """
     file = Path(path)
     columns = _columns(file) if file.is_file() else 8
@@ -43,12 +43,12 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
     found = Trajectory.load_tum(file)
     if found.timestamps[0] < _NANOSECONDS:
         return found
-    warnings.warn(f"`{file}`: its times are nanoseconds, and were taken as such", NoteWarning, stacklevel=2)
+    warnings.warn(f"`{file}`: its times are nanoseconds, and are converted", NoteWarning, stacklevel=2)
     return Trajectory(1e-9 * found.timestamps, found.poses)
 
 
 def _columns(file: Path) -> int:
-    """Of the first line that holds any."""
+    """Return the number of columns of the first line with any."""
     lines = (line.split("#", 1)[0].replace(",", " ").split() for line in read_text(file).splitlines())
     return len(next((words for words in lines if words), ()))
 

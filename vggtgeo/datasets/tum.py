@@ -28,17 +28,17 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.text_files import whole_text
 
 MAX_DEPTH_DELAY = 0.02
-"""Seconds between an image and its depth."""
+"""Maximum seconds between an image and its depth."""
 
 MOST_LETTERS = 200
 LEAST_FALLING, LEAST_LINES = 0.1, 10
-"""Share of the lines at which the first column of a list falls, and lines, for it to be no time: lists that two
-processes wrote have a line out of order now and then, and what frames took to come falls at every second line."""
+"""Minimum share of lines at which the first column of a list decreases, and of lines, for it not to be a time: lists of
+two processes have a few lines out of order, durations of frames decrease at every second line."""
 _DECIMAL_COMMA = re.compile(r"-?\d+,\d+\s")
 _TRUTH = "groundtruth.txt"
 _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")
 MOST_FRAMES = 1e6
-"""Whole numbers up to here are no times, but count frames."""
+"""Integers up to this one are numbers of frames, not times."""
 _Entry = tuple[float, Path]
 _Frame = tuple[float, Path, Path | None]
 
@@ -49,13 +49,13 @@ class TumRgbd(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has an `rgb.txt` of times, or a list of pairs of such."""
+        """Return whether `folder` has an `rgb.txt` of times, or a list of pairs."""
         file = list_of(folder)
         return file is not None and not lists_no_times(file)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Read the lists and pairs them; without `depth.txt` the sequence has no depth."""
+        """Read and pair the lists; without `depth.txt` the sequence has no depth."""
         pairs = list_of(folder)
         if pairs is None or pairs.name == "rgb.txt":
             frames, coding = _of_lists(folder), FIVE_THOUSANDTHS
@@ -79,21 +79,18 @@ def _camera(folder: Path, width: int, height: int) -> Camera:
 
 
 def list_of(folder: Path) -> Path | None:
-    """Return the list of images in a folder, with those of depth where `rgb.txt` is not there; None where there is
-    none.
-    """
+    """Return the list of images in a folder, or of pairs without `rgb.txt`; None without either."""
     return next((file for name in ("rgb.txt", *_PAIRS) if (file := folder / name).is_file()), None)
 
 
 def lists_no_times(file: Path) -> bool:
-    """Return whether the first column of a list is no time: it falls again and again, while the files are numbered in
-    the order of the list. Scripts write what each frame took in place of when it came; sorted by that, frames are
-    shuffled.
+    """Return whether the first column of a list is not a time: it decreases often while the files are numbered in
+    order. Some scripts write durations instead of times; sorted by them, frames would be shuffled.
     """
     try:
         lines = [line.split("#", 1)[0].split() for line in whole_text(file).splitlines()]
         times, names = zip(*((float(words[0]), words[1]) for words in lines if words), strict=True)
-    except (InputError, ValueError, IndexError):  # told where it is read
+    except (InputError, ValueError, IndexError):  # reported by the reader
         return False
     if not np.isfinite(times).all():
         return False
@@ -106,7 +103,7 @@ def lists_no_times(file: Path) -> bool:
 
 
 def _recording(folder: Path) -> str:
-    """What the benchmark's own list says it is of, `# file: 'rgbd_dataset_freiburg1_desk.bag'`: folders are renamed."""
+    """Return the recording that the list names, `# file: 'rgbd_dataset_freiburg1_desk.bag'`: folders may be renamed."""
     file = folder / "rgb.txt"
     if not file.is_file():
         return ""
@@ -128,7 +125,7 @@ def _of_lists(folder: Path) -> list[_Frame]:
 
 
 def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
-    """Return the frames, and the unit of their depth: who counts frames is no benchmark, and has millimetres."""
+    """Return the frames, and the unit of their depth: millimetres if the list counts frames, as no benchmark does."""
     pairs = read_pairs(file, "TIME")
     counted = all(time.is_integer() and abs(time) < MOST_FRAMES for time, *_ in pairs)
     if counted:
@@ -147,8 +144,8 @@ def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
 
 
 def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
-    """Return time and name of the image, and name of its depth, of each line of a list of pairs, in either order;
-    InputError with the line of one that is none. time: how the message calls it.
+    """Return time and name of the image, and name of its depth, of each line of a list of pairs, in either order; raise
+    InputError naming an invalid line. time: noun of the first column.
     """
     expected = f"expected `{time} rgb/{time}.png {time} depth/{time}.png`"
     pairs = []
@@ -168,7 +165,7 @@ def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
 
 
 def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
-    """Return the entries by time; `frames` where each of them is a frame, which counts when it is left out."""
+    """Return the entries by time; frames: whether each is a frame, which is counted if it is left out."""
     if not file.is_file():
         raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
     entries = []

@@ -1,4 +1,4 @@
-"""A sequence seen otherwise: with other intrinsics, without its depth, or with its truth set apart."""
+"""Views of a sequence: with other intrinsics, without depth, or without ground truth."""
 
 import math
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ LEAST_UNITS, MOST_UNITS = 1e-3, 1e6
 
 @dataclass(frozen=True)
 class SequenceView:
-    """`source` with another camera, and with depth and truth kept or hidden."""
+    """`source` with another camera, with or without depth and ground truth."""
 
     source: Sequence
     camera: Camera
@@ -40,22 +40,22 @@ class SequenceView:
         return len(self.source)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`. Those of a class from elsewhere are copied: it may fill one array anew for each frame,
-        and the map holds some of them.
+        """Return frames as `Sequence.frames`; those of a user's class are copied, since it may reuse one array and the
+        map keeps frames.
         """
         frames = self.source.frames(start, end, stride)
         frames = frames if self.has_depth else (replace(frame, depth=None) for frame in frames)
         return frames if type(self.source).__module__.startswith("vggtgeo.") else map(copied, frames)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the truth of the source, unless it is hidden."""
+        """Return the ground truth of the source, unless it is hidden."""
         return self.source.ground_truth() if self.has_truth else None
 
 
 def with_intrinsics(
     sequence: Sequence, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
 ) -> Sequence:
-    """Return the sequence with the given, known intrinsics (pixels) in place of whatever its folder says."""
+    """Return the sequence with known intrinsics (pixels), replacing those of its folder."""
     camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height, distortion)
     check_plausible("`intrinsics`", camera)
     source = replace(sequence, camera=camera) if isinstance(sequence, RosBag) else sequence  # depth is registered to it
@@ -63,10 +63,10 @@ def with_intrinsics(
 
 
 def with_rate(sequence: Sequence, rate: float) -> Sequence:
-    """Return the sequence with `rate` frames a second, in place of the times that are assumed or that a video states.
+    """Return the sequence with `rate` frames a second, replacing assumed times or those of a video.
 
     Raises:
-        InputError: `rate` is no positive number, or the sequence knows its times.
+        InputError: `rate` is not positive, or the sequence has times of its own.
 
     """
     check_real("rate", rate, "a positive number of frames a second")
@@ -83,7 +83,7 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
     """Return the sequence whose depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
 
     Raises:
-        InputError: it is no positive number, no scale of a depth, or the depth comes from no such files.
+        InputError: the scale is not positive, implausible, or the sequence has no such depth files.
 
     """
     check_real("units_per_metre", units_per_metre, "a positive number of units a metre")
@@ -97,17 +97,17 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
     plain = isinstance(sequence, FolderSequence) and type(sequence).load_depth is FolderSequence.load_depth
     files = sequence.files if isinstance(sequence, FolderSequence) and plain else ()
     if not any(file.depth is not None for file in files):
-        raise InputError(f"`{sequence.name}` has no depth files whose unit could be another")
+        raise InputError(f"`{sequence.name}` has no depth files with a selectable unit")
     assert isinstance(sequence, FolderSequence)
     coding = replace(sequence.depth_format, units_per_metre=units_per_metre, floats_per_metre=units_per_metre)
-    # Floats in millimetres are beyond every room as the metres that they are by convention.
+    # Floats in millimetres, read as metres, are out of range.
     size, fewer = (sequence.camera.width, sequence.camera.height), sequence.depth_of_fewer_pixels
     usable = sequence.has_depth or depth_is_usable(sequence.name, files, coding, *size, fewer)
     return replace(sequence, depth_format=coding, has_depth=usable)
 
 
 def without_depth(sequence: Sequence) -> Sequence:
-    """Return the colour images alone; depth files are not even decoded."""
+    """Return the sequence without depth; depth files are not decoded."""
     known = isinstance(sequence, FolderSequence | RosBag | VideoFile)
     source = replace(sequence, has_depth=False) if known else sequence  # type: ignore[type-var]
     return SequenceView(source, sequence.camera, has_depth=False)

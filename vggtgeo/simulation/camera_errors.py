@@ -1,8 +1,8 @@
-"""Errors that the cameras of real recordings have, done to simulated ones whose depth and poses are exact.
+"""Errors of real cameras, applied to simulated recordings with exact depth and poses.
 
 A pixel moves with the motion field of the frame (Longuet-Higgins and Prazdny, 1980). With the camera's velocity `v` and
 angular velocity `w` a point `p` of the camera's frame moves by `p' = w x p + v`, and its pixel by the derivative of the
-projection. Over an exposure this is nearly constant, so blur and rolling shutter cost a few resamplings, no rendering.
+projection. It is nearly constant over an exposure, so blur and rolling shutter need a few resamplings, no rendering.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from vggtgeo.simulation.degradations import Recording, with_images
 from vggtgeo.simulation.rolling_rows import camera_velocities
 
 INSTANTS = 5
-"""Of an exposure: an image is the mean of what is seen at so many."""
+"""Moments of an exposure whose mean is the image."""
 ROUNDS = 2
-"""Until a pixel and its motion belong together: the field is read where the pixel came from."""
+"""Iterations for the position from which a pixel moved."""
 
 
 def motion_field(
@@ -48,11 +48,11 @@ def motion_field(
 
 
 def exposed(recording: Recording, readout: float = 0.0, exposure: float = 0.0) -> Recording:
-    """Return images whose rows are read one after another, and whose shutter is open for a while.
+    """Apply rolling shutter and exposure time.
 
     readout: seconds from the first row to the last; timestamps name the middle one. exposure: seconds the shutter is
     open. Depth stays that of the frame's instant: depth cameras have a shutter of their own.
-    Raises InputError where frames have no depth: the motion of the pixels is computed from it.
+    Raises InputError if frames have no depth, which determines the motion of pixels.
     """
     instants = exposure * ((np.arange(INSTANTS) + 0.5) / INSTANTS - 0.5) if exposure else np.zeros(1)
 
@@ -68,9 +68,9 @@ def exposed(recording: Recording, readout: float = 0.0, exposure: float = 0.0) -
 
 
 def late_depth(recording: Recording, seconds: float) -> Recording:
-    """Return depth that was taken so many seconds before its image; negative: after.
+    """Replace depth by that of so many seconds before its image; negative: after.
 
-    Raises InputError where frames have no depth.
+    Raises InputError if frames have no depth.
     """
 
     def before(frame: Frame, velocity: np.ndarray) -> np.ndarray:
@@ -84,13 +84,13 @@ def late_depth(recording: Recording, seconds: float) -> Recording:
 
 
 def late_truth(recording: Recording, seconds: float) -> Recording:
-    """Truth whose clock is so many seconds ahead: a pose carries the time of a later moment."""
+    """Shift the clock of the ground truth ahead by so many seconds."""
     truth = recording.truth
     return replace(recording, truth=Trajectory(truth.timestamps + seconds, truth.poses))
 
 
 def vignetted(recording: Recording, share: float) -> Recording:
-    """Return corners that are darker by `share`, growing with the square of the distance from the middle."""
+    """Darken the corners by `share`, with the square of the distance from the middle."""
     height, width = recording.frames[0].image.shape[:2]
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     factor = (1 - share * (x**2 + y**2) / 2)[..., None]
@@ -98,7 +98,7 @@ def vignetted(recording: Recording, share: float) -> Recording:
 
 
 def auto_exposed(recording: Recording, strength: float, frames: float) -> Recording:
-    """Return images of a camera that adapts its exposure to what it sees.
+    """Adapt the exposure to the brightness of the images.
 
     strength: share of the difference to the mean brightness of the recording that is taken away, 0 to 1.
     frames: frames that the control lags behind.
@@ -121,7 +121,7 @@ def _as_bytes(image: np.ndarray) -> np.ndarray:
 
 def _depth(frame: Frame) -> np.ndarray:
     if frame.depth is None:
-        raise InputError(f"frame {frame.index} has no depth; the motion of its pixels follows from it: give depth")
+        raise InputError(f"frame {frame.index} has no depth, which determines the motion of its pixels: give depth")
     return frame.depth
 
 
@@ -132,8 +132,8 @@ def _each(recording: Recording, change: Callable[[Frame, np.ndarray], Frame]) ->
 
 
 def _source(field: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where in the frame is what each pixel shows so many seconds later, float [H, 1]: p + seconds field(p) =
-    pixel.
+    """Return the position in the frame of what each pixel shows so many seconds later, float [H, 1]: p + seconds
+    field(p) = pixel.
     """
     rows, columns = np.mgrid[: field.shape[0], : field.shape[1]].astype(np.float32)
     late, at = seconds.astype(np.float32), field

@@ -1,4 +1,4 @@
-"""What happens to people's recordings, done to simulated ones: functions from a recording to another."""
+"""Degradations of real recordings, applied to simulated ones: functions from a recording to another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Frames with their camera and the truth."""
+    """Frames with their camera and ground truth."""
 
     frames: list[Frame]
     camera: Camera
@@ -33,7 +33,7 @@ def as_it_is(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def dirty_lens(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Twelve dark, sharp specks that stay in their place in the image."""
+    """Draw twelve dark, sharp specks, fixed in the image."""
     height, width = recording.frames[0].image.shape[:2]
     mask = np.zeros((height, width), np.uint8)
     for x, y, size in zip(
@@ -44,7 +44,7 @@ def dirty_lens(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def bars(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Black bars above and below, of 13 % of the height each, as in a film."""
+    """Draw black bars above and below, 13 % of the height each."""
     del rng
     height = round(0.13 * recording.frames[0].image.shape[0])
 
@@ -57,7 +57,7 @@ def bars(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def text(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Return a time code, the name of the camera and an address, white, in three lines."""
+    """Draw a time code, the name of the camera and an address, white, in three lines."""
     del rng
     height, width = recording.frames[0].image.shape[:2]
     size = width / 770
@@ -85,7 +85,7 @@ def board(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def person(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Return a patterned figure 1.2 m away walks through the picture, to and fro; depth sees it, too."""
+    """Add a patterned figure, 1.2 m away, that walks to and fro, in image and depth."""
     height, width = recording.frames[0].image.shape[:2]
     pattern = cv2.resize(rng.integers(0, 255, (30, 16, 3)).astype(np.uint8), (width // 4, height))
 
@@ -107,19 +107,19 @@ def person(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def dark(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Return a twelfth of the light, with the noise of a camera in it."""
+    """Reduce the light to a twelfth, with camera noise."""
     change = lambda image, row: np.clip(image / 12.0 + rng.normal(0, 2.0, image.shape), 0, 255).astype(np.uint8)
     return with_images(recording, change)
 
 
 def centimetres(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Return depth read in a unit ten times too small."""
+    """Scale the depth by 0.1, as a wrong unit does."""
     del rng
     return with_depths(recording, lambda depth, row: 0.1 * depth)
 
 
 def growing_depth(recording: Recording, rng: np.random.Generator, share: float = 0.4) -> Recording:
-    """Return a depth camera that warms up: its scale grows by 40 % over the recording, or another share."""
+    """Let the scale of the depth grow over the recording, by 40 % or another share, as a sensor that warms up."""
     del rng
     count = len(recording.frames)
     return with_depths(recording, lambda depth, row: depth * (1 + share * row / count))
@@ -140,7 +140,7 @@ def other_depth(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def shuffled(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Return frames out of order (sorted by file name, say): 1, 10, 11, ..., 2, 20, ..."""
+    """Reorder the frames as file names sort: 1, 10, 11, ..., 2, 20, ..."""
     del rng
     frames, poses, times = recording.frames, recording.truth.poses, recording.truth.timestamps
     order = sorted(range(len(frames)), key=str)
@@ -149,7 +149,7 @@ def shuffled(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def barrel(recording: Recording, rng: np.random.Generator, k1: float = -0.3) -> Recording:
-    """Return a wide lens, k1 = -0.3 or another value, that the calibration does not state."""
+    """Apply a wide lens, k1 = -0.3 or another value, that the calibration omits."""
     del rng
     camera = recording.camera
     y, x = np.mgrid[: camera.height, : camera.width].astype(np.float64)
@@ -162,23 +162,21 @@ def barrel(recording: Recording, rng: np.random.Generator, k1: float = -0.3) -> 
 
 
 def zooming(recording: Recording, rng: np.random.Generator, share: float = 0.3) -> Recording:
-    """Return a lens that zooms while it films: the picture grows steadily, by 1.3 in the end, or 1 + share."""
+    """Zoom steadily, by 1.3 at the end, or 1 + share."""
     del rng
     last = max(len(recording.frames) - 1, 1)
     return _through_lens(recording, lambda row: 1.0 + share * row / last)
 
 
 def changed_lens(recording: Recording, rng: np.random.Generator, factor: float = 1.7) -> Recording:
-    """Return a phone that changes its lens in the middle, for one of `factor` times the focal length."""
+    """Change the lens in the middle, to `factor` times the focal length."""
     del rng
     middle = len(recording.frames) // 2
     return _through_lens(recording, lambda row: factor if row >= middle else 1.0)
 
 
 def rolling_shutter(recording: Recording, rng: np.random.Generator, seconds: float = 0.02) -> Recording:
-    """Return the rows of each picture read one by one, over 20 ms, as by the camera of a phone; drawn by depth and
-    truth.
-    """
+    """Apply a rolling shutter of 20 ms, by depth and ground truth."""
     del rng
     frames, camera = recording.frames, recording.camera
     moving = camera_velocities(np.array([frame.timestamp for frame in frames]), recording.truth)
@@ -192,9 +190,7 @@ def wrong_focal(
     factor: float = 1.15,
     aside: tuple[float, float] = (0.0, 0.0),
 ) -> Recording:
-    """Return the calibration of a lens with 15 % more focal length, or `factor` times; its centre is `aside`, in
-    pixels.
-    """
+    """Change the calibration: `factor` times the focal length, and a centre moved by `aside`, pixels."""
     del rng
     fx, fy, cx, cy = recording.camera.intrinsics
     given = (factor * fx, factor * fy, cx + aside[0], cy + aside[1])
@@ -202,7 +198,7 @@ def wrong_focal(
 
 
 def covered(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Return a hand on the lens for a second in the middle."""
+    """Cover the lens for a second in the middle."""
     middle = len(recording.frames) // 2
     noise = lambda image: rng.normal(12, 2.0, image.shape).clip(0, 255).astype(np.uint8)
     inside = lambda row: middle <= row < middle + 10
@@ -211,7 +207,7 @@ def covered(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def without_depth(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Return colour alone."""
+    """Remove the depth."""
     del rng
     return replace(recording, frames=[replace(frame, depth=None) for frame in recording.frames])
 
@@ -226,7 +222,7 @@ DEGRADATIONS: dict[str, Degradation] = {
 
 
 def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recording:
-    """Return images and depth of a lens of so many times the focal length."""
+    """Return image and depth with so many times the focal length."""
     cx, cy = recording.camera.intrinsics[2:]
     nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
 
@@ -242,27 +238,27 @@ def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recor
 
 
 def with_images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
-    """Return the recording with each image, uint8 [H, W, 3], changed, given its row too."""
+    """Return the recording with each image, uint8 [H, W, 3], changed, by a function of image and row."""
     frames = [replace(frame, image=change(frame.image, row)) for row, frame in enumerate(recording.frames)]
     return replace(recording, frames=frames)
 
 
 def in_bands_of_light(image: np.ndarray, row: int, share: float, period: float, speed: float) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], under lamps that flicker while its rows are read one after another: `share`
-    more and less light in bands of `period` rows, which wander by `speed` rows from image to image; row: of this one.
+    """Return the image, uint8 [H, W, 3], with flicker of a rolling shutter: bands of `period` rows with `share` more
+    and less light, which move by `speed` rows per image. row: of this image.
     """
     phase = 2 * np.pi * (np.arange(len(image))[:, None, None] + speed * row) / period
     return np.clip(image * (1 + share * np.sin(phase)), 0, 255).astype(np.uint8)
 
 
 def compressed(image: np.ndarray, quality: int) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], RGB, as JPEG once more, with this quality."""
+    """Return the image, uint8 [H, W, 3], RGB, after JPEG compression of this quality."""
     _, code = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.ascontiguousarray(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])
 
 
 def with_depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
-    """Return the recording with each depth image, float32 [H, W], changed, given its row too."""
+    """Return the recording with each depth, float32 [H, W], changed, by a function of depth and row."""
     frames = [
         frame if frame.depth is None else replace(frame, depth=change(frame.depth, row).astype(np.float32))
         for row, frame in enumerate(recording.frames)

@@ -1,7 +1,7 @@
-"""The truth about a synthetic sequence, asked by image: what the stubs of the five roles stand on.
+"""Ground truth of a synthetic sequence by image, for the stubs of the five roles.
 
-A role is given images, not frame numbers. The oracle therefore hands the sequence's frames out itself (it is a
-`Sequence`) and remembers the fingerprint of each image it gave.
+Roles receive images, not frame numbers. So the oracle is itself a `Sequence`, and remembers a fingerprint of each
+image.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class _Known:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedOracle:
-    """A `Sequence` that knows the truth about each image it has given.
+    """A `Sequence` with the ground truth of each of its images.
 
-    kept: frames whose truth is kept in memory; that of others is rendered again when it is asked for.
+    kept: number of frames whose ground truth is kept in memory; others are rendered again on request.
     """
 
     sequence: SyntheticSequence
@@ -87,12 +87,12 @@ class SimulatedOracle:
         return self.sequence.ground_truth()
 
     def index_of(self, image: np.ndarray) -> int:
-        """Return the frame whose image this is; InputError for an image that `frames` has not given."""
+        """Return the frame of an image; raise InputError for an image that is not of `frames`."""
         index = self._given.get(_fingerprint(image))
         if index is None:
             raise InputError(
-                "`image` is no image that this simulated sequence has given; stubs know the frames of the oracle's "
-                "own `frames()` only: feed the pipeline from the oracle, unchanged"
+                "`image` is not of this simulated sequence; stubs know only frames of the oracle's `frames()`: run the "
+                "pipeline on the oracle, unchanged"
             )
         return index
 

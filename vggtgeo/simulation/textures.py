@@ -176,6 +176,6 @@ def paint_texture(name: str, seed: int, size: int) -> np.ndarray:
     painter = TILES.get(kind) or DECALS.get(kind)
     if painter is None:
         known = ", ".join(sorted([*TILES, *DECALS]))
-        raise InputError(f"`name` is {name!r}, which is no texture; use one of {known}")
+        raise InputError(f"`name` must be one of {known}, got {name!r}")
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     return painter(rng, size)

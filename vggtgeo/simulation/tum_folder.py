@@ -1,8 +1,8 @@
-"""Writes a synthetic sequence as a TUM RGB-D folder, so that any SLAM system can run it.
+"""Write a synthetic sequence as a TUM RGB-D folder, for any SLAM system.
 
 `rgb/`, `depth/` (16-bit PNG, metres x 5000, 0 = none), `rgb.txt`, `depth.txt`, `groundtruth.txt`, and
-`calibration.txt` (fx fy cx cy). The lists are written first: of a walk that was interrupted they name files that are
-not there, which a reader tells.
+`calibration.txt` (fx fy cx cy). The lists are written first: after an interruption they name missing files, which
+readers report.
 """
 
 import os
@@ -25,14 +25,13 @@ _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 def write_tum_folder(sequence: SyntheticSequence, folder: str | os.PathLike[str]) -> Iterator[Frame]:
     """Render `sequence` into `folder`, giving each frame once it is written (for a progress bar).
 
-    Raises InputError if `folder` is there and not empty, or cannot be written.
+    Raises InputError if `folder` exists and is not empty, or is not writable.
     """
     target = Path(folder)
     check_new(target)
     for part in ("rgb", "depth"):
         (target / part).mkdir(parents=True, exist_ok=True)
-    # First what the codes of depth and the times are read by: without it a walk that was killed is a folder of images
-    # and depth of another unit.
+    # Units and times first: without them an interrupted folder would be read with another unit of depth.
     fx, fy, cx, cy = sequence.camera.intrinsics
     write_text(target / "calibration.txt", f"{fx:.9g} {fy:.9g} {cx:.9g} {cy:.9g}\n")
     sequence.ground_truth().save_tum(target / "groundtruth.txt")
@@ -53,11 +52,11 @@ def _name(time: float) -> str:
 
 
 def check_new(folder: Path) -> None:
-    """InputError if `folder` is there and not an empty folder."""
+    """Raise InputError if `folder` exists and is not an empty folder."""
     if folder.is_symlink() and not folder.exists():
-        raise InputError(f"`{folder}` is a link that leads nowhere; give the name of a new folder")
+        raise InputError(f"`{folder}` is a broken link; give the name of a new folder")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"`{folder}` is there and not an empty folder; give the name of a new one")
+        raise InputError(f"`{folder}` exists and is not an empty folder; give the name of a new one")
 
 
 def _depth_code(depth: np.ndarray) -> np.ndarray:

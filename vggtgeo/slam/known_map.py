@@ -82,7 +82,7 @@ def load_map(path: str | os.PathLike[str]) -> Slam:
         >>> vg.load_map("office.map")
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `office.map` is no file; give that of a map
+        vggtgeo.io.errors.InputError: `office.map` does not exist or is not a file; give the file of a map
 
     """
     found, _ = MAP.read(path_of("path", path))
