@@ -46,9 +46,7 @@ def _sentences(text: str) -> list[int]:
 
 def test_sentences_are_counted() -> None:
     # Proves the count below. Oracle: a text whose sentences were counted by hand.
-    text = (
-        "# A heading\n\nOne `two words` three.\nFour (five).\n\n| a | b |\n|---|---|\n\n- Six\n- seven [eight](9.md)\n"
-    )
+    text = "# A heading\n\nOne `two words` three.\nFour (five).\n\n| a | b |\n|---|---|\n\n- Six\n- x [eight](9.md)\n"
     assert _sentences(text) == [3, 2, 1, 2]
 
 
@@ -56,6 +54,13 @@ def test_all_pages_together_can_be_read() -> None:
     # Proves the bound of CONTRIBUTING.md on all pages. Oracle: their words, code included.
     words = {page.name: _words(page.read_text()) for page in (ROOT / "docs").rglob("*.md")}
     assert sum(words.values()) <= 20_000, words
+
+
+def test_the_first_page_and_the_changes_are_short() -> None:
+    # Proves at most 600 words of prose in README.md, and 60 lines in CHANGELOG.md. Oracle: the files.
+    readme, changes = ((ROOT / name).read_text() for name in ("README.md", "CHANGELOG.md"))
+    assert sum(_sentences(readme)) <= 600, sum(_sentences(readme))
+    assert len(changes.splitlines()) <= 60
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
