@@ -121,7 +121,7 @@ def test_published_figures_have_source_and_protocol_and_stand_apart() -> None:
     assert lost in after
     assert "`-`" not in after
     other = markdown.published_table(published("averages"))
-    assert "| SLAM3R* | - | 0.066 | Y. Liu et al., SLAM3R" in other
+    assert "| SLAM3R* | - | - | 0.066 | - | - | Y. Liu et al., SLAM3R" in other
     assert "`-`: not published." in other
     with pytest.raises(InputError, match=r"`published` .*`x`"):
         published("x")

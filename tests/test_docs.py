@@ -29,6 +29,47 @@ def test_links_and_named_files_exist(page: Path) -> None:
     assert {path for path in links | named if not path.exists()} == set()
 
 
+def _words(text: str) -> int:
+    """Words and numbers; the lines of a table are none."""
+    return sum(bool(re.search(r"\w", word)) for word in text.split())
+
+
+def _sentences(text: str) -> list[int]:
+    """Words of each sentence, without code blocks, equations, tables, headings, pictures. Code in it is one word."""
+    text = re.sub(r"^ *```.*?^ *```$|\$\$.*?\$\$|<!--.*?-->", "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"^ *(:::|!\[|#|\||Code: |---).*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"`[^`]*`|\$[^$]*\$", "x", text)
+    text = re.sub(r"\]\([^)]*\)", "]", text)
+    parts = re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )|(?<=[.!?:;])[\s)]", text)
+    return [length for length in map(_words, parts) if length]
+
+
+def test_sentences_are_counted() -> None:
+    # Proves the count below. Oracle: a text whose sentences were counted by hand.
+    text = "# A heading\n\nOne `two words` three.\nFour (five).\n\n| a | b |\n|---|---|\n\n- Six\n- x [eight](9.md)\n"
+    assert _sentences(text) == [3, 2, 1, 2]
+
+
+def test_all_pages_together_can_be_read() -> None:
+    # Proves the bound of CONTRIBUTING.md on all pages. Oracle: their words, code included.
+    words = {page.name: _words(page.read_text()) for page in (ROOT / "docs").rglob("*.md")}
+    assert sum(words.values()) <= 20_000, words
+
+
+def test_the_first_page_and_the_changes_are_short() -> None:
+    # Proves at most 600 words of prose in README.md, and 60 lines in CHANGELOG.md. Oracle: the files.
+    readme, changes = ((ROOT / name).read_text() for name in ("README.md", "CHANGELOG.md"))
+    assert sum(_sentences(readme)) <= 600, sum(_sentences(readme))
+    assert len(changes.splitlines()) <= 60
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_sentences_of_a_page_are_short(page: Path) -> None:
+    # Proves that sentences have 25 words at most on average. Oracle: the page.
+    lengths = _sentences(page.read_text())
+    assert not lengths or sum(lengths) / len(lengths) <= 25, sum(lengths) / len(lengths)
+
+
 def test_make_targets_in_the_documents_exist() -> None:
     # Proves that each `make target` in a document can be called. Oracle: the Makefile.
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
@@ -42,7 +83,7 @@ def test_make_targets_in_the_documents_exist() -> None:
 def test_the_committed_picture_is_the_drawn_one() -> None:
     # Proves that the picture was redrawn after its script changed. Oracle: the script.
     draw = runpy.run_path(str(ROOT / "docs" / "draw_architecture.py"))["draw"]
-    assert (ROOT / "docs" / "architecture.svg").read_text() == draw()
+    assert (ROOT / "docs" / "concepts" / "architecture.svg").read_text() == draw()
 
 
 def test_the_site_has_every_page_once(hooks: dict[str, Any]) -> None:

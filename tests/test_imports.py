@@ -1,4 +1,4 @@
-"""Who may import whom (the layers of docs/architecture.md), read from the sources."""
+"""Who may import whom (the layers of docs/concepts/architecture.md), read from the sources."""
 
 import ast
 import sys
