@@ -45,7 +45,7 @@ def choose_provider(provider: Provider) -> str:
 def _covered() -> str:
     """Return a message if `onnxruntime` was installed over `onnxruntime-gpu`, else "".
 
-    Both packages have the same module, and pip installs them in any order.
+    Both packages have the same module, and an installer may write either last.
     """
     try:
         found = metadata.version(GPU_PACKAGE)
