@@ -3,7 +3,7 @@
     python benchmarks/paper_figures.py -o runs/figures --scenes office hall
 
 figure-1-SCENE.png: the depths of all keyframes at the poses that they began with, beside the adjusted map, from above.
-figure-5.png: the map of every scene. figure-6.png: the path of every scene beside the truth.
+figure-5.png: the map of every scene. figure-6-SCENE.png: the path beside the truth.
 figure-7-SCENE.png: image, depth prior, depth after the adjustment, and its error, for keyframes of the run.
 Simulated, as the tables of `vggtgeo bench paper`.
 """
@@ -22,8 +22,8 @@ from vggtgeo.benchmark.inputs import Input, open_input
 from vggtgeo.benchmark.jobs import jobs_of
 from vggtgeo.benchmark.suite import load_suite
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.evaluation import absolute_error, associate
 from vggtgeo.figures import map_view
+from vggtgeo.figures.plots import trajectory_figure
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.report.figures import depth_colours
@@ -109,21 +109,10 @@ def figure_5(runs: list[Run], folder: Path) -> None:
     figure.savefig(folder / "figure-5.png", dpi=120)
 
 
-def figure_6(runs: list[Run], folder: Path) -> None:
-    """Write the path of every scene from above beside the truth, after SE(3) alignment, with the ATE."""
-    figure, axes = plt.subplots(1, len(runs), figsize=(6 * len(runs), 5), layout="constrained", squeeze=False)
-    for axis, run in zip(axes[0], runs, strict=True):
-        truth = run.given.truth
-        error = absolute_error(*associate(run.result.trajectory, truth))
-        own = error.alignment.points(run.result.trajectory.positions)
-        wide = np.argsort(np.ptp(truth.positions, axis=0))[::-1][:2]
-        axis.plot(*truth.positions[:, wide].T, color="#999999", lw=3, label="truth")
-        axis.plot(*own[:, wide].T, color="#1f5fbf", lw=1.5, label="estimate")
-        axis.set_title(f"{run.scene}: ATE {100 * error.statistics.rmse:.2f} cm")
-        axis.set_aspect("equal")
-        axis.set_xlabel("m")
-        axis.legend(frameon=False)
-    figure.savefig(folder / "figure-6.png", dpi=120)
+def figure_6(run: Run, folder: Path) -> None:
+    """Write the path beside the truth, from above and from the side, after SE(3) alignment, with the ATE."""
+    drawn = trajectory_figure(run.result.trajectory, run.given.truth, run.result.keyframes, title=run.scene, width=9.0)
+    drawn.savefig(folder / f"figure-6-{run.scene}.png", dpi=120)
 
 
 def figure_7(run: Run, folder: Path) -> None:
@@ -162,9 +151,9 @@ def main() -> None:
     runs = [run_scene(scene, options.frames) for scene in options.scenes]
     for run in runs:
         figure_1(run, options.output)
+        figure_6(run, options.output)
         figure_7(run, options.output)
     figure_5(runs, options.output)
-    figure_6(runs, options.output)
 
 
 if __name__ == "__main__":

@@ -181,7 +181,7 @@
     const [x, y, z] = header.middle, away = Math.hypot(x, y);
     const e = header.extent * Math.max(1, (1.2 * stage.clientHeight) / stage.clientWidth);
     const [dx, dy] = away > 0.1 * header.extent ? [x / away, y / away] : [0.6, 0.8];
-    k3d.setCamera([x - 0.6 * e * dx, y - 0.6 * e * dy, z + 0.55 * e, x, y, z, 0, 0, 1]);
+    k3d.setCamera([x - 0.68 * e * dx, y - 0.68 * e * dy, z + 0.6 * e, x, y, z, 0, 0, 1]);
     setCut(header.cut);
     tick(["path", "sigma", "truth", "cameras"], true);
     refresh();

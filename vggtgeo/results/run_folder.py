@@ -33,7 +33,7 @@ from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED
 
 RESERVE = 96 * 2**20
 """Bytes reserved on the disk until the results are written: a map of 500,000 points (14 MB), a mesh of a million faces
-(30 MB), 200 images (20 MB), report and trajectories of 10,000 frames (10 MB)."""
+(30 MB), 200 images (20 MB), report with its 3D view and trajectories of 10,000 frames (25 MB)."""
 
 _LOCK = ".lock"
 _RESERVED = ".reserve"
