@@ -35,7 +35,7 @@ import numpy as np
 from scipy.stats import binomtest
 from stress import Outcome, trajectory_errors
 from stress import judge as outcome_of
-from verdict_faults import FAULTS, HEALTHY, OF_DEPTH, WITHOUT_DEPTH, CameraErrors, Given, Walk, rendered
+from verdict_faults import FAULTS, HEALTHY, OF_DEPTH, OF_STREAM, WITHOUT_DEPTH, CameraErrors, Given, Walk, rendered
 
 import vggtgeo as vg
 from vggtgeo.benchmark.inputs import DegradedWalk
@@ -139,8 +139,12 @@ def record(case: Case, render: Callable[[Walk], Recording]) -> Recording:
         moved = errors.of_motion(FAULTS[case.degradation](Given(perfect, case.walk, case.severity, rng, render)))
     else:
         seen = lambda walk: errors.of_motion(render(walk))
-        moved = FAULTS[case.degradation](Given(seen(case.walk), case.walk, case.severity, rng, seen))
+        moved = seen(case.walk)
+        if case.degradation not in OF_STREAM:
+            moved = FAULTS[case.degradation](Given(moved, case.walk, case.severity, rng, seen))
     recording = errors.of_sensors(moved, rng)
+    if case.degradation in OF_STREAM:
+        recording = FAULTS[case.degradation](Given(recording, case.walk, case.severity, rng, render))
     return without_depth(recording, rng) if case.rgb_only else recording
 
 

@@ -396,5 +396,7 @@ OF_IMAGES: dict[str, Fault] = {
 """Faults of the images, or of images and depth."""
 WITHOUT_DEPTH: dict[str, Fault] = {"turning_on_the_spot": turning_on_the_spot}
 """Faults of runs without depth alone."""
+OF_STREAM = {"depth_frozen", "frozen_pictures"}
+"""Faults that come after the sensors: what is shown again has the same noise."""
 HEALTHY = "healthy"
 FAULTS: dict[str, Fault] = {HEALTHY: lambda given: given.recording, **OF_DEPTH, **OF_IMAGES, **WITHOUT_DEPTH}

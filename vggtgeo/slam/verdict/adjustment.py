@@ -319,3 +319,13 @@ def start_of(tracks: Tracks) -> Unknowns:
     inverse = np.where(np.isfinite(measured), measured, np.where(known, value, middle))
     inverse = np.clip(inverse, 0.02 * middle, 20.0 * middle)
     return Unknowns(tracks.poses, np.column_stack([own[:, :2], np.log(inverse)]), np.zeros(SIZE))
+
+
+def subset(tracks: Tracks, kept: np.ndarray) -> tuple[Tracks, np.ndarray]:
+    """The tracks of which `kept`, bool [t], is true, and their numbers."""
+    rows = kept[tracks.track]
+    numbers = np.flatnonzero(kept)
+    track = (np.cumsum(kept) - 1)[tracks.track[rows]]
+    first = np.flatnonzero(np.r_[True, track[1:] != track[:-1]])
+    parts = {name: getattr(tracks, name)[rows] for name in ("frame", "pixels", "depth", "readout")}
+    return replace(tracks, **parts, track=track, first=first), numbers
