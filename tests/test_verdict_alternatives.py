@@ -156,7 +156,7 @@ def test_depth_of_another_scene_contradicts_the_images() -> None:
     rng = np.random.default_rng(1)
     here = walk(COUNT, measured=lambda row, z: rng.permutation(z))
     found = here.explanation()
-    assert found.noise.depth > DEPTH_NOISE
+    assert found.depth_noise > DEPTH_NOISE
     one = contradiction(found, True)
     assert one is not None
     assert one.cause == "depth"

@@ -28,6 +28,8 @@ ITERATIONS, CONVERGED = 12, 5e-4
 """At most; and the relative decrease of the energy below which the iteration ends."""
 FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e3
 """Of Levenberg and Marquardt, as a share of the diagonal."""
+LINEAR = 0.5
+"""Of the decrease of the energy that a step promises: with less, the points are solved once more for its poses."""
 KNOTS = 4
 """Of a quantity that changes with time: linear between so many moments, evenly spread over the window."""
 FOCAL = slice(0, KNOTS)
@@ -85,10 +87,17 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations: of a corner, pixels; of the logarithm of a measured depth."""
+    """Standard deviations: of a corner, pixels; of the logarithm of a measured depth, near the camera, and its growth a
+    metre: what is triangulated (stereo, a pattern) has an error that grows with the square of the distance.
+    """
 
     pixel: float
     depth: float
+    growth: float = 0.0
+
+    def of_depth(self, metres: np.ndarray) -> np.ndarray:
+        """Of the logarithm of depths measured at these distances."""
+        return np.hypot(self.depth, self.growth * metres)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +157,9 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, theta_too: bool 
     at = lambda moved, logs, theta: predict(tracks, moved, logs, theta)
     value = at(numerator, log_inverse, unknowns.theta)
     measured = np.column_stack([tracks.pixels, np.log(tracks.depth)])
-    scale = np.tile(1.0 / np.array([noise.pixel, noise.pixel, noise.depth]), (len(a), 1))
-    scale[:, 2] /= np.sqrt(tracks.depths)  # the error of a measured depth is common to its track
+    scale = np.full((len(a), 3), 1.0 / noise.pixel)
+    # The error of a measured depth is common to its track.
+    scale[:, 2] = 1.0 / (noise.of_depth(np.nan_to_num(tracks.depth)) * np.sqrt(tracks.depths))
     known = np.isfinite(measured) & ~behind[:, None]
     residual = np.where(known, (value - np.where(known, measured, 0.0)) * scale, 0.0)
     step = DIFFERENCE * np.abs(numerator[:, 2])
@@ -276,9 +286,11 @@ def solve(
         poses = rigid.moved(unknowns.poses, step[:width].reshape(-1, 6)) if poses_free else unknowns.poses
         points = unknowns.points + np.clip(reduced.points(step), -1.0, 1.0)
         tried = Unknowns(poses, points, unknowns.theta + columns @ step[width:])
-        if len(step):
-            tried = _with_own_points(tracks, tried, noise)
         there = linearise(tracks, tried, noise, some)
+        expected = float(np.sum(reduced.point_side**2) + reduced.side @ step)
+        if len(step) and linear.energy - there.energy < LINEAR * expected:
+            tried = _with_own_points(tracks, tried, noise)
+            there = linearise(tracks, tried, noise, some)
         if not there.energy < linear.energy:
             damping *= 10.0
             if damping > LAST_DAMPING:

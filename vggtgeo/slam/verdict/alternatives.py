@@ -40,6 +40,8 @@ MAX_TRIED = 3
 """Alternatives that are solved in each round: those of the largest predicted gain."""
 WIDE = 20.0
 """Times the noise in the first steps towards a second motion, which begin far from it."""
+FIRST_STEPS = 6
+"""With that noise."""
 START = Noise(0.6, 0.03)
 """Pixels of an image of 320, relative: until residuals say more."""
 
@@ -104,6 +106,11 @@ class Explanation:
     rival: float
     second: np.ndarray | None
     reversal: float = np.nan
+
+    @property
+    def depth_noise(self) -> float:
+        """Relative noise of the depth in the middle of the scene."""
+        return float(self.noise.of_depth(np.nanmedian(self.tracks.depth)))
 
     @property
     def reversed(self) -> bool:
@@ -222,14 +229,11 @@ def _outliers(tracks: Tracks, fit: Fit) -> np.ndarray:
 
 def second_motion(tracks: Tracks, noise: Noise, outliers: np.ndarray) -> tuple[float, np.ndarray | None, np.ndarray]:
     """Whether one other motion explains the corners that contradict the first: its share of all observations, its
-    poses (None where there is none), and its tracks, bool [t].
+    poses (None where there is none), and its tracks, bool [t]. Depth has no say: it may be that of either.
     """
-    own, _ = subset(tracks, outliers)
-    without = replace(own, depth=np.full(len(own.depth), np.nan))
+    own, _ = subset(replace(tracks, depth=np.full(len(tracks.depth), np.nan)), outliers)
     still = np.tile(tracks.poses[:1], (len(tracks.poses), 1, 1))
-    fits = []
-    for seen in (own, without) if np.isfinite(own.depth).any() else (without,):
-        fits += [_fit_from(seen, poses, noise) for poses in (still, tracks.poses)]
+    fits = (_fit_from(own, poses, noise) for poses in (still, tracks.poses))
     other = max(fits, key=lambda one: float(one.linear.weight[:, 0].sum()))
     explained = ~_outliers(own, other)
     theirs = np.zeros(len(tracks.first), bool)
@@ -246,9 +250,9 @@ def _predicts(tracks: Tracks, motion: Fit, noise: Noise) -> bool:
     fit them, whatever they do.
     """
     half = np.arange(len(tracks.first)) % 2 == 0
-    first, kept = subset(replace(tracks, depth=np.full(len(tracks.depth), np.nan)), half)
+    first, kept = subset(tracks, half)
     fit = solve(first, replace(motion.unknowns, points=motion.unknowns.points[kept]), noise)
-    second, kept = subset(replace(tracks, depth=np.full(len(tracks.depth), np.nan)), ~half)
+    second, kept = subset(tracks, ~half)
     start = replace(fit.unknowns, points=motion.unknowns.points[kept])
     predicted = solve(second, start, noise, poses_free=False)
     return float(np.mean(~_outliers(second, predicted))) > 0.5
@@ -274,8 +278,9 @@ def reversed_poses(poses: np.ndarray, tracks: Tracks) -> np.ndarray:
 def _fit_from(tracks: Tracks, poses: np.ndarray, noise: Noise) -> Fit:
     """The fit with free poses that is begun far from it, at these."""
     points = _in_chart(tracks, start_of(replace(tracks, poses=poses)), poses)
-    wide = solve(tracks, Unknowns(poses, points, np.zeros(SIZE)), Noise(WIDE * noise.pixel, WIDE * noise.depth))
-    return solve(tracks, wide.unknowns, noise)
+    wide = Noise(WIDE * noise.pixel, WIDE * noise.depth)
+    near = solve(tracks, Unknowns(poses, points, np.zeros(SIZE)), wide, iterations=FIRST_STEPS)
+    return solve(tracks, near.unknowns, noise)
 
 
 def _in_chart(tracks: Tracks, start: Unknowns, poses: np.ndarray) -> np.ndarray:

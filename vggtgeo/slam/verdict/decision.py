@@ -46,7 +46,7 @@ def contradiction(explanation: Explanation, metric: bool) -> Contradiction | Non
     cause = None
     if explanation.rival > RIVAL * (explanation.rival + explanation.share):
         cause = "second motion"
-    elif with_depth and explanation.noise.depth > DEPTH_NOISE:
+    elif with_depth and explanation.depth_noise > DEPTH_NOISE:
         cause = "depth"
     if cause is None and all(np.less(preferred(explanation).difference(not with_depth), limits)):
         return None  # small even with its noise
@@ -200,7 +200,7 @@ def _shutter(windows: Sequence[Explanation]) -> str:
 
 
 def _depth(windows: Sequence[Explanation]) -> str:
-    noise, added = max(window.noise.depth for window in windows), _of("depth", windows)
+    noise, added = max(window.depth_noise for window in windows), _of("depth", windows)
     if noise > DEPTH_NOISE or not added:
         return f"the depth contradicts the motion in the images (it scatters by {100 * noise:.0f} %)"
     value, sigma = _pooled(added)
