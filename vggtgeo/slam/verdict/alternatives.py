@@ -110,7 +110,7 @@ class Explanation:
     @property
     def depth_noise(self) -> float:
         """Relative noise of the depth in the middle of the scene."""
-        return float(self.noise.of_depth(np.nanmedian(self.tracks.depth)))
+        return float(self.noise.of_depth(np.nanmedian(self.tracks.depth, keepdims=True))[0])
 
     @property
     def reversed(self) -> bool:
