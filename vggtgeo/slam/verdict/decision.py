@@ -79,8 +79,8 @@ def drift(chain: Sequence[Explanation], metric: bool, stated: float) -> Contradi
     limit = max(PLACES if metric else SHARE * extent(whole.claimed), DRIFT * length, 1e-12)
     if whole.difference(free)[0] < limit:
         return None
-    both = zip(*(halves(one) for one in chain), strict=True)
-    found = consequence(*(chained(motions, free) for motions in both), free)
+    first, second = zip(*(halves(one) for one in chain), strict=True)
+    found = consequence(chained(first, free), chained(second, free), free)
     if found.places < max(limit, SIGMAS * np.hypot(found.places_sigma, stated)):
         return None
     cause, count = Counter(_first_added(one) for one in chain).most_common(1)[0]
