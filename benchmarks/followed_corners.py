@@ -21,8 +21,9 @@ import numpy as np
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, in_bands_of_light, with_images
+from vggtgeo.slam.perception.followed_corners import common_to_rows
 from vggtgeo.slam.verdict.windows import MIN_COMMON
-from vggtgeo.slam.verdict.witness import FrameEvidence, common_to_rows
+from vggtgeo.slam.verdict.witness import FrameEvidence
 
 AGREE = 3.0
 """Pixels."""

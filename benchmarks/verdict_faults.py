@@ -49,11 +49,11 @@ class Walk:
 
     @classmethod
     def drawn(cls, world: str, seed: int) -> Walk:
-        """A walk whose speed, rate, start, length and picture size follow from the seed."""
+        """A walk whose speed, rate, start and length follow from the seed."""
         rng = np.random.default_rng([seed, 41])
-        size = ((200, 150), (240, 180))[int(rng.integers(2))]
         speed = WORLDS[world][1].speed * float(rng.uniform(0.7, 1.5))
-        return cls(world, seed, size, int(rng.integers(40, 51)), float(rng.uniform(8, 15)), speed, rng.uniform(0, 60))
+        frames, rate, start = int(rng.integers(40, 49)), float(rng.uniform(8, 15)), float(rng.uniform(0, 60))
+        return cls(world, seed, (240, 180), frames, rate, speed, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,5 +396,7 @@ OF_IMAGES: dict[str, Fault] = {
 """Faults of the images, or of images and depth."""
 WITHOUT_DEPTH: dict[str, Fault] = {"turning_on_the_spot": turning_on_the_spot}
 """Faults of runs without depth alone."""
+OF_STREAM = {"depth_frozen", "frozen_pictures"}
+"""Faults that come after the sensors: what is shown again has the same noise."""
 HEALTHY = "healthy"
 FAULTS: dict[str, Fault] = {HEALTHY: lambda given: given.recording, **OF_DEPTH, **OF_IMAGES, **WITHOUT_DEPTH}

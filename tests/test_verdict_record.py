@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from witness import Walk
+import pytest
+from witness import Walk, walk
 
-from vggtgeo.slam.verdict.record import check_record
+from vggtgeo.slam.verdict.record import check_frozen, check_record
 
 
 def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
@@ -65,3 +66,23 @@ def test_a_run_that_is_found_nowhere_in_a_map_says_so(healthy: Walk) -> None:
 def test_a_camera_that_is_a_guess_is_reported(healthy: Walk) -> None:
     """An unknown camera of which too little was seen is a reason of its own; oracle: the claim."""
     assert [f.check for f in check_record(replace(healthy.claim, guessed=True))] == ["camera"]
+
+
+@pytest.mark.parametrize(("still", "told"), [(False, True), (True, False)])
+def test_pictures_that_are_shown_again_while_the_camera_moves(still: bool, told: bool) -> None:
+    """Fifteen frames with the very same corners are reported where the camera moved before and after, and not where it
+    was at rest anyway; corners at rest with the noise of new pictures are not the same. Oracle: what was planted.
+    """
+    here = walk(40)
+    poses = np.tile(here.claim.poses[:1], (40, 1, 1)) if still else here.claim.poses.copy()
+    poses[12:27] = poses[11]
+    corners = list(here.evidence)
+    corners[12:27] = [replace(here.evidence[11], frame=row) for row in range(12, 27)]
+    claim = replace(here.claim, poses=poses)
+    assert [one.check for one in check_frozen(claim, corners)] == ["frozen"] * told
+    rng = np.random.default_rng(0)
+    moved = [
+        replace(one, pixels=(one.pixels + 0.05 * rng.standard_normal(one.pixels.shape)).astype(np.float32))
+        for one in corners
+    ]
+    assert check_frozen(claim, moved) == []

@@ -1,6 +1,6 @@
 """How far the poses of a run can be off: the covariances of the last adjustment, carried to every frame.
 
-How true they are is measured: see docs/concepts/verdict.md.
+How true they are is measured: see docs/concepts/uncertainty.md.
 """
 
 from __future__ import annotations

@@ -28,6 +28,8 @@ ITERATIONS, CONVERGED = 12, 5e-4
 """At most; and the relative decrease of the energy below which the iteration ends."""
 FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e3
 """Of Levenberg and Marquardt, as a share of the diagonal."""
+LINEAR = 0.5
+"""Of the decrease of the energy that a step promises: with less, the points are solved once more for its poses."""
 KNOTS = 4
 """Of a quantity that changes with time: linear between so many moments, evenly spread over the window."""
 FOCAL = slice(0, KNOTS)
@@ -37,7 +39,6 @@ RADIAL, READOUT, OFFSET = 2 * KNOTS + 2, 2 * KNOTS + 3, 2 * KNOTS + 4
 SIZE = 2 * KNOTS + 5
 """Layout of `theta`: log focal length at each knot; log depth factor at each knot; principal point, as a share of the
 focal length; radial distortion k1; time from the first row to the last, s; metres added to the depth."""
-DIFFERENCE = 1e-6
 HUGE = 1e3
 """Whitened residual of a point behind a camera."""
 
@@ -85,10 +86,17 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations: of a corner, pixels; of the logarithm of a measured depth."""
+    """Standard deviations: of a corner, pixels; of the logarithm of a measured depth, near the camera, and its growth a
+    metre: what is triangulated (stereo, a pattern) has an error that grows with the square of the distance.
+    """
 
     pixel: float
     depth: float
+    growth: float = 0.0
+
+    def of_depth(self, metres: np.ndarray) -> np.ndarray:
+        """Of the logarithm of depths measured at these distances."""
+        return np.hypot(self.depth, self.growth * metres)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,24 +127,50 @@ class Linear:
         return float(self.energies.sum())
 
 
-def predict(tracks: Tracks, numerator: np.ndarray, log_inverse: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Pixels and log depth of each observation, float64 [m, 3].
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Pixels and log depth of each observation, value [m, 3], and derivatives: by the point in the camera times its
+    inverse depth `rho` [m, 3, 3], by `log rho` [m, 3], and by the calibration [m, 3, SIZE].
+    """
+
+    value: np.ndarray
+    by_numerator: np.ndarray
+    by_log: np.ndarray
+    by_theta: np.ndarray
+
+
+def predict(tracks: Tracks, numerator: np.ndarray, log_inverse: np.ndarray, theta: np.ndarray) -> Prediction:
+    """What is seen of points.
 
     numerator: float64 [m, 3], point in the camera times its `rho`. log_inverse: float64 [m], `log rho`.
     """
-    z = numerator[:, 2]
+    count, z, inverse, weights = len(numerator), numerator[:, 2], np.exp(log_inverse), tracks.knots()
     normalised = numerator[:, :2] / z[:, None]
-    squared = np.sum(normalised**2, 1)
-    bent = normalised * (1.0 + theta[RADIAL] * squared)[:, None] + theta[CENTRE]
-    weights = tracks.knots()
-    focal = np.exp(weights @ theta[FOCAL])
-    pixels = tracks.intrinsics[:2] * focal[:, None] * bent + tracks.intrinsics[2:]
-    pixels = pixels + theta[READOUT] * tracks.readout
-    depth = np.maximum(z * np.exp(-log_inverse) + theta[OFFSET], 1e-3)
-    return np.column_stack([pixels, np.log(depth) + weights @ theta[DRIFT]])
+    squared = np.sum(normalised**2, 1)[:, None]
+    stretch = 1.0 + theta[RADIAL] * squared
+    focal = np.exp(weights @ theta[FOCAL])[:, None] * tracks.intrinsics[:2]
+    seen = focal * (normalised * stretch + theta[CENTRE])
+    depth = np.maximum(z / inverse + theta[OFFSET], 1e-3)
+    value = np.column_stack(
+        [seen + tracks.intrinsics[2:] + theta[READOUT] * tracks.readout, np.log(depth) + weights @ theta[DRIFT]]
+    )
+    by_normalised = 2.0 * theta[RADIAL] * normalised[:, :, None] * normalised[:, None, :]
+    by_normalised = focal[:, :, None] * (by_normalised + stretch[:, :, None] * np.eye(2))
+    by_numerator, by_log, by_theta = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros((count, 3, SIZE))
+    by_numerator[:, :2, :2] = by_normalised / z[:, None, None]
+    by_numerator[:, :2, 2] = -np.einsum("mij,mj->mi", by_normalised, normalised) / z[:, None]
+    by_numerator[:, 2, 2] = 1.0 / (inverse * depth)
+    by_log[:, 2] = -z / (inverse * depth)
+    by_theta[:, :2, FOCAL] = seen[:, :, None] * weights[:, None]
+    by_theta[:, :2, CENTRE] = focal[:, :, None] * np.eye(2)
+    by_theta[:, :2, RADIAL] = focal * normalised * squared
+    by_theta[:, :2, READOUT] = tracks.readout
+    by_theta[:, 2, DRIFT] = weights
+    by_theta[:, 2, OFFSET] = 1.0 / depth
+    return Prediction(value, by_numerator, by_log, by_theta)
 
 
-def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, theta_too: bool = True) -> Linear:
+def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
     """Residuals and their derivatives there."""
     relative = unknowns.poses[tracks.frame] @ rigid.invert(tracks.poses[tracks.anchor])[tracks.track]
     a, b, log_inverse = unknowns.points[tracks.track].T
@@ -145,36 +179,25 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, theta_too: bool 
     numerator = turn[:, :, 0] * a[:, None] + turn[:, :, 1] * b[:, None] + turn[:, :, 2] + shift
     behind = numerator[:, 2] < 1e-3
     numerator = np.where(behind[:, None], [0.0, 0.0, 1.0], numerator)
-    at = lambda moved, logs, theta: predict(tracks, moved, logs, theta)
-    value = at(numerator, log_inverse, unknowns.theta)
+    seen = predict(tracks, numerator, log_inverse, unknowns.theta)
     measured = np.column_stack([tracks.pixels, np.log(tracks.depth)])
-    scale = np.tile(1.0 / np.array([noise.pixel, noise.pixel, noise.depth]), (len(a), 1))
-    scale[:, 2] /= np.sqrt(tracks.depths)  # the error of a measured depth is common to its track
+    scale = np.full((len(a), 3), 1.0 / noise.pixel)
+    # The error of a measured depth is common to its track.
+    scale[:, 2] = 1.0 / (noise.of_depth(np.nan_to_num(tracks.depth)) * np.sqrt(tracks.depths))
     known = np.isfinite(measured) & ~behind[:, None]
-    residual = np.where(known, (value - np.where(known, measured, 0.0)) * scale, 0.0)
-    step = DIFFERENCE * np.abs(numerator[:, 2])
-    along = lambda axis: (at(numerator + step[:, None] * axis, log_inverse, unknowns.theta) - value) / step[:, None]
-    by_numerator = np.stack([along(axis) for axis in np.eye(3)], 2)
-    by_log = (at(numerator, log_inverse + DIFFERENCE, unknowns.theta) - value) / DIFFERENCE
+    residual = np.where(known, (seen.value - np.where(known, measured, 0.0)) * scale, 0.0)
     mask = (known * scale)[:, :, None]
     none = np.zeros(len(a))
     x, y, z = numerator.T
     cross = np.stack([none, z, -y, -z, none, x, y, -x, none], 1).reshape(-1, 3, 3)
-    by_pose = mask * np.concatenate([by_numerator * inverse[:, None, None], by_numerator @ cross], 2)
-    to_point = np.stack([turn[:, :, 0], turn[:, :, 1], shift], 2)
-    by_point = by_numerator @ to_point
-    by_point[:, :, 2] += by_log
-    by_theta = np.zeros((len(a), 3, SIZE))
-    if theta_too:
-        for index in range(SIZE):
-            other = unknowns.theta.copy()
-            other[index] += DIFFERENCE
-            by_theta[:, :, index] = (at(numerator, log_inverse, other) - value) / DIFFERENCE
+    by_pose = mask * np.concatenate([seen.by_numerator * inverse[:, None, None], seen.by_numerator @ cross], 2)
+    by_point = seen.by_numerator @ np.stack([turn[:, :, 0], turn[:, :, 1], shift], 2)
+    by_point[:, :, 2] += seen.by_log
     squared = np.column_stack([np.sum(residual[:, :2] ** 2, 1), residual[:, 2] ** 2])
     squared[:, 0] = np.where(behind, HUGE**2, squared[:, 0])
     energies = KERNEL**2 * np.log1p(squared / KERNEL**2).sum(1)
     weight = (1.0 / (1.0 + squared / KERNEL**2))[:, [0, 0, 1]]
-    return Linear(residual, weight, by_pose, mask * by_point, mask * by_theta, energies)
+    return Linear(residual, weight, by_pose, mask * by_point, mask * seen.by_theta, energies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,16 +240,13 @@ def reduce(tracks: Tracks, linear: Linear, columns: np.ndarray, poses_free: bool
     matrix, side = np.zeros((size, size)), np.zeros(size)
     if poses_free:
         moved = linear.by_pose * linear.weight[:, :, None]
-        blocks = np.zeros((frames, 6, 6))
-        np.add.at(blocks, tracks.frame, np.einsum("mri,mrj->mij", moved, linear.by_pose))
+        seen_by = (tracks.frame == np.arange(frames)[:, None]).astype(np.float64)
+        of_frames = lambda values: (seen_by @ values.reshape(len(values), -1)).reshape(frames, *values.shape[1:])
+        blocks = of_frames(np.einsum("mri,mrj->mij", moved, linear.by_pose))
         inside = np.arange(width).reshape(frames, 6)
         matrix[inside[:, :, None], inside[:, None, :]] = blocks
-        pose_side = np.zeros((frames, 6))
-        np.add.at(pose_side, tracks.frame, -np.einsum("mri,mr->mi", moved, linear.residual))
-        side[:width] = pose_side.ravel()
-        shared = np.zeros((frames, 6, extra.shape[2]))
-        np.add.at(shared, tracks.frame, np.einsum("mri,mrj->mij", moved, extra))
-        matrix[:width, width:] = shared.reshape(width, -1)
+        side[:width] = of_frames(-np.einsum("mri,mr->mi", moved, linear.residual)).ravel()
+        matrix[:width, width:] = of_frames(np.einsum("mri,mrj->mij", moved, extra)).reshape(width, -1)
         matrix[width:, :width] = matrix[:width, width:].T
     weighted_extra = extra * linear.weight[:, :, None]
     matrix[width:, width:] = np.einsum("mri,mrj->ij", weighted_extra, extra)
@@ -263,9 +283,8 @@ def solve(
 ) -> Fit:
     """Minimise over points, poses where `poses_free`, and the calibration's `columns` (float64 [SIZE, k])."""
     columns = np.zeros((SIZE, 0)) if columns is None else columns
-    some = columns.shape[1] > 0
     unknowns, damping = start, FIRST_DAMPING
-    linear = linearise(tracks, unknowns, noise, some)
+    linear = linearise(tracks, unknowns, noise)
     width = 6 * len(tracks.poses) * poses_free
     free = slice(6 * poses_free, None)  # the first pose fixes the gauge
     for _ in range(iterations):
@@ -276,9 +295,11 @@ def solve(
         poses = rigid.moved(unknowns.poses, step[:width].reshape(-1, 6)) if poses_free else unknowns.poses
         points = unknowns.points + np.clip(reduced.points(step), -1.0, 1.0)
         tried = Unknowns(poses, points, unknowns.theta + columns @ step[width:])
-        if len(step):
+        there = linearise(tracks, tried, noise)
+        expected = float(np.sum(reduced.point_side**2) + reduced.side @ step)
+        if len(step) and linear.energy - there.energy < LINEAR * expected:
             tried = _with_own_points(tracks, tried, noise)
-        there = linearise(tracks, tried, noise, some)
+            there = linearise(tracks, tried, noise)
         if not there.energy < linear.energy:
             damping *= 10.0
             if damping > LAST_DAMPING:
@@ -295,7 +316,7 @@ def _with_own_points(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Unknow
     """After a step of the points alone: points follow a long step of poses and focal length on a curve, and without
     this the iteration creeps along it (embedded point iterations, Jeong et al. 2012).
     """
-    linear = linearise(tracks, unknowns, noise, theta_too=False)
+    linear = linearise(tracks, unknowns, noise)
     reduced = reduce(tracks, linear, np.zeros((SIZE, 0)), False, FIRST_DAMPING)
     return replace(unknowns, points=unknowns.points + np.clip(reduced.points(np.zeros(0)), -1.0, 1.0))
 
@@ -319,3 +340,13 @@ def start_of(tracks: Tracks) -> Unknowns:
     inverse = np.where(np.isfinite(measured), measured, np.where(known, value, middle))
     inverse = np.clip(inverse, 0.02 * middle, 20.0 * middle)
     return Unknowns(tracks.poses, np.column_stack([own[:, :2], np.log(inverse)]), np.zeros(SIZE))
+
+
+def subset(tracks: Tracks, kept: np.ndarray) -> tuple[Tracks, np.ndarray]:
+    """The tracks of which `kept`, bool [t], is true, and their numbers."""
+    rows = kept[tracks.track]
+    numbers = np.flatnonzero(kept)
+    track = (np.cumsum(kept) - 1)[tracks.track[rows]]
+    first = np.flatnonzero(np.r_[True, track[1:] != track[:-1]])
+    parts = {name: getattr(tracks, name)[rows] for name in ("frame", "pixels", "depth", "readout")}
+    return replace(tracks, **parts, track=track, first=first), numbers

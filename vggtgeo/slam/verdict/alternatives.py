@@ -3,7 +3,7 @@
 Each alternative is the run's claim with a few more free parameters. All have free poses, so that a wrong camera cannot
 hide behind poses that make up for it; they differ by what else is free (`TABLE`). They are added one after another
 (forward selection) as long as one is significant with robust covariances (`noise.py`): what explains most is first.
-Before that, corners that another motion explains are set apart (`second_motion`).
+Before that, without depth, the reversed motion is tried, and corners that another motion explains are set apart.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.adjustment import (
     CENTRE,
@@ -30,26 +29,26 @@ from vggtgeo.slam.verdict.adjustment import (
     Unknowns,
     solve,
     start_of,
+    subset,
 )
+from vggtgeo.slam.verdict.levels import LEVEL, LIKELIER, MIN_SHARE
 from vggtgeo.slam.verdict.noise import Scores, estimated, scores
 
-LEVEL = 1e-6
-"""Significance of an alternative. Seven are tried in each window."""
 MAX_ADDED = 3
 """Alternatives in one explanation."""
 MAX_TRIED = 3
 """Alternatives that are solved in each round: those of the largest predicted gain."""
-MIN_SHARE = 0.15
-"""Of the observations that must contradict the first motion before a second one is looked for."""
 WIDE = 20.0
 """Times the noise in the first steps towards a second motion, which begin far from it."""
+FIRST_STEPS = 6
+"""With that noise."""
 START = Noise(0.6, 0.03)
 """Pixels of an image of 320, relative: until residuals say more."""
 
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """A name, and which combinations of the calibration it frees: float64 [SIZE, k]."""
+    """A name, and which combinations of the calibration it frees: float64 [SIZE, k]. Two of one name are of a kind."""
 
     name: str
     columns: np.ndarray
@@ -62,13 +61,15 @@ def _rows(*places: slice | int) -> np.ndarray:
 
 TABLE = (
     Alternative("focal length", _rows(FOCAL).sum(1, keepdims=True)),
-    Alternative("zoom", _rows(FOCAL)),
+    Alternative("focal length", _rows(FOCAL)),
     Alternative("principal point", _rows(CENTRE)),
     Alternative("distortion", _rows(RADIAL)),
     Alternative("rolling shutter", _rows(READOUT)),
-    Alternative("depth factor", _rows(DRIFT)[:, 1:], needs_depth=True),
-    Alternative("depth offset", _rows(OFFSET), needs_depth=True),
+    Alternative("depth", _rows(DRIFT)[:, 1:], needs_depth=True),
+    Alternative("depth", _rows(OFFSET), needs_depth=True),
 )
+"""A focal length that is wrong, or changes; a factor of the depth that changes, or an offset. With poses alone, a
+second motion and the reversal these are eight explanations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +92,8 @@ class Explanation:
     tracks, noise: that the rest refers to, without the corners of the second motion. free: fit with free
     poses. best: with all that was added. added: in the order in which they were. share, rival: of
     the observations, explained by the first motion and by the second. second: that motion, None where there is none.
+    reversal: by how much the reversed motion is likelier than the claimed one, minus twice the log of it, with as many
+    observations as count as one; NaN where measured depth excludes it.
     """
 
     tracks: Tracks
@@ -102,15 +105,38 @@ class Explanation:
     share: float
     rival: float
     second: np.ndarray | None
+    reversal: float = np.nan
+
+    @property
+    def depth_noise(self) -> float:
+        """Relative noise of the depth in the middle of the scene."""
+        return float(self.noise.of_depth(np.nanmedian(self.tracks.depth, keepdims=True))[0])
+
+    @property
+    def reversed(self) -> bool:
+        """Whether the reversed motion is preferred."""
+        return self.reversal > LIKELIER
 
 
 def explain(tracks: Tracks) -> Explanation:
     """The preferred explanation of the tracks of a window."""
     noise = Noise(START.pixel * max(tracks.size) / 320.0, START.depth)
-    start = start_of(tracks)
-    fit = solve(tracks, solve(tracks, start, noise, poses_free=False, iterations=4).unknowns, noise)
+    fit = solve(tracks, solve(tracks, start_of(tracks), noise, poses_free=False, iterations=4).unknowns, noise)
     noise = estimated(tracks, fit, noise)
     fit = solve(tracks, fit.unknowns, noise)
+    if np.isfinite(tracks.depth).any():
+        return _with_the_rest(tracks, noise, fit)
+    other = _fit_from(tracks, reversed_poses(fit.unknowns.poses, tracks), noise)
+    likelier, rival, sign = (other, fit, 1.0) if other.energy < fit.energy else (fit, other, -1.0)
+    noise = estimated(tracks, likelier, noise)
+    likelier, rival = (solve(tracks, one.unknowns, noise) for one in (likelier, rival))
+    gain = sign * (rival.energy - likelier.energy) / scores(tracks, likelier, noise).as_one
+    found = _with_the_rest(tracks, noise, likelier if gain > LIKELIER or sign < 0 else rival)
+    return replace(found, reversal=gain)
+
+
+def _with_the_rest(tracks: Tracks, noise: Noise, fit: Fit) -> Explanation:
+    """The explanation of a motion, a second one, and what else is added."""
     chosen = _selected(tracks, noise, fit)
     rival, second = 0.0, None
     outliers = _outliers(tracks, chosen.fit)
@@ -201,29 +227,13 @@ def _outliers(tracks: Tracks, fit: Fit) -> np.ndarray:
     return np.asarray(np.add.reduceat(fit.linear.weight[:, 0], tracks.first) / views < 0.5)
 
 
-def subset(tracks: Tracks, kept: np.ndarray) -> tuple[Tracks, np.ndarray]:
-    """The tracks of which `kept`, bool [t], is true, and their numbers."""
-    rows = kept[tracks.track]
-    numbers = np.flatnonzero(kept)
-    track = (np.cumsum(kept) - 1)[tracks.track[rows]]
-    first = np.flatnonzero(np.r_[True, track[1:] != track[:-1]])
-    parts = {name: getattr(tracks, name)[rows] for name in ("frame", "pixels", "depth", "readout")}
-    return replace(tracks, **parts, track=track, first=first), numbers
-
-
 def second_motion(tracks: Tracks, noise: Noise, outliers: np.ndarray) -> tuple[float, np.ndarray | None, np.ndarray]:
     """Whether one other motion explains the corners that contradict the first: its share of all observations, its
-    poses (None where there is none), and its tracks, bool [t].
+    poses (None where there is none), and its tracks, bool [t]. Depth has no say: it may be that of either.
     """
-    own, _ = subset(tracks, outliers)
-    without = replace(own, depth=np.full(len(own.depth), np.nan))
+    own, _ = subset(replace(tracks, depth=np.full(len(tracks.depth), np.nan)), outliers)
     still = np.tile(tracks.poses[:1], (len(tracks.poses), 1, 1))
-    fits = []
-    for seen in (own, without) if np.isfinite(own.depth).any() else (without,):
-        for poses in (still, tracks.poses):
-            points = _in_chart(seen, start_of(replace(seen, poses=poses)), poses)
-            wide = solve(seen, Unknowns(poses, points, np.zeros(SIZE)), Noise(WIDE * noise.pixel, WIDE * noise.depth))
-            fits.append(solve(seen, wide.unknowns, noise))
+    fits = (_fit_from(own, poses, noise) for poses in (still, tracks.poses))
     other = max(fits, key=lambda one: float(one.linear.weight[:, 0].sum()))
     explained = ~_outliers(own, other)
     theirs = np.zeros(len(tracks.first), bool)
@@ -240,12 +250,37 @@ def _predicts(tracks: Tracks, motion: Fit, noise: Noise) -> bool:
     fit them, whatever they do.
     """
     half = np.arange(len(tracks.first)) % 2 == 0
-    first, kept = subset(replace(tracks, depth=np.full(len(tracks.depth), np.nan)), half)
+    first, kept = subset(tracks, half)
     fit = solve(first, replace(motion.unknowns, points=motion.unknowns.points[kept]), noise)
-    second, kept = subset(replace(tracks, depth=np.full(len(tracks.depth), np.nan)), ~half)
+    second, kept = subset(tracks, ~half)
     start = replace(fit.unknowns, points=motion.unknowns.points[kept])
     predicted = solve(second, start, noise, poses_free=False)
     return float(np.mean(~_outliers(second, predicted))) > 0.5
+
+
+def reversed_poses(poses: np.ndarray, tracks: Tracks) -> np.ndarray:
+    """Poses [f, 4, 4] that show nearly the same with near and far exchanged.
+
+    The steps across the view change their sign, and turns make up for it at the scene's distance `d`: with a step `t`
+    since the first frame the turn is `2 / d e_z x t` more, and an inverse depth `1/z` becomes `2/d - 1/z`. Images tell
+    the two apart by what is of second order in the angle of view (Koenderink and van Doorn, 1991).
+    """
+    since = poses @ rigid.invert(poses[0])
+    inverse = float(np.median(np.exp(start_of(replace(tracks, poses=poses)).points[:, 2])))
+    moved = since.copy()
+    across = since[:, :3, 3] * [1.0, 1.0, 0.0]
+    turns = Rotation.from_rotvec(2.0 * inverse * np.cross([0.0, 0.0, 1.0], across)).as_matrix()
+    moved[:, :3, :3] = turns @ since[:, :3, :3]
+    moved[:, :3, 3] = since[:, :3, 3] - 2.0 * across
+    return np.asarray(moved @ poses[0])
+
+
+def _fit_from(tracks: Tracks, poses: np.ndarray, noise: Noise) -> Fit:
+    """The fit with free poses that is begun far from it, at these."""
+    points = _in_chart(tracks, start_of(replace(tracks, poses=poses)), poses)
+    wide = Noise(WIDE * noise.pixel, WIDE * noise.depth)
+    near = solve(tracks, Unknowns(poses, points, np.zeros(SIZE)), wide, iterations=FIRST_STEPS)
+    return solve(tracks, near.unknowns, noise)
 
 
 def _in_chart(tracks: Tracks, start: Unknowns, poses: np.ndarray) -> np.ndarray:
@@ -257,54 +292,3 @@ def _in_chart(tracks: Tracks, start: Unknowns, poses: np.ndarray) -> np.ndarray:
     moved = np.einsum("tij,tj->ti", relative[:, :3, :3], local) + relative[:, :3, 3]
     z = np.maximum(moved[:, 2], 1e-3)
     return np.column_stack([moved[:, 0] / z, moved[:, 1] / z, -np.log(z)])
-
-
-@dataclass(frozen=True)
-class Consequence:
-    """How far a motion is from the claim, RMS over frames, and the standard deviations of the same.
-
-    places: after alignment, in the unit of the map. turn: from frame to frame, rad.
-    """
-
-    places: float
-    places_sigma: float
-    turn: float
-    turn_sigma: float
-
-
-def consequence(explanation: Explanation, free_scale: bool) -> Consequence:
-    """Of the preferred explanation, as both halves of the tracks confirm it.
-
-    Each half is fitted by itself, from the claimed poses, so that both do not begin at one wrong minimum. Errors of
-    tracks, mistracked corners among them, are independent between the halves: the mean product of what both differ from
-    the claim by is free of their noise, and half of what they differ from each other by is the standard deviation of
-    their mean.
-    """
-    tracks, best = explanation.tracks, explanation.best
-    halves = []
-    for half in (0, 1):
-        some, _ = subset(tracks, np.arange(len(tracks.first)) % 2 == half)
-        start = replace(start_of(some), theta=best.unknowns.theta)
-        fit = solve(some, start, explanation.noise, best.columns)
-        halves.append(_differences(fit.unknowns.poses, tracks.poses, free_scale))
-    values = []
-    for first, second in zip(*halves, strict=True):
-        values.append(np.sqrt(max(float(np.mean(np.sum(first * second, 1))), 0.0)))
-        values.append(0.5 * np.sqrt(float(np.mean(np.sum((first - second) ** 2, 1)))))
-    return Consequence(*map(float, values))
-
-
-def difference(explanation: Explanation, free_scale: bool) -> tuple[float, float]:
-    """Places and turns by which the preferred explanation differs from the claim, RMS, noise included."""
-    off = _differences(explanation.best.unknowns.poses, explanation.tracks.poses, free_scale)
-    places, turn = (float(np.sqrt(np.mean(np.sum(one**2, 1)))) for one in off)
-    return places, turn
-
-
-def _differences(poses: np.ndarray, claimed: np.ndarray, free_scale: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Of the places after alignment, float64 [f, 3], and of the turns from frame to frame, rad, [f - 1, 3]."""
-    places, theirs = rigid.invert(poses)[:, :3, 3], rigid.invert(claimed)[:, :3, 3]
-    fitted = umeyama(places, theirs, free_scale)
-    step = lambda poses: poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)
-    turns = Rotation.from_matrix(step(poses) @ np.swapaxes(step(claimed), 1, 2)).as_rotvec()
-    return fitted.scale * places @ fitted.rotation.T + fitted.translation - theirs, np.asarray(turns)

@@ -62,3 +62,9 @@ class Claim:
     def centres(self) -> np.ndarray:
         """Camera centres, float64 [n, 3]."""
         return rigid.invert(self.poses)[:, :3, 3]
+
+
+def extent(poses: np.ndarray) -> float:
+    """RMS distance of the places from their mean, of poses world -> camera [n, 4, 4]."""
+    places = rigid.invert(poses)[:, :3, 3]
+    return float(np.sqrt(np.mean(np.sum((places - places.mean(0)) ** 2, 1))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -27,6 +27,29 @@ class Finding:
     end: int | None = None
     scale: bool = False
     local: bool = False
+
+
+@dataclass(frozen=True)
+class Noted:
+    """An alternative that is significant, but without consequence.
+
+    check: its name. start, end: first and last frame concerned. estimate, sigma: of its parameters (natural units:
+    metres, seconds, logarithms). places: by how much the places would differ, in the unit of the map; turn: the turns
+    from frame to frame, rad.
+    """
+
+    check: str
+    start: int
+    end: int
+    estimate: tuple[float, ...]
+    sigma: tuple[float, ...]
+    places: float
+    turn: float
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The inverse of `dataclasses.asdict`."""
+        return cls(**{**values, "estimate": tuple(values["estimate"]), "sigma": tuple(values["sigma"])})
 
 
 @dataclass(frozen=True)
@@ -62,7 +85,7 @@ class Verdict:
 
     level: "good"; "degraded", something contradicts the result or is missing from it; "failed", it is not to be used.
     reasons: one sentence each, the worst first. segments: the run by time, in order, without gaps. metric: False where
-    lengths are not metres, or doubtful.
+    lengths are not metres, or doubtful. noted: what is significant and without consequence.
 
     Example:
         >>> import vggtgeo as vg
@@ -75,6 +98,7 @@ class Verdict:
     reasons: tuple[str, ...] = ()
     segments: tuple[Segment, ...] = ()
     metric: bool = True
+    noted: tuple[Noted, ...] = ()
 
     def __repr__(self) -> str:
         return f"Verdict({': '.join((self.level, '; '.join(self.reasons))) if self.reasons else self.level})"
@@ -85,13 +109,15 @@ class Verdict:
             "level": self.level,
             "reasons": list(self.reasons),
             "segments": [segment.to_dict() for segment in self.segments],
+            "noted": [asdict(one) for one in self.noted],
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], metric: bool = True) -> Self:
         """The inverse of `to_dict`."""
         segments = tuple(Segment.from_dict(segment) for segment in values["segments"])
-        return cls(values["level"], tuple(values["reasons"]), segments, metric)
+        noted = tuple(Noted.from_dict(one) for one in values.get("noted", ()))
+        return cls(values["level"], tuple(values["reasons"]), segments, metric, noted)
 
 
 def worst(levels: Iterable[Level]) -> Level:

@@ -8,7 +8,7 @@ from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.slam.perception.still_parts import StillParts
 from vggtgeo.slam.verdict.finding import Finding
-from vggtgeo.slam.verdict.record import MAX_LOST
+from vggtgeo.slam.verdict.levels import MAX_LOST
 
 
 def check_refusals(refusals: Mapping[str, Refusals]) -> tuple[Finding, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -13,19 +14,16 @@ from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import STRONG_INLIERS
 from vggtgeo.slam.verdict.alternatives import Explanation, explain
-from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.decision import extent, findings
-from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
-from vggtgeo.slam.verdict.record import MAX_LOST, check_record
+from vggtgeo.slam.verdict.claim import Claim, extent
+from vggtgeo.slam.verdict.decision import findings, noted
+from vggtgeo.slam.verdict.finding import Finding, Noted, Verdict, conclude
+from vggtgeo.slam.verdict.levels import MAX_LOST, MAX_UNKNOWN, NEAREST
+from vggtgeo.slam.verdict.record import check_frozen, check_record
 from vggtgeo.slam.verdict.windows import linked, thinned, tracks_of, windows
 from vggtgeo.slam.verdict.witness import Evidence, FrameEvidence
 
 MIN_FRAMES = 4
 """Frames of a window; in fewer, free poses explain nearly all."""
-NEAREST = 0.2
-"""Metres: sensors for rooms see nothing nearer."""
-MAX_UNKNOWN = 0.55
-"""Median standard deviation of the places over their spread, beyond which a path without depth has no shape."""
 
 
 def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
@@ -42,12 +40,17 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     known = frame_uncertainty(slam) if slam.keyframes else None
     found += check_extent(claim, None if known is None else known.translation)
     corners = aligned(slam, claim, evidence) if claim.started and len(claim) > 1 else None
+    without_consequence: list[Noted] = []
     if corners is not None:
-        found += check_unit(claim, corners)
+        found += [*check_unit(claim, corners), *check_frozen(claim, corners)]
         stretches = linked(corners, claim.tracked)
         found += unlinked(slam, claim, stretches)
-        found += findings(claim, explanations(slam, claim, corners, stretches))
-    return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
+        explained = explanations(slam, claim, corners, stretches)
+        stated = np.zeros(1) if known is None else known.translation[np.isfinite(known.translation)]
+        found += findings(claim, explained, float(np.median(stated)) if len(stated) else 0.0)
+        without_consequence = noted(claim, explained)
+    verdict = conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
+    return replace(verdict, noted=tuple(without_consequence))
 
 
 def judge_or_report(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:

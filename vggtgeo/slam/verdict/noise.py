@@ -1,7 +1,7 @@
 """The noise model of the verdict, estimated from the run itself. Everything that is called significant uses this file.
 
-- A corner has the standard deviation `pixel`, a measured depth `depth` (relative), both by the median absolute
-  deviation of the residuals with free poses, corrected for the unknowns that these residuals determine.
+- A corner has the standard deviation `pixel`, a measured depth `hypot(depth, growth z)` (relative), both by the median
+  absolute deviation of the residuals with free poses, corrected for the unknowns that these residuals determine.
 - The depth errors of a track are common to it (an edge, a material): `n` depths of a track weigh as one.
 - Errors are not independent along a track, which drifts, nor within a frame. So covariances are cluster-robust, by
   track and by frame (two-way, Cameron, Gelbach & Miller 2011): with the score `g_o` of each observation, and `H` the
@@ -31,10 +31,21 @@ def estimated(tracks: Tracks, fit: Fit, noise: Noise) -> Noise:
     freedom = max(2 * count - unknowns, 0.3 * count)
     pixel = noise.pixel * _deviation(fit.linear.residual[:, :2]) * np.sqrt(2 * count / freedom)
     known = np.isfinite(tracks.depth)
-    depth = noise.depth
+    depth, growth = noise.depth, 0.0
     if known.any():
-        depth *= _deviation(fit.linear.residual[known, 2] * np.sqrt(tracks.depths[known]))
-    return Noise(max(float(pixel), MIN_PIXEL), max(float(depth), MIN_DEPTH))
+        metres = tracks.depth[known]
+        error = fit.linear.residual[known, 2] * np.sqrt(tracks.depths[known]) * noise.of_depth(metres)
+        depth, growth = _growing(np.abs(error), metres)
+    return Noise(max(float(pixel), MIN_PIXEL), max(depth, MIN_DEPTH), growth)
+
+
+def _growing(error: np.ndarray, metres: np.ndarray) -> tuple[float, float]:
+    """Standard deviation at no distance, and its growth a metre, by the nearer and the farther half."""
+    near = metres <= np.median(metres)
+    parts = [(_deviation(error[part]), float(np.mean(metres[part] ** 2))) for part in (near, ~near) if part.any()]
+    (first, close), (second, far) = parts[0], parts[-1]
+    growth = max(second**2 - first**2, 0.0) / max(far - close, 1e-12)
+    return float(np.sqrt(max(first**2 - growth * close, 0.0))), float(np.sqrt(growth))
 
 
 def _deviation(values: np.ndarray) -> float:

@@ -7,21 +7,20 @@ relocalized by `a T^2 / 2`. The RMS over all frames is the effect on the traject
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
-from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.claim import Claim, extent
 from vggtgeo.slam.verdict.finding import Finding, spans
+from vggtgeo.slam.verdict.levels import ACCELERATION, MAX_BRIDGED, MAX_LOST, MIN_TRACKED, SHARE, UNMOVED
+from vggtgeo.slam.verdict.windows import MIN_COMMON
+from vggtgeo.slam.verdict.witness import FrameEvidence
 
-ACCELERATION = 1.0
-"""m/s^2, of a hand-held camera."""
-MAX_BRIDGED = 0.04
-"""Metres, RMS over all frames, that bridges may cost."""
-MAX_LOST = 0.10
-"""Share of the frames that may be lost in a good run."""
-MIN_TRACKED = 0.5
-"""Share of the frames below which the run has failed."""
+AROUND = 3
+"""Steps before and after a picture that is shown again, which tell the speed."""
 MAX_SENTENCES = 5
 """Lost stretches that have a sentence each."""
 
@@ -69,6 +68,37 @@ def _lost(claim: Claim) -> list[Finding]:
     if share < MIN_TRACKED:
         found.append(Finding("lost", "failed", f"only {100 * share:.0f} % of the frames were tracked"))
     return found
+
+
+def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
+    """Pictures that were shown again while the camera moved on.
+
+    Where a camera is at rest, the noise of a new picture still moves its corners a little: all of them in the very
+    same place have no likelihood but that of the same picture. Meanwhile the camera goes on as before and after.
+    """
+    repeated = np.array([False, *(_same(*pair) for pair in pairwise(corners))], bool)
+    speeds = np.linalg.norm(np.diff(claim.centres, axis=0), axis=1) / np.maximum(np.diff(claim.times), 1e-9)
+    squares, found = 0.0, []
+    for first, last in spans(repeated & claim.tracked):
+        around = range(max(first - 1 - AROUND, 0), min(last + AROUND, len(speeds)))
+        moving = [speeds[row] for row in around if not repeated[row + 1]]
+        seconds = float(claim.times[last] - claim.times[first - 1])
+        off = seconds * float(np.median(moving)) if moving else 0.0
+        squares += (last - first + 1) * off**2 / 3
+        found.append(f"{claim.frames[first]} to {claim.frames[last]}")
+    off = float(np.sqrt(squares / max(len(claim), 1)))
+    if not found or off <= (MAX_BRIDGED if claim.metric else SHARE * extent(claim.poses[claim.tracked])):
+        return []
+    told = ", ".join(found[:MAX_SENTENCES])
+    text = f"frames {told} show the picture before them again, while the camera moved; film them again"
+    return [Finding("frozen", "degraded", text)]
+
+
+def _same(before: FrameEvidence, after: FrameEvidence) -> bool:
+    """Whether two frames show one picture: most of their corners did not move at all."""
+    _, first, second = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
+    moved = np.abs(before.pixels[first] - after.pixels[second]).max(1, initial=0.0)
+    return len(first) >= MIN_COMMON and bool(np.median(moved) < UNMOVED)
 
 
 def _never_started(claim: Claim) -> str:

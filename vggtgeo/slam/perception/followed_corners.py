@@ -1,0 +1,120 @@
+"""Corners followed from image to image (Lucas & Kanade, 1981), on images of 320 pixels.
+
+About 4 ms a frame (640 x 480).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+WIDTH = 320
+"""Pixels of the longer side of the images that corners are followed in."""
+CELL = 20
+"""Pixels of these images a side of a cell. A cell holds one track: a poster does not outvote the walls around it."""
+MIN_CORNER = 2e-5
+"""Smallest eigenvalue of the structure tensor (OpenCV's unit). White noise of 3 grey levels gives 1e-5."""
+CONTRAST = 50.0
+"""Grey levels, standard deviation."""
+AROUND = 19
+"""Pixels of these images, side of the square (twice) whose mean is the brightness around a pixel."""
+LIGHT_REMOVED = 0.7
+"""Share of that brightness that is taken away. With more, or a smaller square, little is left to follow on white walls,
+whose shades are soft, and in pictures that are smeared (`benchmarks/followed_corners.py`)."""
+DARKEST = 0.3
+"""Of the mean brightness: darker surroundings are not made brighter than this allows; they are noise."""
+BANDS = 8.0
+"""Grey levels of these images by which two in a row must differ (root mean square over the rows) in what is common to
+a row, for bands of light to be looked for. Without any 0.5 to 4.6 in the middle of a clip, 13 in turns; with 10 to 28
+(`benchmarks/followed_corners.py`)."""
+MORE = 1.2
+"""Times as many corners come back without them: then these are bands."""
+ROUND_TRIP = 0.5
+"""Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
+PATCH = (15, 15)
+_FLOW = {
+    "winSize": PATCH,
+    "maxLevel": 4,
+    "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),
+}
+
+
+def follow(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where corners of one grey image are in the next, float32 [m, 2], and which of them came back when asked."""
+    start = pixels.reshape(-1, 1, 2)
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None, **_FLOW)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **_FLOW)
+    off = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
+    moved = there.reshape(-1, 2)
+    height, width = after.shape
+    inside = (moved > 4).all(1) & (moved < (width - 5, height - 5)).all(1)
+    return moved, (ok.ravel() == 1) & (again.ravel() == 1) & (off < ROUND_TRIP) & inside
+
+
+def follow_through_bands(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `follow`, where lamps may have flickered while the rows (of a picture that was turned: the columns) were read:
+    without what most of a row has in common with the change, if that helps.
+    """
+    moved, kept = follow(before, after, pixels)
+    bands = common_to_rows(before, after)
+    if np.sqrt(np.mean(bands**2)) <= BANDS:
+        return moved, kept
+    steady = np.clip(after - bands, 0, 255).astype(np.uint8)
+    others, again = follow(before, steady, pixels)
+    return (others, again) if np.count_nonzero(again) > MORE * np.count_nonzero(kept) else (moved, kept)
+
+
+def common_to_rows(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """By how much most of each row (column, of an upright picture) became brighter: float64 [h, 1] ([1, w])."""
+    along = 1 if after.shape[1] >= after.shape[0] else 0
+    some = (slice(None), slice(None, None, 4)) if along else (slice(None, None, 4), slice(None))
+    return np.asarray(np.median(after[some].astype(np.int16) - before[some], axis=along, keepdims=True))
+
+
+def one_a_cell(ids: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The oldest track of each cell; ids grow with time, and rows are in their order."""
+    cells = (pixels // CELL).astype(int)
+    _, first = np.unique(cells[:, 0] + 10_000 * cells[:, 1], return_index=True)
+    kept = np.sort(first)
+    return ids[kept], pixels[kept]
+
+
+def new_corners(grey: np.ndarray, taken: np.ndarray) -> np.ndarray:
+    """The strongest corner of each cell that holds none of `taken`, float32 [m, 2]."""
+    strength = cv2.cornerMinEigenVal(grey, 5)
+    rows, columns = grey.shape[0] // CELL, grey.shape[1] // CELL
+    cells = strength[: rows * CELL, : columns * CELL].reshape(rows, CELL, columns, CELL)
+    cells = cells.transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+    best = cells.argmax(2)
+    free = cells.max(2) > MIN_CORNER
+    x, y = np.clip(taken // CELL, 0, (columns - 1, rows - 1)).astype(int).T
+    free[y, x] = False
+    row, column = np.nonzero(free)
+    inner = best[row, column]
+    return np.column_stack([column * CELL + inner % CELL, row * CELL + inner // CELL]).astype(np.float32)
+
+
+def small_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Width and height of the image that corners are followed in; shape: of the one that was read."""
+    scale = max(shape) / WIDTH
+    height, width = (max(round(side / scale), 2 * CELL) for side in shape)
+    return width, height
+
+
+def small_grey(image: np.ndarray) -> np.ndarray:
+    """The image that corners are followed in, uint8.
+
+    Lucas and Kanade compare grey levels, and a camera changes its exposure, a lamp flickers: so each pixel is compared
+    with the brightness around it. Not with that of its row, which bands of light would call for: what enters a row far
+    away would then move its corners.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    small = cv2.resize(grey, small_size(grey.shape), interpolation=cv2.INTER_AREA)
+    mean, deviation = max(float(small.mean()), 1.0), float(small.std())
+    square = (AROUND, AROUND)
+    levels = small.astype(np.float32)
+    around = cv2.blur(cv2.blur(levels, square), square)
+    detail = levels - LIGHT_REMOVED * around - (1 - LIGHT_REMOVED) * mean
+    detail *= mean / np.maximum(around, DARKEST * mean)
+    gain = min(CONTRAST / max(deviation, 1e-3), 4.0)
+    return np.clip(gain * detail + 128.0, 0, 255).astype(np.uint8)
