@@ -118,7 +118,7 @@ def _check_features(features: Features, shape: tuple[int, int]) -> None:
 def _check_slots(name: str, slots: Slots, count: int) -> None:
     check_array(f"pixels of {name}", slots.pixels, (count, 2))
     _check_near(f"pixels of {name}", slots.pixels)
-    for field in ("inverse_depth", "prior", "sigma"):
+    for field in ("inverse_depth", "prior", "sigma", "deviation"):
         check_array(f"{field} of {name}", getattr(slots, field), (count,), finite=False)
         _check_not_negative(f"{field} of {name}", getattr(slots, field))
     if ((slots.sigma == 0) & (slots.prior > 0)).any():

@@ -77,7 +77,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All that a file may name; a state with anything else in it is not written."""
-VERSION = 15
+VERSION = 16
 STATE = Layout("state", VERSION, by_name(STATE_CLASSES))
 
 

@@ -12,6 +12,9 @@ from vggtgeo.models.roles import LineMatches, PointMatches, RelativeView
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
+GATE_SIGMA = 4.0
+"""Standard deviations that a gate of matches stands for."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -125,7 +128,8 @@ def _consistent(
     """
     inverse = first.points.inverse_depth[points.index_i]
     ray = pinhole.rays(points.pixels_i, intrinsics)
-    known = np.isfinite(inverse)
+    length, focal = float(np.linalg.norm(relative[:3, 3])), float(intrinsics[0])
+    known = first.points.known_for(length, focal, settings.matching.match_gate / GATE_SIGMA)[points.index_i]
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
     off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)
     epipolar = pinhole.epipolar_distance(points.pixels_i, points.pixels_j, relative, intrinsics)
