@@ -474,10 +474,15 @@ def test_pieces_that_never_met_join_at_the_end(torn: tuple[Slam, Slam]) -> None:
 
 
 def _check_joined(whole: Slam, joined: Slam) -> None:
-    """One submap, each keyframe where it was to 5 cm, and its depths what they were to 5 %."""
+    """One submap, each keyframe where it was as seen from the first one, to 5 cm, and depths to 5 %, in the
+    unit of the first.
+    """
     assert len(joined.map.roots) == 1, joined.notes
     assert len(set(piece_of(joined.map))) == 1
+    first, now = whole.keyframes[0], joined.keyframes[0]
+    unit = float(np.nanmedian(now.points.inverse_depth / first.points.inverse_depth))
     for before, after in zip(whole.keyframes, joined.keyframes, strict=True):
-        off = np.linalg.norm(rigid.centre(before.pose) - rigid.centre(after.pose))
+        expected, found = before.pose @ rigid.invert(first.pose), after.pose @ rigid.invert(now.pose)
+        off = np.linalg.norm(expected[:3, 3] - unit * found[:3, 3])
         assert off < 0.05, f"keyframe {before.number} is {100 * off:.1f} hundredths of the unit off"
-        np.testing.assert_allclose(after.points.inverse_depth, before.points.inverse_depth, rtol=0.05)
+        np.testing.assert_allclose(after.points.inverse_depth, unit * before.points.inverse_depth, rtol=0.05)
