@@ -175,7 +175,7 @@ def track_by_rays(given: TrackingInput, keyframe: Keyframe, length: float) -> Tr
     length: of the motion between both, by the motion so far.
     """
     matches = given.roles.points.match(keyframe.features, given.data.features)
-    found = two_view_motion(keyframe, matches, length, given.intrinsics, given.roles.geometry, PIXEL_SIGMA)
+    found = two_view_motion(matches, length, given.intrinsics, given.roles.geometry, PIXEL_SIGMA)
     if found is None:
         return None
     agree = int(np.count_nonzero(found.inliers))

@@ -2,7 +2,8 @@
 share much, and three share nothing.
 
 The essential matrix of the matches gives the rotation and the direction of the translation. Its length is that of the
-depths that are known, few as they are, and of the motion so far: the mean of both by information, over the logarithm.
+motion so far: of depths that are known there are too few to place the frame, and what so few say of a length is no
+measurement.
 The information of the motion is that of the matches, the depth of each eliminated: with the rows `J` of a projection
 over the left tangent and its column `c` over the inverse depth of the point, `sum J^T (I - c c^T / c^T c) J / sigma^2`.
 It says nothing of the length, so that of the length is added. Where all points are far away it says little of the
@@ -21,9 +22,6 @@ from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import STEP_GROWTH
 
-LEAST_KNOWN = 3
-"""Depths that tell a length: the median of fewer is any of them."""
-
 
 @dataclass(frozen=True, eq=False)
 class TwoViewMotion:
@@ -38,14 +36,9 @@ class TwoViewMotion:
 
 
 def two_view_motion(
-    keyframe: Keyframe,
-    matches: PointMatches,
-    length: float,
-    intrinsics: np.ndarray,
-    geometry: InitialGeometry,
-    sigma: float,
+    matches: PointMatches, length: float, intrinsics: np.ndarray, geometry: InitialGeometry, sigma: float
 ) -> TwoViewMotion | None:
-    """The motion to a frame by its matches with a keyframe; None where they do not determine one.
+    """The motion from a keyframe to a frame by their matches; None where these do not determine one.
 
     length: of the motion by the motion so far. sigma: standard deviation of a match, pixels.
     """
@@ -54,13 +47,12 @@ def two_view_motion(
         return None
     if not (length > 0 and guess.inliers.any()):
         return None
-    length, spread = _length(keyframe, matches.index_i, guess.points, guess.inliers, length)
     motion = guess.pose.copy()
     motion[:3, 3] *= length
     points = length * guess.points
     information = _without_length(points[guess.inliers], motion, intrinsics) / sigma**2
     along = np.append(motion[:3, 3], np.zeros(3))
-    information += np.outer(along, along) / (spread * length * length) ** 2
+    information += np.outer(along, along) / (STEP_GROWTH * length * length) ** 2
     return TwoViewMotion(motion, information, guess.inliers, points)
 
 
@@ -71,22 +63,6 @@ def usual_step(keyframes: tuple[Keyframe, ...], frame: int) -> float:
     before, last = keyframes[-2:]
     apart = np.linalg.norm(rigid.centre(last.pose) - rigid.centre(before.pose))
     return float(apart) * (frame - last.frame) / max(last.frame - before.frame, 1)
-
-
-def _length(
-    keyframe: Keyframe, slots: np.ndarray, points: np.ndarray, inliers: np.ndarray, expected: float
-) -> tuple[float, float]:
-    """The length of a motion whose points [n, 3] are known in its unit, and the deviation of its logarithm."""
-    known = inliers & keyframe.points.determined[slots]
-    if np.count_nonzero(known) < LEAST_KNOWN:
-        return expected, STEP_GROWTH
-    logs = -np.log(keyframe.points.inverse_depth[slots[known]] * points[known, 2])
-    middle = float(np.median(logs))
-    # Standard error of a median: 1.25 sigma / sqrt(n), sigma from the median absolute deviation.
-    error = 1.25 * 1.48 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
-    weights = np.array([STEP_GROWTH, max(error, 1e-3)]) ** -2
-    mean = weights @ [np.log(expected), middle] / weights.sum()
-    return float(np.exp(mean)), float(weights.sum() ** -0.5)
 
 
 def _without_length(points: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
