@@ -17,23 +17,24 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections import deque
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
 import cv2
+import jax
 import numpy as np
 import pycolmap
 from vggtgeo.models.classical import SiftMatcher, place_vector
 
-import vggtgeo as vg
 from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation.absolute import absolute_error
 from vggtgeo.evaluation.association import associate
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.slam.run import default_roles, frame_trajectory
+from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run
 from vggtgeo.slam.submaps import pieces_by_size
 
 NEIGHBOURS, ALIKE = 10, 10
@@ -52,7 +53,8 @@ class Run:
 def main() -> None:
     """Run both over every clip, and print a table."""
     options = _options()
-    pycolmap.logging.minloglevel = pycolmap.logging.WARNING
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR
+    jax.config.update("jax_enable_x64", True)
     print("| clip | run | largest piece | all | pieces | ATE Sim(3), cm | % of the path | s |\n" + "|---" * 8 + "|")
     for path in options.clips:
         sequence = open_sequence(path)
@@ -76,7 +78,8 @@ def main() -> None:
 def _ours(frames: list[Frame], sequence: Sequence, seed: int, unknown: bool) -> Run:
     began = time.monotonic()
     camera = None if unknown else sequence.camera
-    slam = vg.reconstruct(frames, roles=default_roles(False).seeded(seed), camera=camera, dense="none").slam
+    roles = default_roles(False).seeded(seed)
+    slam = finish(deque(run(frames, roles, camera=camera), maxlen=1).pop(), roles)
     pieces = [frame_trajectory(slam, piece) for piece in range(len(pieces_by_size(slam)))]
     return Run(f"ours, seed {seed}", pieces, time.monotonic() - began)
 
