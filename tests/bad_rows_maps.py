@@ -31,7 +31,7 @@ CAMERA = np.array([55.0, 55.0, 31.5, 23.5])
 def slots(count: int) -> Slots:
     """Points at 2 m."""
     half, one = np.full(count, 0.5), np.ones(count)
-    return Slots(pixels(count), half, half, 0.1 * half, one, one)
+    return Slots(pixels(count), half, half, 0.1 * half, one, one, 0.1 * half)
 
 
 def pixels(count: int) -> np.ndarray:

@@ -47,7 +47,7 @@ def moved(pose: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 def keyframe(number: int, pose: np.ndarray, depth: np.ndarray, sigma: float = 0.01) -> Keyframe:
     """A keyframe that has seen depth alone, of relative standard deviation `sigma`."""
     none, nobody = np.zeros(0), np.zeros((0, 2))
-    slots = Slots(nobody, none, none, none, none, none)
+    slots = Slots(nobody, none, none, none, none, none, none)
     segments = Segments(np.zeros((0, 2, 2)), none)
     return Keyframe(
         number=number,

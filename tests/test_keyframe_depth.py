@@ -20,7 +20,7 @@ def keyframe(number: int, depth: np.ndarray, slots: Slots | None = None) -> Keyf
     none = np.zeros(0)
     pose = np.eye(4)
     pose[0, 3] = -0.02 * number
-    empty = Slots(np.zeros((0, 2)), none, none, none, none, none)
+    empty = Slots(np.zeros((0, 2)), none, none, none, none, none, none)
     return Keyframe(
         number=number,
         frame=number,
@@ -73,7 +73,7 @@ def test_slots_correct_what_is_around_them() -> None:
     count, inverse = len(rows), 1 / prior[rows, columns]
     pixels = np.column_stack([columns, rows]).astype(np.float64)
     one = np.ones(count)
-    slots = Slots(pixels, np.full(count, 1 / WALL), inverse, 0.05 * inverse, one, one)
+    slots = Slots(pixels, np.full(count, 1 / WALL), inverse, 0.05 * inverse, one, one, np.nan * one)
     error = lambda depth: np.sqrt(np.mean((depth - WALL) ** 2))
     assert error(optimised_depth(keyframe(0, prior, slots))) < 0.5 * error(prior)
     assert error(optimised_depth(keyframe(0, prior, slots), np.full(SIZE, 1.02 * WALL, np.float32))) < 0.01 * WALL

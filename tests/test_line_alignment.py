@@ -68,9 +68,10 @@ def _keyframe(points: np.ndarray, rng: np.random.Generator, sigma: float) -> Key
     inverse = 1.0 / points[..., 2]
     inverse = inverse * (1.0 + sigma * rng.normal(size=inverse.shape))
     on_line = inverse[segment, 0] + fraction * (inverse[segment, 1] - inverse[segment, 0])
-    samples = Slots(pixels, on_line, on_line, sigma * on_line, np.ones_like(on_line), np.ones_like(on_line))
+    ones = np.ones_like(on_line)
+    samples = Slots(pixels, on_line, on_line, sigma * on_line, ones, ones, np.nan * ones)
     none, image = np.zeros(0), np.zeros((*SIZE[::-1], 3), np.uint8)
-    points_slots = Slots(np.zeros((0, 2)), none, none, none, none, none)
+    points_slots = Slots(np.zeros((0, 2)), none, none, none, none, none, none)
     blank = np.zeros(image.shape[:2], np.float16)
     images = KeyframeImages(image, blank, blank, blank.astype(np.uint8))
     features = Features(np.zeros((0, 2)), none)
@@ -182,7 +183,7 @@ def test_points_and_lines_make_an_edge_together(points: int, lines: int, joined:
     keyframe = replace(
         known,
         features=Features(pixels, np.ones(20)),
-        points=Slots(pixels, third, third, 0.02 * third, np.ones(20), np.ones(20)),
+        points=Slots(pixels, third, third, 0.02 * third, np.ones(20), np.ones(20), np.full(20, np.nan)),
     )
     roles = Roles(points=_FirstPoints(points), line_matches=_FirstLines(lines))
     pair = match_keyframes(keyframe, replace(keyframe, number=1), roles, INTRINSICS)

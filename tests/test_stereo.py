@@ -36,7 +36,7 @@ SMOOTH, JUMP = 0.04, 0.5
 
 def slots_of(pixels: np.ndarray, inverse: np.ndarray) -> Slots:
     one = np.ones(len(inverse))
-    return Slots(pixels, inverse, inverse, 0.01 * inverse, one, one)
+    return Slots(pixels, inverse, inverse, 0.01 * inverse, one, one, np.nan * one)
 
 
 def keyframe_of(number: int, image: np.ndarray, pose: np.ndarray, points: Slots, depth: np.ndarray) -> Keyframe:

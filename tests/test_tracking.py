@@ -20,6 +20,7 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.global_map.join_at_end import join_at_end
 from vggtgeo.slam.global_map.join_submaps import join_pieces, scaled_piece
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.perception.description import Description
@@ -30,6 +31,7 @@ from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import updated
+from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking import relocalisation
@@ -43,6 +45,7 @@ SETTINGS = SlamSettings(
     refinement=RefinementSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
+FREE_ROLES = replace(ROLES, depth=NoDepth())
 Room = tuple[list[Frame], Camera, Trajectory]
 
 
@@ -425,16 +428,16 @@ def test_pieces_join_where_they_meet(room: Room) -> None:
     assert _error(slam, Trajectory(times, truth.poses[numbers])) < 0.04
 
 
-def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
-    """The second half of a map whose scale is free, 1.6 times too large and elsewhere, comes back where it was when its
-    newest keyframe shows the first half. Oracle: the map before it was taken apart.
+@pytest.fixture(scope="module")
+def torn(room: Room) -> tuple[Slam, Slam]:
+    """A map whose scale is free, and the same with its last third 1.6 times too large, elsewhere, and joined to
+    the rest by nothing.
     """
     frames, camera, _ = room
-    roles = replace(ROLES, depth=NoDepth())
     seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:16], *frames[14:4:-1]))]
     whole = _run(seen, camera)
     whole = replace(whole, map=replace(whole.map, metric=False))
-    origin = len(whole.keyframes) // 2
+    origin = 2 * len(whole.keyframes) // 3
     own = lambda ends: len({number < origin for number in ends}) == 1
     torn_apart = replace(
         whole,
@@ -445,16 +448,41 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room) -> None:
             factors=tuple(factor for factor in whole.map.factors if own(factor.keyframes)),
         ),
     )
-    apart = scaled_piece(torn_apart, 1.6)
+    apart = scaled_piece(torn_apart, 1.6, lambda number: number >= origin)
     moved = np.eye(4)
     moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
     moved[:3, 3] = [0.5, -1.0, 2.0]
-    torn = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
+    keyframes = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
+    return whole, replace(apart, map=replace(apart.map, keyframes=keyframes))
+
+
+def test_pieces_of_free_scale_join_by_a_similarity(room: Room, torn: tuple[Slam, Slam]) -> None:
+    """The last third of a map whose scale is free, 1.6 times too large and elsewhere, comes back where it was when its
+    newest keyframe shows the rest. Oracle: the map before it was taken apart.
+    """
+    whole, apart = torn
     newest = whole.keyframes[-1]
-    data = FrameData(seen[newest.frame], Description.of(newest.features), None)
-    joined = join_pieces(replace(apart, map=replace(apart.map, keyframes=torn)), data, roles, SETTINGS)
-    assert joined.map.roots == (0,), joined.notes
-    for before, after in zip(whole.keyframes[origin:], joined.keyframes[origin:], strict=True):
-        off = np.linalg.norm(rigid.centre(before.pose) - rigid.centre(after.pose))
+    shown = [*room[0][:16], *room[0][14:4:-1]][newest.frame]
+    data = FrameData(replace(shown, index=newest.frame), Description.of(newest.features), None)
+    _check_joined(whole, join_pieces(apart, data, FREE_ROLES, SETTINGS))
+
+
+def test_pieces_that_never_met_join_at_the_end(torn: tuple[Slam, Slam]) -> None:
+    """The same by all keyframes that look alike, when the run is over. Oracle: the map before it was taken apart."""
+    whole, apart = torn
+    _check_joined(whole, join_at_end(apart, FREE_ROLES, SETTINGS))
+
+
+def _check_joined(whole: Slam, joined: Slam) -> None:
+    """One submap, each keyframe where it was as seen from the first one, to 5 cm, and depths to 5 %, in the
+    unit of the first.
+    """
+    assert len(joined.map.roots) == 1, joined.notes
+    assert len(set(piece_of(joined.map))) == 1
+    first, now = whole.keyframes[0], joined.keyframes[0]
+    unit = float(np.nanmedian(now.points.inverse_depth / first.points.inverse_depth))
+    for before, after in zip(whole.keyframes, joined.keyframes, strict=True):
+        expected, found = before.pose @ rigid.invert(first.pose), after.pose @ rigid.invert(now.pose)
+        off = np.linalg.norm(expected[:3, 3] - unit * found[:3, 3])
         assert off < 0.05, f"keyframe {before.number} is {100 * off:.1f} hundredths of the unit off"
-        np.testing.assert_allclose(after.points.inverse_depth, before.points.inverse_depth, rtol=0.05)
+        np.testing.assert_allclose(after.points.inverse_depth, unit * before.points.inverse_depth, rtol=0.05)

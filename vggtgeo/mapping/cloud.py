@@ -91,7 +91,7 @@ def map_points(
 
 def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray) -> _Points:
     slots = keyframe.points
-    known = np.isfinite(slots.inverse_depth) & (slots.inverse_depth > 0.02)
+    known = slots.determined & (slots.inverse_depth > 0.02)
     points = rigid.unproject(slots.pixels[known], slots.inverse_depth[known], keyframe.pose, intrinsics)
     colours = read_at(keyframe.image, slots.pixels[known])
     return _Points.of(points, colours, np.zeros((len(points), 3)), slots.confidence[known])

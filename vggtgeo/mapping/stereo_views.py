@@ -23,7 +23,7 @@ def known_points(keyframe: Keyframe, intrinsics: np.ndarray) -> np.ndarray:
     """Return the keyframe's key points and line samples of known depth as world points, float64 [n, 3]."""
     parts = []
     for slots in (keyframe.points, keyframe.samples):
-        known = np.isfinite(slots.inverse_depth) & (slots.inverse_depth > 0.02)
+        known = slots.determined & (slots.inverse_depth > 0.02)
         parts.append(rigid.unproject(slots.pixels[known], slots.inverse_depth[known], keyframe.pose, intrinsics))
     return np.concatenate(parts)
 

@@ -54,8 +54,10 @@ from vggtgeo.slam.tracking.track import (
     tie_to,
     track,
     track_by_map,
+    track_by_rays,
 )
 from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.tracking.two_view_motion import usual_step
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 LOST_PATIENCE = 10
@@ -152,9 +154,15 @@ def _track(
     if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
         slam = _settled(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
-    if slam.tracker.lost and (found is None or not found.accepted):
+    if (slam.tracker.lost or not slam.metric) and (found is None or not found.accepted):
         with clock.measure("relocalise"):
             found = relocalise(TrackingInput(data, slam.intrinsics, roles), slam.keyframes, slam.tracker) or found
+    grows = bool(slam.window.members) and not settings.keyframes.localise_only
+    if grows and not slam.metric and found is not None and not found.accepted:
+        with clock.measure("track"):
+            newest = slam.keyframes[slam.window.members[-1]]
+            given = TrackingInput(data, slam.intrinsics, roles, _prior(slam))
+            found = track_by_rays(given, newest, usual_step(slam.keyframes, frame.index)) or found
     return slam, data, found
 
 
@@ -181,8 +189,7 @@ def _decide(
 
 def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Track:
     """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
-    predicted = rigid.orthonormal(slam.tracker.velocity @ slam.last_pose)
-    prior = MotionPrior(predicted, slam.tracker.velocity, slam.tracker.lost)
+    prior = _prior(slam)
     first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
     others = [number for number in reversed(slam.window.members) if number != first][:2]
     window = tuple(slam.keyframes[number] for number in (first, *others))
@@ -204,6 +211,12 @@ def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> 
         joint = track_by_map(given, piece, best.keyframe, source)
         return joint if joint.accepted else best
     return refined_by_map(best, given, piece)
+
+
+def _prior(slam: Slam) -> MotionPrior:
+    """Where the next frame is, if the camera goes on as it did."""
+    predicted = rigid.orthonormal(slam.tracker.velocity @ slam.last_pose)
+    return MotionPrior(predicted, slam.tracker.velocity, slam.tracker.lost)
 
 
 def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameData:
@@ -357,4 +370,5 @@ def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settin
 
 
 def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
-    return needs_keyframe(found.pose, found.keyframe.pose, found.evidence.inliers, settings.keyframes)
+    own, reference = found.pose, found.keyframe.pose
+    return found.evidence.by_rays or needs_keyframe(own, reference, found.evidence.inliers, settings.keyframes)

@@ -25,6 +25,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
+from vggtgeo.slam.global_map.join_at_end import join_at_end
 from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.made_ahead import made_ahead
@@ -159,7 +160,7 @@ def finish(
     with clock.measure("place frames"):
         slam = replace(slam, tracker=against_nearest(slam.map, slam.tracker, slam.intrinsics, roles))
     with clock.measure("loops"):
-        slam = close_loops(slam, roles, settings)
+        slam = close_loops(join_at_end(slam, roles), roles, settings)
     with clock.measure("global adjustment"):
         return adjust_all(slam, settings)
 

@@ -110,7 +110,7 @@ def _check_features(features: Features, shape: tuple[int, int]) -> None:
 
 def _check_slots(name: str, slots: Slots, count: int) -> None:
     _check_pixels(f"pixels of {name}", slots.pixels, (count, 2))
-    for field in ("inverse_depth", "prior", "sigma"):
+    for field in ("inverse_depth", "prior", "sigma", "deviation"):
         _check_lengths(f"{field} of {name}", getattr(slots, field), (count,))
     if ((slots.sigma == 0) & (slots.prior > 0)).any():
         raise ValueError(f"`sigma of {name}` must be positive where there is a prior, got 0")

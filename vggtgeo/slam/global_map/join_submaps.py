@@ -41,7 +41,9 @@ def join_pieces(slam: Slam, data: FrameData, roles: Roles, settings: SlamSetting
     if slam.metric:
         return _joined(slam, place, slam.window.members[:1])
     ratio = unit_ratio(slam, place, roles)
-    return slam if ratio is None else _joined(scaled_piece(slam, ratio), place, slam.window.members[:2])
+    if ratio is None:
+        return slam
+    return _joined(scaled_piece(slam, ratio, newest_piece(slam)), place, slam.window.members[:2])
 
 
 def unit_ratio(slam: Slam, place: Track, roles: Roles) -> float | None:
@@ -51,15 +53,17 @@ def unit_ratio(slam: Slam, place: Track, roles: Roles) -> float | None:
     return ratio_of_units(old, new, matches.select(matches.index_j >= 0), place.relative, slam.intrinsics)
 
 
-def scaled_piece(slam: Slam, ratio: float) -> Slam:
-    """The state with all lengths of the newest piece multiplied by `ratio`; its own unit, the baseline, is given up."""
-    inside = newest_piece(slam)
+def scaled_piece(slam: Slam, ratio: float, inside: Callable[[int], bool]) -> Slam:
+    """The state with all lengths of a piece multiplied by `ratio`; its own unit, the baseline, is given up.
+
+    inside: whether a keyframe, by its number, belongs to the piece.
+    """
     keyframes = tuple(scaled_keyframe(k, ratio) if inside(k.number) else k for k in slam.keyframes)
     frames = tuple(scaled_record(record, ratio) if inside(record.reference) else record for record in slam.frames)
     own = lambda factor: all(inside(number) for number in factor.keyframes)
     factors = tuple(scaled_factor(factor, ratio) if own(factor) else factor for factor in slam.map.factors)
     kept = tuple(f for f in factors if not (isinstance(f, MeasuredBaseline) and own(f)))
-    velocity = longer(slam.tracker.velocity, ratio)
+    velocity = longer(slam.tracker.velocity, ratio) if inside(len(keyframes) - 1) else slam.tracker.velocity
     return replace(
         slam,
         map=replace(slam.map, keyframes=keyframes, factors=kept),

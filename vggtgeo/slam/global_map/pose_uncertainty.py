@@ -117,7 +117,7 @@ def _unmeasured_turn(slam: Slam) -> float:
 
 def median_depths(slam: Slam) -> np.ndarray:
     """Of each keyframe's points, float64 [n]; that of all where it has none."""
-    each = [keyframe.points.inverse_depth[np.isfinite(keyframe.points.inverse_depth)] for keyframe in slam.keyframes]
+    each = [keyframe.points.inverse_depth[keyframe.points.determined] for keyframe in slam.keyframes]
     every = float(np.median(np.concatenate(each))) if any(map(len, each)) else 1.0
     return 1 / np.array([float(np.median(values)) if len(values) else every for values in each])
 

@@ -131,7 +131,7 @@ def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[
     if slam.metric:
         return np.ones(len(slam.keyframes))
     ratios = [UnitRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
-    return solve_units(len(slam.keyframes), [tie.keyframes for tie in motions], ratios)
+    return solve_units(len(slam.keyframes), motions, ratios)
 
 
 def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:

@@ -14,8 +14,13 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.tracking.evidence import STEP_GROWTH
+
 DRIFT = 0.01
 """Standard deviation of the change of scale from one keyframe to the next."""
+GUESSED = STEP_GROWTH
+"""The same where the length of the motion between them was taken from the motion so far."""
 RATIO = 0.03
 """Standard deviation of the logarithm of a measured ratio."""
 WIDTHS = (1024.0, 256.0, 64.0, 16.0, 4.0, 2.5, 2.5, 2.5)
@@ -32,13 +37,15 @@ class UnitRatio:
     ratio: float
 
 
-def solve_units(keyframes: int, motions: Sequence[tuple[int, int]], ratios: Sequence[UnitRatio]) -> np.ndarray:
+def solve_units(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios: Sequence[UnitRatio]) -> np.ndarray:
     """By what the lengths of each keyframe must be multiplied, float64 [n]; by 1 those of the first."""
     if not ratios:
         return np.ones(keyframes)
-    first, second = np.array([*motions, *((r.first, r.second) for r in ratios)], int).T
+    ends = [*(motion.keyframes for motion in motions), *((r.first, r.second) for r in ratios)]
+    first, second = np.array(ends, int).T
     measured = np.concatenate([np.zeros(len(motions)), np.log([r.ratio for r in ratios])])
-    sigma = np.repeat([DRIFT, RATIO], [len(motions), len(ratios)])
+    drifts = [GUESSED if motion.by_rays else DRIFT for motion in motions]
+    sigma = np.array([*drifts, *[RATIO] * len(ratios)])
     rows = np.repeat(np.arange(len(first)), 2)
     shape = (len(first), keyframes)
     logs, weight = np.zeros(keyframes), np.ones(len(first))

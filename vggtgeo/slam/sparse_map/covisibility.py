@@ -20,6 +20,8 @@ EPIPOLAR_GATE = 4.0
 """The same for the epipolar distance, where depth is not known; narrower, because it checks one direction only."""
 MIN_OVERLAP = 0.25
 """Share of a keyframe's points that must fall into another's image before the two are matched."""
+GATE_SIGMA = 4.0
+"""Standard deviations that a gate of matches stands for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +131,8 @@ def _consistent(points: PointMatches, first: Keyframe, relative: np.ndarray, int
     """
     inverse = first.points.inverse_depth[points.index_i]
     ray = pinhole.rays(points.pixels_i, intrinsics)
-    known = np.isfinite(inverse)
+    length, focal = float(np.linalg.norm(relative[:3, 3])), float(intrinsics[0])
+    known = first.points.known_for(length, focal, REPROJECTION_GATE / GATE_SIGMA)[points.index_i]
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
     off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)
     epipolar = pinhole.epipolar_distance(points.pixels_i, points.pixels_j, relative, intrinsics)

@@ -49,12 +49,17 @@ class MeasuredBaseline:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRelativePose:
-    """Camera `first` -> camera `second`, float64 [4, 4], and its information float64 [6, 6], translation first."""
+    """Camera `first` -> camera `second`, float64 [4, 4], and its information float64 [6, 6], translation first.
+
+    by_rays: whether no known depth took part, so that the length is little more than a guess, and with it the scale of
+    what comes after, see `tracking/two_view_motion.py`.
+    """
 
     first: int
     second: int
     pose: np.ndarray
     information: np.ndarray
+    by_rays: bool = False
 
     @property
     def keyframes(self) -> tuple[int, int]:

@@ -16,6 +16,8 @@ from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages, array_of
 
 LINE_SPACING = 10.0
 """Pixels between the samples of a segment: closer ones would measure the same piece of an edge again."""
+LARGEST_ERROR = 0.2
+"""Relative standard deviation of a depth that is still of use as a depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +26,9 @@ class Slots:
 
     pixels: float [m, 2]. inverse_depth: float [m], 1/m, NaN = not known yet. prior, sigma: float [m], metric inverse
     depth and its standard deviation, 1/m, NaN = none. prior_confidence: float [m] in [0, 1].
-    confidence: float [m] in [0, 1], how far the image can be trusted there.
+    confidence: float [m] in [0, 1], how far the image can be trusted there. deviation: float [m], 1/m, standard
+    deviation of `inverse_depth` where views of other keyframes gave it, NaN elsewhere. That of a point far away is as
+    large as its inverse depth; such a point still fixes the rotation of a frame, see `determined`.
     """
 
     pixels: np.ndarray
@@ -33,6 +37,18 @@ class Slots:
     sigma: np.ndarray
     prior_confidence: np.ndarray
     confidence: np.ndarray
+    deviation: np.ndarray
+
+    @property
+    def determined(self) -> np.ndarray:
+        """Whether the depth itself is known, bool [m]: no more than `LARGEST_ERROR` of it is its standard deviation."""
+        return np.isfinite(self.inverse_depth) & ~(self.deviation > LARGEST_ERROR * self.inverse_depth)
+
+    def known_for(self, length: float, focal: float, pixels: float) -> np.ndarray:
+        """Whether the depth tells the projection after a motion of `length` to within `pixels`, or is determined, bool
+        [m].
+        """
+        return self.determined | (self.deviation * length * focal < pixels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +175,8 @@ def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) 
     measured = depth.depth, depth.sigma_rel, depth.confidence
     z, sigma_rel, trust = (read_at(image, pixels).astype(np.float64) for image in measured)
     inverse, seen = 1.0 / z, read_at(confidence, pixels).astype(np.float64)
-    return Slots(pixels, inverse, inverse, sigma_rel * inverse, np.nan_to_num(trust), seen)
+    nothing = np.full(len(pixels), np.nan)
+    return Slots(pixels, inverse, inverse, sigma_rel * inverse, np.nan_to_num(trust), seen, nothing)
 
 
 def read_at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -186,4 +203,5 @@ def _with_line_depth(samples: Slots, on_line: np.ndarray) -> Slots:
         sigma=np.where(known, np.fmax(np.nan_to_num(samples.sigma), floor), np.nan),
         prior_confidence=np.where(known, np.maximum(samples.prior_confidence, 0.3), 0.0),
         confidence=samples.confidence,
+        deviation=samples.deviation,
     )

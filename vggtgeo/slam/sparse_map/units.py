@@ -28,7 +28,7 @@ def ratio_of_units(
     new one has it, in the new camera, which `relative` leads to. None where they are too few, or disagree.
     """
     before, after = old.points.inverse_depth[matches.index_i], new.points.inverse_depth[matches.index_j]
-    known = np.isfinite(before) & np.isfinite(after)
+    known = old.points.determined[matches.index_i] & new.points.determined[matches.index_j]
     matches, before, after = matches.select(known), before[known], after[known]
     local = rigid.unproject(matches.pixels_i, before, np.eye(4), intrinsics)
     depth = local @ relative[2, :3] + relative[2, 3]
@@ -51,7 +51,7 @@ def longer(motion: np.ndarray, ratio: float) -> np.ndarray:
 
 def scaled_keyframe(keyframe: Keyframe, ratio: float) -> Keyframe:
     """The keyframe in a world whose lengths are `ratio` times as long."""
-    nearer = lambda slots: replace(slots, inverse_depth=slots.inverse_depth / ratio)
+    nearer = lambda slots: replace(slots, inverse_depth=slots.inverse_depth / ratio, deviation=slots.deviation / ratio)
     points: Slots = nearer(keyframe.points)
     samples: Slots = nearer(keyframe.samples)
     line_depths = keyframe.line_depths * ratio

@@ -59,7 +59,9 @@ class Evidence:
     metres and radians, from the information matrix. chi2: squared Mahalanobis distance from the predicted pose, 6
     degrees of freedom. agreement: distance between the poses by points and by surface, metres. lines, visible_lines:
     segments of the keyframe whose match in the frame agrees with the pose, and all that the frame should show.
-    map_points: key points of other keyframes that were found where the pose says.
+    map_points: key points of other keyframes that were found where the pose says. metre: what stands for a metre in a
+    map of free scale, in its unit: `fusion.metre_of`. by_rays: whether the pose is by key points without known depth,
+    so that its distance from the keyframe is little more than a guess: `two_view_motion.py`.
     """
 
     matches: int = 0
@@ -76,6 +78,8 @@ class Evidence:
     lines: int = 0
     visible_lines: int = 0
     map_points: int = 0
+    metre: float = 1.0
+    by_rays: bool = False
 
     @property
     def share(self) -> float:
@@ -139,7 +143,9 @@ class Evidence:
     @property
     def accepted(self) -> bool:
         """Whether the pose is to be believed."""
-        if self.sigma_translation > LARGEST_SIGMA or self.correlation < CONTRADICTION:
+        if self.by_rays:
+            return self.points_strong
+        if self.sigma_translation > LARGEST_SIGMA * self.metre or self.correlation < CONTRADICTION:
             return False
         if not self.plausible:
             return self.points_strong and self.dense_fair
@@ -151,7 +157,8 @@ class Evidence:
     def certain(self) -> bool:
         """Whether the pose is to be believed without any prediction, among all places of the map."""
         known_place = self.inliers >= STRONG_INLIERS and self.share >= 0.6
-        return self.sigma_translation <= LARGEST_SIGMA and known_place and not self.correlation < LEAST_CORRELATION
+        measured = self.sigma_translation <= LARGEST_SIGMA * self.metre
+        return measured and known_place and not self.correlation < LEAST_CORRELATION
 
 
 def step_chi2(pose: np.ndarray, predicted: np.ndarray, step: np.ndarray, waited: int = 0) -> float:

@@ -14,6 +14,7 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.models.roles import LineFeatures, LineMatcher
 from vggtgeo.slam.perception.rgbd_alignment import Aligned
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH
 from vggtgeo.slam.tracking.evidence import Evidence, tangent
 from vggtgeo.slam.tracking.line_alignment import align_lines
 
@@ -73,6 +74,16 @@ def wanting(found: Motion) -> bool:
     """
     floor = _floor(found.motion)
     return bool(np.linalg.eigvalsh(found.information * np.outer(floor, floor))[0] < 1.0)
+
+
+def metre_of(points: np.ndarray, pose: np.ndarray) -> float:
+    """What stands for a metre in a map of free scale, in its unit, where points [m, 3] are seen from a pose [4, 4].
+
+    The mean inverse depth tells how far the image moves for a motion of one unit. In the first views of a map it is
+    about `1 / NOMINAL_DEPTH`, and thresholds are in metres there; where all is far away, places are known worse.
+    """
+    depth = points @ pose[2, :3] + pose[2, 3]
+    return float(len(points) / (NOMINAL_DEPTH * np.sum(1.0 / depth)))
 
 
 def with_lines(

@@ -27,9 +27,10 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import Evidence, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.tracking.following import Located, located_by_flow
-from vggtgeo.slam.tracking.fusion import Motion, agreed, drawn_to, wanting, with_lines, with_systematic
+from vggtgeo.slam.tracking.fusion import Motion, agreed, drawn_to, metre_of, wanting, with_lines, with_systematic
 from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
 from vggtgeo.slam.tracking.tracker import SeenPoints
+from vggtgeo.slam.tracking.two_view_motion import two_view_motion
 
 PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
@@ -168,6 +169,23 @@ def track_by_map(
     return _placed(given, reference, given.views(source), located)
 
 
+def track_by_rays(given: TrackingInput, keyframe: Keyframe, length: float) -> Track | None:
+    """The pose of a frame from matches with a keyframe whose depths are not known; None where they do not determine it.
+
+    length: of the motion between both, by the motion so far.
+    """
+    matches = given.roles.points.match(keyframe.features, given.data.features)
+    found = two_view_motion(matches, length, given.intrinsics, given.roles.geometry, PIXEL_SIGMA)
+    if found is None:
+        return None
+    agree = int(np.count_nonzero(found.inliers))
+    metre = metre_of(found.points[found.inliers], np.eye(4))
+    evidence = Evidence(matches=len(matches), inliers=agree, metre=metre, by_rays=True)
+    motion = Motion(found.motion, found.information)
+    motion = motion if given.prior is None else drawn_to(motion, given.prior.motion_from(keyframe))
+    return _judged(rigid.orthonormal(motion.motion @ keyframe.pose), motion.information, evidence, keyframe, None)
+
+
 def _placed(
     given: TrackingInput, keyframe: Keyframe, views: tuple[RgbdView, RgbdView] | None, located: Located
 ) -> Track:
@@ -182,6 +200,8 @@ def _placed(
         information = pose_information(guess.pose, located.points[guess.inliers], given.intrinsics, located.sigma)
         by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
     evidence = _seen(guess, located.matches, by_points, dense)
+    if known and not given.roles.metric:
+        evidence = replace(evidence, metre=metre_of(located.points[guess.inliers], guess.pose))
     prior = None if given.prior is None else given.prior.motion_from(keyframe)
     found = agreed(by_points, dense, evidence)
     if found is not None and prior is not None:
@@ -232,7 +252,7 @@ def tie_to(found: Track, number: int) -> MeasuredRelativePose:
     What other keyframes know of it enters by their own edges: in the tie it would count twice.
     """
     own = found.alone or found
-    return MeasuredRelativePose(own.keyframe.number, number, own.relative, own.information)
+    return MeasuredRelativePose(own.keyframe.number, number, own.relative, own.information, own.evidence.by_rays)
 
 
 def tie_between(first: Track, second: Track) -> MeasuredRelativePose:

@@ -18,7 +18,7 @@ from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
-from vggtgeo.slam.sparse_map.keyframe import LINE_SPACING, Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe import LARGEST_ERROR, LINE_SPACING, Keyframe, Slots
 from vggtgeo.slam.window.line_support import sample_shares, supported
 from vggtgeo.slam.window.selection import Selection
 
@@ -27,6 +27,10 @@ MIN_INVERSE_DEPTH = 1e-3
 LINE_GATE = 12.0
 """Largest distance of a line sample from its matched segment by the poses before an adjustment, pixels; outliers within
 it are left to the robust kernel."""
+STEP_PIXELS = 2.0
+"""Standard deviation, pixels, with which a motion as long as those that a point was seen over must project it, if the
+point is to place frames: that of a match, see `PIXEL_SIGMA` in `tracking/track.py`. It leaves out what lies in the
+direction of the motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +62,8 @@ class Adjustment:
     is_line: np.ndarray
     informed: np.ndarray
     """Whether measurements determine the landmark's depth well enough to be used elsewhere, `[D]`."""
+    deviation: np.ndarray
+    """Standard deviation of its inverse depth by views of other keyframes, `[D]`, NaN where it has another source."""
 
 
 def build(
@@ -82,7 +88,8 @@ def build(
     local = {keyframe.number: i for i, keyframe in enumerate(keyframes)}
     points = Selection.points(keyframes, edges, local, settings)
     lines = Selection.lines(keyframes, edges, local, settings)
-    observations, depths, informed = _observed(keyframes, edges, local, (points, lines), intrinsics, settings)
+    selected = points, lines
+    observations, depths, informed, deviation = _observed(keyframes, edges, local, selected, intrinsics, settings)
     problem, initial, index = pack(
         observations,
         rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
@@ -105,6 +112,7 @@ def build(
         slot=np.concatenate([points.slot, lines.slot]),
         is_line=np.arange(len(observations.host)) >= len(points.host),
         informed=informed,
+        deviation=deviation,
     )
 
 
@@ -115,12 +123,12 @@ def _observed(
     selected: tuple[Selection, Selection],
     intrinsics: np.ndarray,
     settings: SlamSettings,
-) -> tuple[Observations, np.ndarray, np.ndarray]:
-    """Matches and depth priors of the selected points and line samples, where their inverse depths start, and for which
-    of them anything tells it.
+) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray]:
+    """Matches and depth priors of the selected points and line samples, where their inverse depths start, for which of
+    them anything tells it, and how well views do.
     """
     points, lines = selected
-    depths, informed = _initial_depths(keyframes, edges, local, points, intrinsics)
+    depths, informed, deviation = _initial_depths(keyframes, edges, local, points, intrinsics)
     key_points, samples = [keyframe.points for keyframe in keyframes], [keyframe.samples for keyframe in keyframes]
     read = lambda name: np.concatenate([points.read(key_points, name), lines.read(samples, name)])
     prior, sigma = read("prior"), read("sigma")
@@ -139,7 +147,9 @@ def _observed(
         alpha=settings.depth_terms.depth_weight,
         segment=_segments(keyframes, points, lines) if settings.line.two_ends_lines else None,
     )
-    return observations, depths, np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
+    informed = np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
+    deviation = np.concatenate([deviation, np.full(len(lines.host), np.nan)])
+    return observations, depths, informed, np.where(has_prior, np.nan, deviation)
 
 
 def write_back(
@@ -160,9 +170,10 @@ def write_back(
 
 
 def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.ndarray) -> Slots:
-    inverse = slots.inverse_depth.copy()
-    inverse[adjustment.slot[here]] = depths[here]
-    return replace(slots, inverse_depth=inverse)
+    inverse, deviation = slots.inverse_depth.copy(), slots.deviation.copy()
+    inverse[adjustment.slot[here]] = np.maximum(depths[here], MIN_INVERSE_DEPTH)
+    deviation[adjustment.slot[here]] = adjustment.deviation[here]
+    return replace(slots, inverse_depth=inverse, deviation=deviation)
 
 
 def _segments(keyframes: Sequence[Keyframe], points: Selection, lines: Selection) -> np.ndarray:
@@ -262,10 +273,38 @@ def _initial_depths(
     local: dict[int, int],
     points: Selection,
     intrinsics: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse depth of each point landmark: its estimate, else triangulated; and whether views determine it."""
-    current = points.read([keyframe.points for keyframe in keyframes], "inverse_depth")
-    weighted, information = np.zeros(len(current)), np.zeros(len(current))
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inverse depth of each point landmark: its estimate, else triangulated; whether views determine it; and its
+    standard deviation by these.
+
+    A point whose rays are parallel to within their noise is far away, and starts there. From a typical depth it would
+    pull the cameras together until no parallax is left, and change the scale of a map whose lengths nothing measures.
+    """
+    slots = [keyframe.points for keyframe in keyframes]
+    current, before = points.read(slots, "inverse_depth"), points.read(slots, "deviation")
+    triangulated, information, longest = _triangulated(keyframes, edges, local, points, intrinsics)
+    seen = information > 0
+    deviation = np.where(seen, 1.0 / np.sqrt(np.maximum(information, 1e-12)), np.nan)
+    determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (deviation < LARGEST_ERROR * triangulated)
+    # What a depth camera leaves out may be glass or a mirror, which no view should give a depth.
+    free = seen & ~np.array([np.isfinite(own.prior).any() for own in slots])[points.host]
+    steady = free & (deviation * longest * intrinsics[0] < STEP_PIXELS) & ~(deviation > before)
+    known = np.isfinite(current)
+    some = current[known] if known.any() else triangulated[determined]
+    typical = np.median(some) if len(some) else 1.0
+    depths = np.where(known, current, np.where(determined | free, triangulated, typical))
+    return depths.astype(np.float64), determined | steady, deviation
+
+
+def _triangulated(
+    keyframes: Sequence[Keyframe],
+    edges: Sequence[Directed],
+    local: dict[int, int],
+    points: Selection,
+    intrinsics: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inverse depth of each point landmark by the mean of its views, its information, and its longest baseline."""
+    weighted, information, longest = np.zeros((3, len(points.host)))
     for edge in edges:
         host, target = keyframes[local[edge.host]], keyframes[local[edge.target]]
         landmark = points.table[local[edge.host]][edge.slots]
@@ -276,9 +315,5 @@ def _initial_depths(
         )
         np.add.at(weighted, landmark[chosen], weight * value)
         np.add.at(information, landmark[chosen], weight)
-    triangulated = weighted / np.maximum(information, 1e-12)
-    good = (information > 0) & (triangulated > MIN_INVERSE_DEPTH) & (triangulated * np.sqrt(information) > 5.0)
-    known = np.isfinite(current)
-    typical = np.median(current[known]) if np.any(known) else (np.median(triangulated[good]) if np.any(good) else 1.0)
-    depths = np.where(known, current, np.where(good, triangulated, typical))
-    return depths.astype(np.float64), good
+        np.maximum.at(longest, landmark[chosen], float(np.linalg.norm(relative[:3, 3])))
+    return weighted / np.maximum(information, 1e-12), information, longest

@@ -1,0 +1,95 @@
+"""A motion from matches whose depths are not known: rotation, direction, and the length by what there is.
+
+Exact truth: points and poses that were drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from vggtgeo.models.classical import PnpGeometry
+from vggtgeo.models.roles import Features, LineFeatures, PointMatches, Segments
+
+from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.rigid import exponential
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
+from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.two_view_motion import two_view_motion, usual_step
+
+INTRINSICS = np.array([400.0, 400.0, 239.5, 134.5])
+TRUE = exponential(np.array([0.30, 0.05, 0.10, 0.02, 0.50, -0.03]))
+NOISE = 0.3
+LINES = LineFeatures(Segments(np.zeros((0, 2, 2)), np.zeros(0)), np.zeros((0, 1)))
+
+
+class Views(NamedTuple):
+    """A keyframe that sees points, and its matches with a frame after the motion `TRUE`."""
+
+    keyframe: Keyframe
+    matches: PointMatches
+
+
+def _views() -> Views:
+    """Points 2 to 12 m away whose depth the keyframe does not know; matches with noise."""
+    draw = np.random.default_rng(3)
+    pixels = draw.uniform([200, 20], [460, 250], (1200, 2))
+    inverse = 1.0 / draw.uniform(2.0, 12.0, len(pixels))
+    points = pinhole.rays(pixels, INTRINSICS) / inverse[:, None]
+    seen = pinhole.project(points @ TRUE[:3, :3].T + TRUE[:3, 3], INTRINSICS)
+    inside = ((seen > 0) & (seen < [480, 270])).all(1)
+    pixels, inverse, seen = pixels[inside], inverse[inside], seen[inside] + draw.normal(0, NOISE, (inside.sum(), 2))
+    count = len(pixels)
+    nothing, ones = np.full(count, np.nan), np.ones(count)
+    slots = Slots(pixels, nothing, nothing, nothing, ones, ones, nothing)
+    none = np.zeros((0, 2))
+    image = np.zeros((270, 480, 3), np.uint8)
+    images = KeyframeImages(image, image[..., 0].astype(np.float16), image[..., 0].astype(np.float16), image[..., 0])
+    features = Features(pixels, ones, None)
+    empty = Slots(none, none[:, 0], none[:, 0], none[:, 0], none[:, 0], none[:, 0], none[:, 0])
+    keyframe = Keyframe(0, 0, 0.0, np.eye(4), images, features, LINES, none, slots, empty, np.zeros(0, int))
+    rows = np.arange(count)
+    return Views(keyframe, PointMatches(rows, rows, pixels, seen, ones))
+
+
+def test_a_motion_without_known_depths() -> None:
+    """Rotation and direction of a motion come right to 0.3 and 2 degrees from matches alone; its length is the expected
+    one, twice too long. Oracle: the motion that was drawn.
+    """
+    length = float(np.linalg.norm(TRUE[:3, 3]))
+    found = two_view_motion(_views().matches, 2 * length, INTRINSICS, PnpGeometry(), NOISE)
+    assert found is not None
+    assert np.degrees(rigid.angle_between(found.motion, TRUE)) < 0.3
+    cosine = found.motion[:3, 3] @ TRUE[:3, 3] / (2 * length * length)
+    assert np.degrees(np.arccos(min(cosine, 1.0))) < 2.0
+
+
+def test_the_information_says_that_the_length_is_a_guess() -> None:
+    """Along the motion the stated deviation is 70 % of the length, that of the motion so far; across it, and of the
+    rotation, what matches tell: the error there is within 4 stated deviations. Oracle: the motion that was drawn.
+    """
+    length = float(np.linalg.norm(TRUE[:3, 3]))
+    found = two_view_motion(_views().matches, length, INTRINSICS, PnpGeometry(), NOISE)
+    assert found is not None
+    along = np.append(found.motion[:3, 3] / np.linalg.norm(found.motion[:3, 3]), np.zeros(3))
+    deviation = 1.0 / np.sqrt(along @ found.information @ along)
+    assert deviation / length == pytest.approx(0.7, rel=0.01)
+    off = tangent(found.motion @ rigid.invert(TRUE))
+    assert off @ found.information @ off < 6 * 4**2
+
+
+def test_the_usual_step_goes_on_at_the_speed_between_the_newest_keyframes() -> None:
+    """Two keyframes 0.2 apart in two frames lead to 0.3 in three more. Oracle: the rule of three."""
+    keyframe = _views().keyframe
+    first, second = keyframe, _placed(keyframe, 1, 2, 0.2)
+    assert usual_step((first, second), 5) == pytest.approx(0.3)
+    assert usual_step((first,), 5) == 0.0
+
+
+def _placed(keyframe: Keyframe, number: int, frame: int, x: float) -> Keyframe:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return replace(keyframe, number=number, frame=frame, pose=pose)

@@ -1,0 +1,73 @@
+"""A frame's motion from a keyframe whose key points have no depth yet: where the camera turns so fast that two frames
+share much, and three share nothing.
+
+The essential matrix of the matches gives the rotation and the direction of the translation. Its length is that of the
+motion so far: of depths that are known there are too few to place the frame, and what so few say of a length is no
+measurement.
+The information of the motion is that of the matches, the depth of each eliminated: with the rows `J` of a projection
+over the left tangent and its column `c` over the inverse depth of the point, `sum J^T (I - c c^T / c^T c) J / sigma^2`.
+It says nothing of the length, so that of the length is added. Where all points are far away it says little of the
+translation: that goes on as before (`fusion.drawn_to`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.tracking.evidence import STEP_GROWTH
+
+
+@dataclass(frozen=True, eq=False)
+class TwoViewMotion:
+    """Keyframe camera -> frame camera, float64 [4, 4], its information [6, 6] over the left tangent, translation first,
+    and which of the matches agree, bool [n]. points: float64 [n, 3] in the keyframe, NaN where not known.
+    """
+
+    motion: np.ndarray
+    information: np.ndarray
+    inliers: np.ndarray
+    points: np.ndarray
+
+
+def two_view_motion(
+    matches: PointMatches, length: float, intrinsics: np.ndarray, geometry: InitialGeometry, sigma: float
+) -> TwoViewMotion | None:
+    """The motion from a keyframe to a frame by their matches; None where these do not determine one.
+
+    length: of the motion by the motion so far. sigma: standard deviation of a match, pixels.
+    """
+    guess = geometry.start(matches.pixels_i, matches.pixels_j, intrinsics)
+    if guess.result not in (GeometryResult.SUCCESS, GeometryResult.LOW_PARALLAX):
+        return None
+    if not (length > 0 and guess.inliers.any()):
+        return None
+    motion = guess.pose.copy()
+    motion[:3, 3] *= length
+    points = length * guess.points
+    information = _without_length(points[guess.inliers], motion, intrinsics) / sigma**2
+    along = np.append(motion[:3, 3], np.zeros(3))
+    information += np.outer(along, along) / (STEP_GROWTH * length * length) ** 2
+    return TwoViewMotion(motion, information, guess.inliers, points)
+
+
+def usual_step(keyframes: tuple[Keyframe, ...], frame: int) -> float:
+    """Length of the motion from the newest keyframe to a frame, at the speed between the newest two."""
+    if len(keyframes) < 2:
+        return 0.0
+    before, last = keyframes[-2:]
+    apart = np.linalg.norm(rigid.centre(last.pose) - rigid.centre(before.pose))
+    return float(apart) * (frame - last.frame) / max(last.frame - before.frame, 1)
+
+
+def _without_length(points: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Information [6, 6] of matches of a pixel's noise about a motion, the depths of their points eliminated."""
+    turned = points @ motion[:3, :3].T
+    rows = np.stack(pinhole.projection_rows(turned + motion[:3, 3], intrinsics))  # [2, 6, n]
+    column = np.einsum("rkn,nk->rn", rows[:, :3], turned)
+    reduced = rows - column[:, None] * (np.einsum("rkn,rn->kn", rows, column) / np.sum(column**2, 0))[None]
+    return np.asarray(np.einsum("rkn,rln->kl", reduced, reduced))
