@@ -470,7 +470,7 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room, torn: tuple[Slam,
 def test_pieces_that_never_met_join_at_the_end(torn: tuple[Slam, Slam]) -> None:
     """The same by all keyframes that look alike, when the run is over. Oracle: the map before it was taken apart."""
     whole, apart = torn
-    _check_joined(whole, join_at_end(apart, FREE_ROLES, SETTINGS))
+    _check_joined(whole, join_at_end(apart, FREE_ROLES))
 
 
 def _check_joined(whole: Slam, joined: Slam) -> None:
