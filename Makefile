@@ -15,8 +15,8 @@ PYTHONS ?= $(PYTHON)
 # Compiled modules are kept, also where the environment says otherwise: the tests start hundreds of processes, and each
 # begins in a third of the time with them.
 export PYTHONDONTWRITEBYTECODE :=
-CORE    := tests/test_packing.py tests/test_solve.py tests/test_properties.py tests/test_report.py tests/test_point_cloud.py \
-	tests/test_plots.py tests/test_settings_file.py
+CORE    := tests/bundle/test_packing.py tests/bundle/test_solve.py tests/bundle/test_properties.py tests/evaluation/test_report.py tests/geometry/test_point_cloud.py \
+	tests/figures/test_plots.py tests/cli/test_settings_file.py
 
 .PHONY: help venv demo test test-long test-slow test-lowest test-newest test-more fuzz fuzz-parsers fuzz-decoders docs audit sbom release lint types format lock clean
 
@@ -45,8 +45,8 @@ test-slow: $(READY)  ## run the slow tests: real clips, long sequences
 	$(BIN)/python -m pytest -m slow $(ARGS)
 
 fuzz: $(READY)  ## try COUNT=2000 random problems, geometries and damaged files of each kind, others than the tests do
-	VGGTGEO_FUZZ=$(COUNT) $(BIN)/python -m pytest -m "not slow" $(or $(ARGS),tests/test_properties.py \
-		tests/test_geometry_properties.py tests/test_mutated_files.py)
+	VGGTGEO_FUZZ=$(COUNT) $(BIN)/python -m pytest -m "not slow" $(or $(ARGS),tests/bundle/test_properties.py \
+		tests/geometry/test_geometry_properties.py tests/test_mutated_files.py)
 
 fuzz-parsers: $(READY)  ## fuzz each parser for TIME=60 seconds, guided by coverage (Linux); ARGS='"EuRoC camera" problem' for some
 	$(BIN)/python -m pip install --quiet "atheris>=3"
@@ -74,8 +74,8 @@ test-more: $(READY)  ## run the tests that need Ray, Open3D or grain (a cluster,
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv venv --quiet --clear --python $(PYTHON) $(MORE)
 	$(BIN)/uv pip install --quiet --python $(MORE)/bin/python --constraint requirements.lock --editable ".[dev,cluster]" open3d grain
-	$(MORE)/bin/python -m pytest -m "" -o filterwarnings=ignore $(or $(ARGS),tests/test_bench_cluster.py \
-		tests/test_map_metrics.py tests/test_window_dataset.py)
+	$(MORE)/bin/python -m pytest -m "" -o filterwarnings=ignore $(or $(ARGS),tests/benchmark/test_bench_cluster.py \
+		tests/evaluation/test_map_metrics.py tests/learning/test_window_dataset.py)
 
 # The reference is read from an installed copy, where `vggtgeo.solvers` and `vggtgeo.models` are in place.
 docs: $(READY)  ## build the documentation site into site/ (open site/index.html); broken links are errors
@@ -104,7 +104,7 @@ release: $(READY)  ## build wheel and source archive into dist/, check them, try
 		$(BIN)/uv pip install --quiet --python $(TRIAL)/venv/bin/python dist/*.whl; \
 		(cd $(TRIAL) && venv/bin/vggtgeo --version && venv/bin/vggtgeo demo --frames 12 -o demo --quiet); \
 		$(BIN)/uv pip install --quiet --python $(TRIAL)/venv/bin/python pytest hypothesis beartype; \
-		(cd $(TRIAL) && venv/bin/python -m pytest -q -p no:cacheprovider ../../tests/test_lie.py); \
+		(cd $(TRIAL) && venv/bin/python -m pytest -q -p no:cacheprovider ../../tests/geometry/test_lie.py); \
 	done
 
 lint: $(READY)  ## check format, style and types

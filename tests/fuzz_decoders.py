@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 FINDINGS = ROOT / ".cache" / "fuzz" / "findings"
 MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # where the files lie: not on a disk, which is slower
 SECONDS, MEGABYTES = 20, 1500

@@ -33,6 +33,7 @@ from typing import Any
 import atheris
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 PLACE = ROOT / ".cache" / "fuzz"
 MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
 """Where the files lie: written to a disk, they took three quarters of the time."""

@@ -50,7 +50,7 @@ class Expected:
 
 def expectations() -> dict[tuple[str, str], Expected]:
     """The rows of `bad_inputs.csv` by reader and input."""
-    with (ROOT / "tests" / "bad_inputs.csv").open(encoding="utf-8", newline="") as file:
+    with (ROOT / "tests" / "helpers" / "bad_inputs.csv").open(encoding="utf-8", newline="") as file:
         return {
             (row["reader"], row["input"]): Expected(
                 row["kind"], row["outcome"], tuple(filter(None, (row["name"], row["value"])))

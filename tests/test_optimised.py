@@ -18,12 +18,12 @@ from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.solution import solve
 
 CORE = (
-    "test_energy.py::test_energy_is_the_sum_written_out",
-    "test_energy.py::test_the_solver_minimises_their_sum",
-    "test_linearise.py::test_gradient_and_hessian_are_those_of_the_columns",
-    "test_linearise.py::test_one_step_is_the_dense_step",
+    "bundle/test_energy.py::test_energy_is_the_sum_written_out",
+    "bundle/test_energy.py::test_the_solver_minimises_their_sum",
+    "bundle/test_linearise.py::test_gradient_and_hessian_are_those_of_the_columns",
+    "bundle/test_linearise.py::test_one_step_is_the_dense_step",
     "test_optimised.py::test_a_gradient_through_the_optimum",
-    "test_solve.py::test_exact_observations_give_the_truth",
+    "bundle/test_solve.py::test_exact_observations_give_the_truth",
 )
 """Energy, the terms' normal equations, a step, a solve and a gradient through it."""
 
@@ -31,7 +31,7 @@ CORE = (
 @pytest.mark.long
 def test_a_gradient_through_the_optimum() -> None:
     # Proves the derivative of the optimum by the matches on a problem that compiles quickly. Oracle: central
-    # differences of the polished optimum (tests/test_gradients.py has every leaf).
+    # differences of the polished optimum (tests/bundle/test_gradients.py has every leaf).
     problem, initial, _ = make_scene(2, 5, 0, noise=0.5, depth_error=0.05, seed=4).pack(fixed_intrinsics=True)
     problem = problem.with_terms((problem.points, problem.depth))
     get = lambda p: p.points.target

@@ -15,8 +15,8 @@ from vggtgeo.solvers.local_inverse import rank_tolerance
 
 WEAK = 1e-6
 """Eigenvalue below which a direction is weak: its standard deviation is a thousand times what it were if all else were
-known. Well-posed windows lie above 1e-4 (tests/test_observability.py); the longer a chain, the weaker its bending: a
-sound loop of 80 keyframes has 9e-5, of 400 6e-7, of 1,000 2e-8."""
+known. Well-posed windows lie above 1e-4 (tests/bundle/analysis/test_observability.py); the longer a chain, the weaker
+its bending: a sound loop of 80 keyframes has 9e-5, of 400 6e-7, of 1,000 2e-8."""
 ALIGNED = 0.9
 """Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""
 NEW = 0.1

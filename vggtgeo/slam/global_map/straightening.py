@@ -24,7 +24,7 @@ from vggtgeo.slam.tracking.tracker import scaled_record
 
 MENDABLE = 20.0
 """Pixels of the median match beyond which the map is straightened before it is adjusted. An adjustment alone brings
-back 5 cm and 2 degrees, 16 pixels (`tests/test_pipeline.py`)."""
+back 5 cm and 2 degrees, 16 pixels (`tests/slam/test_pipeline.py`)."""
 UNTRACKED = (0.02, np.deg2rad(1.0))
 """Standard deviation of a motion between keyframes that no tracking has measured, metres and radians: that of two
 views that start a map of free scale."""

@@ -1,0 +1,345 @@
+"""Terms: what is written by hand equals what is derived, and what is derived is that of the residual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import oracle
+import pytest
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+from priors import prior_on
+from scenes import make_scene
+from scipy.spatial.transform import Rotation
+from vggtgeo.solvers.arrow import multiply, reduce
+from vggtgeo.solvers.kernels import Barron, Cauchy, Square
+
+import vggtgeo as vg
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.objective import (
+    Place,
+    cameras_of,
+    edge_data,
+    hosts_of,
+    motions_of,
+    of_edge,
+    places,
+    prepared,
+    relative_poses,
+    view_of,
+)
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.node import DenseTerm
+from vggtgeo.bundle.terms.relative_pose import quadratic
+from vggtgeo.slam.sparse_map.factors import (
+    MeasuredBaseline,
+    MeasuredRelativePose,
+    MeasuredRotation,
+    factor_terms,
+    surface_term,
+)
+
+SCENE = make_scene(noise=0.7, outliers=0.3, depth_error=0.1, seed=1)
+Pairs = list[tuple[Any, Any]]
+
+
+@jax.jit
+def by_hand_and_derived(problem: vg.Problem, state: vg.State, correction: jax.Array) -> dict[str, Pairs]:
+    """What the hand-written methods give on every edge, beside the derived ones called on the same edge and data."""
+    ready = prepared(problem)
+    cameras, hosts = cameras_of(ready, state), hosts_of(ready, state)
+
+    def one(place: Place, motion: Any, data: Any) -> dict[str, Pairs]:
+        found = {}
+        for term, seen in of_edge(ready, view_of(cameras, hosts, place, motion), data):
+            found[term.name] = [
+                (term.energy(seen), EdgeTerm.energy(term, seen)),
+                (term.columns(seen, None), EdgeTerm.columns(term, seen, None)),
+                (term.columns(seen, correction), EdgeTerm.columns(term, seen, correction)),
+                (term.gradient(seen), EdgeTerm.gradient(term, seen)),
+                (used(term.model(seen)), used(EdgeTerm.model(term, seen))),
+            ]
+        return found
+
+    return jax.vmap(one)(places(ready), motions_of(relative_poses(ready, state)), edge_data(ready))
+
+
+def used(model: Any) -> tuple[jax.Array, jax.Array]:
+    """A local model without the unused corner."""
+    return model.gram.at[-1, -1].set(0.0), model.coupled
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(  # one kind of kernel, so that it is compiled once
+    ("shape", "camera"),
+    [
+        (1.0, vg.cameras.Pinhole),
+        (-2.0, vg.cameras.Pinhole),
+        pytest.param(1.0, vg.cameras.SquarePinhole, marks=pytest.mark.slow),
+    ],
+)
+def test_what_is_written_by_hand_is_what_is_derived(shape: float, camera: type[vg.cameras.AbstractCamera]) -> None:
+    # Proves energy, columns (with and without a correction), gradient and exact model of points and lines, outliers,
+    # absent matches and a landmark behind its target included, with two focal lengths and with one. Oracle: automatic
+    # differentiation of the residual.
+    scene = replace(SCENE, start_intrinsics=SCENE.start_intrinsics[-len(camera.names) :])
+    problem, state, _ = scene.pack(kernel=Barron(1.5, shape), size=vg.PaddedSize(3, 8, 5, 3), camera=camera)
+    state = eqx.tree_at(lambda s: s.inverse_depth, state, state.inverse_depth.at[0, 0].set(60.0))
+    four = eqx.tree_at(lambda s: s.intrinsics, state, jnp.asarray(SCENE.start_intrinsics))
+    behind = oracle.seen_from(problem, four)[:, 0, 2] < oracle.LEAST_DEPTH
+    assert bool(jnp.any(behind & (problem.edges.source == 0) & (problem.points.weight[:, 0] > 0)))
+    found = by_hand_and_derived(problem, state, jnp.asarray(0.7))
+    assert set(found) == {"points", "lines"}
+    for name, pairs in found.items():
+        for number, (by_hand, derived) in enumerate(pairs):
+            for one, other in zip(jax.tree.leaves(by_hand), jax.tree.leaves(derived), strict=True):
+                assert bool(jnp.all(jnp.isfinite(one)))
+                # Each row in its own unit: pixels a metre, a radian, a pixel, 1/m.
+                size = np.abs(other).max(axis=(0, -1) if other.ndim > 1 else 0, keepdims=True)
+                error = float((np.abs(one - other) / np.maximum(size, 1e-12 * np.abs(other).max())).max())
+                assert error < 1e-12, (name, number, error)
+
+
+def test_the_prior_of_marginalisation_is_what_is_derived() -> None:
+    # Proves `MarginalPrior.model`, pose by pose. Oracle: the derived one, which moves everything for every coordinate.
+    _, state, _ = SCENE.pack()
+    prior = replace(prior_on(state, 0.1), kernel=Cauchy(1.5))
+    both = lambda *given: (prior.model(*given, False), DenseTerm.model(prior, *given, False))
+    for correction in (None, jnp.asarray(0.7)):
+        by_hand, derived = eqx.filter_jit(both)(state.poses, state.intrinsics, correction)
+        for found, expected in zip(by_hand, derived, strict=True):
+            assert oracle.gap(found, expected) < 1e-12
+
+
+class LogDepth(vg.terms.SlotTerm):
+    """A slot's term that a user might write."""
+
+    log: Float[Array, "n s"]
+
+    def residual(self, inverse_depth: Float[Array, ""]) -> Float[Array, ""]:
+        return 10 * (jnp.log(inverse_depth) - self.log)
+
+
+class Epipolar(vg.terms.EdgeTerm):
+    """An edge's term with data of every shape: the distance of the pixel seen from the epipolar line."""
+
+    target: Float[Array, "e p 2"]
+
+    def residual(self, view: vg.terms.View) -> Float[Array, ""]:
+        line = jnp.cross(view.relative.translation(), view.relative.rotation().as_matrix() @ view.ray)
+        off = view.camera.unproject(self.target) @ line
+        return 300 * off / jnp.sqrt(line[0] ** 2 + line[1] ** 2 + 1e-6) + view.inverse_depth
+
+
+class SquarePixels(vg.terms.CameraTerm):
+    """A camera's term: both focal lengths are nearly one."""
+
+    def residual(self, parameters: Float[Array, " q"]) -> Float[Array, ""]:
+        return jnp.log(parameters[0] / parameters[1]) * 50
+
+
+class Sighting(vg.terms.PoseTerm):
+    """A term on a pose and the camera: a known place and where it was seen."""
+
+    place: Float[Array, "m 3"]
+    pixel: Float[Array, "m 2"]
+
+    def residual(self, pose: jaxlie.SE3, camera: vg.cameras.AbstractCamera) -> Float[Array, "2"]:
+        return camera.project(pose @ self.place) - self.pixel
+
+
+def turn(*vector: float) -> np.ndarray:
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+def made(kind: str, problem: vg.Problem, state: vg.State) -> vg.terms.AbstractTerm:
+    """A term of some kind, about keyframes 0 to 2, some distance from its optimum."""
+    kernel, information = Cauchy(2.0), np.diag([400.0, 300.0, 500.0, 4e3, 3e3, 5e3])
+    information[0, 4] = information[4, 0] = 500.0
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn(0.03, -0.1, 0.02), [-0.3, 0.05, 0.02]
+    known = {0: 0, 1: 1, 2: 2}
+    factors = {
+        "baselines": [MeasuredBaseline(0, 2, 0.5, 0.1), MeasuredBaseline(1, 2, 0.1, 0.2)],
+        "rotations": [MeasuredRotation(1, turn(0.1, 0, 0.05), information[3:, 3:])],
+        "relative_poses": [MeasuredRelativePose(*pair, pose, information) for pair in ((2, 1), (1, 0))],
+    }
+    if kind in factors:
+        (term,) = factor_terms(factors[kind], known, {type(factors[kind][0]): 4}, metric=True)
+    elif kind == "surfaces":
+        hessians, gradients = np.stack([information, 0 * information]), np.zeros((2, 6))
+        gradients[0] = [1.0, -2, 3, 40, -50, 60]
+        term = surface_term([(0, 1), (1, 2)], np.stack([pose, pose]), hessians, gradients)
+    elif kind == "log_depth":
+        term = LogDepth(log=jnp.log(problem.depth.mean) + 0.1, weight=problem.depth.weight)
+    elif kind == "epipolar":
+        term = Epipolar(target=problem.points.target, weight=problem.points.weight)
+    elif kind == "square_pixels":
+        term = SquarePixels(weight=jnp.ones(1))
+    elif kind == "sighting":
+        term = Sighting(
+            keyframe=[1, 2, 1],
+            place=jnp.array([[0.3, 0.2, 3.0], [0.5, -0.2, 2.0], [0.0, 0, 1]]),
+            pixel=jnp.array([[170.0, 130], [160, 100], [0, 0]]),
+            weight=jnp.array([1.0, 0.5, 0.0]),
+        )
+    else:
+        term = prior_on(state, 0.1)
+    return replace(term, kernel=kernel)
+
+
+KINDS = ("log_depth", "epipolar", "relative_poses", "sighting", "square_pixels", "marginal")
+"""One of each way into the normal equations; the other terms differ in their residual alone."""
+
+
+@eqx.filter_jit
+def assembled(
+    problem: vg.Problem, state: vg.State, along: jax.Array
+) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+    """Products of the Gauss-Newton and the exact matrix with a direction, and gradients: of the solver, and of the
+    residuals and the energy of a problem of one term.
+    """
+    ba = BundleAdjustment(problem)
+    flat, unflat = ravel_pytree(ba.zero_step(state))
+    times = lambda system: ravel_pytree(multiply(system, unflat(along)))[0]
+    forces = lambda system: jnp.concatenate([reduce(system).gradient, system.landmark_gradient.ravel()])
+    plain, exact = ba.linearise(state), ba.hessian(state)
+    found = (times(plain), times(exact), forces(plain), forces(exact), ravel_pytree(ba.gradient(state))[0])
+    slope, curved = jax.jvp(jax.grad(lambda step: vg.energy(problem, state.moved(step))), (flat,), (along,))
+    (term,) = problem.terms
+    residual = lambda step: vg.residuals_at(problem, state.moved(step))[term.name].reshape(*term.weight.shape, -1)
+    value, pushed = jax.jvp(residual, (flat,), (along,))
+    pull = term.weight * term.kernel.weight(term.weight * jnp.sum(value**2, -1))
+    (normal,) = jax.vjp(residual, flat)[1](pull[..., None] * pushed)
+    return found, (normal, curved, slope, slope, slope)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", KINDS)
+def test_normal_equations_are_those_of_the_residual(kind: str) -> None:
+    # Proves for each kind of term, a user's own among them, the assembly of matrix, exact Hessian and gradient, with a
+    # robust kernel. Oracle: `J' W J` of the residuals and second derivatives of the energy, after `State.moved`.
+    problem, state, _ = SCENE.pack(fixed_pose=np.zeros(3, bool), size=vg.PaddedSize(3, 6, 3, 2, 6))
+    alone = problem.with_terms((made(kind, problem, state),))
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        along = jnp.asarray(rng.normal(size=problem.num_camera + state.inverse_depth.size))
+        for found, expected in zip(*assembled(alone, state, along), strict=True):
+            assert oracle.gap(found, expected) < 1e-10, oracle.gap(found, expected)
+            assert np.abs(expected).max() > 1e-3
+
+
+def test_known_terms_by_hand() -> None:
+    # Proves the energies of measured rotations, baselines and relative poses, absent ones left out. Oracle: scipy's
+    # rotation vectors and matrices, in numpy.
+    problem, state, _ = SCENE.pack()
+    rotation, shift = Rotation.from_quat(SCENE.start_poses[:, :4], scalar_first=True), SCENE.start_poses[:, 4:]
+    centres = -rotation.inv().apply(shift)
+    plain = lambda kind: replace(made(kind, problem, state), kernel=Square())
+    energy = lambda kind: float(eqx.filter_jit(vg.energy)(problem.with_terms((plain(kind),)), state))
+    lengths = np.linalg.norm(centres[[2, 2]] - centres[[0, 1]], axis=1)
+    expected = 0.5 * np.sum((np.log(lengths / [0.5, 0.1]) / [0.1, 0.2]) ** 2)
+    assert energy("baselines") == pytest.approx(expected, rel=1e-9)
+    off = (rotation[1] * Rotation.from_matrix(turn(0.1, 0, 0.05)).inv()).as_rotvec()
+    assert energy("rotations") == pytest.approx(0.5 * off @ np.diag([4e3, 3e3, 5e3]) @ off, rel=1e-9)
+    poses = jaxlie.SE3(jnp.asarray(SCENE.start_poses))
+    term = plain("relative_poses")
+    total = 0.0
+    for row, (i, j) in enumerate([(2, 1), (1, 0)]):
+        apart = jaxlie.SE3(poses.wxyz_xyz[j]) @ jaxlie.SE3(poses.wxyz_xyz[i]).inverse()
+        tangent = term.root[row] @ (apart @ jaxlie.SE3(term.measured[row]).inverse()).log()
+        total += 0.5 * float(tangent @ tangent)
+    assert energy("relative_poses") == pytest.approx(total, rel=1e-9)
+
+
+def test_a_quadratic_becomes_a_measured_pose() -> None:
+    # Proves that normal equations of an alignment and their term are one function, a direction without information
+    # included. Oracle: the quadratic itself, evaluated near its linearisation point.
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(5, 6)) * [10, 10, 10, 100, 100, 100]
+    hessian, gradient = root.T @ root, root.T @ rng.normal(size=5) * 1e-3
+    at = jaxlie.SE3.exp(jnp.asarray(rng.normal(0, 0.5, 6)))
+    measured, found = quadratic(at.wxyz_xyz[None], jnp.asarray(hessian)[None], jnp.asarray(gradient)[None])
+    term = vg.terms.RelativePose(first=[0], second=[1], measured=measured, root=found, weight=jnp.ones(1)).holding(
+        {"measured": measured[0], "root": found[0]}
+    )
+    energy = jax.jit(lambda eta: 0.5 * jnp.sum(term.residual(jaxlie.SE3.identity(), jaxlie.SE3.exp(eta) @ at) ** 2))
+    step = 1e-4 * rng.normal(size=6)
+    change = float(energy(jnp.asarray(step)) - energy(jnp.zeros(6)))
+    assert change == pytest.approx(0.5 * step @ hessian @ step + gradient @ step, rel=1e-3)
+    assert np.abs(jax.grad(energy)(jnp.zeros(6)) - gradient).max() < 1e-3 * np.abs(gradient).max()
+
+
+def test_a_written_residual_is_solved() -> None:
+    # Proves that a term that a user writes brings the map right: places seen in keyframes whose poses start 1 cm and
+    # 0.3 degrees off. Oracle: the true poses, from which the places were projected.
+    problem, initial, _ = SCENE.pack(fixed_intrinsics=True)
+    truth = SCENE.poses
+    rng = np.random.default_rng(0)
+    rotation, shift = Rotation.from_quat(truth[:, :4], scalar_first=True), truth[:, 4:]
+    keyframe, seen = np.repeat([1, 2], 6), rng.uniform([-1, -1, 2], [1, 1, 4], (12, 3))
+    place = np.stack([rotation[k].inv().apply(p - shift[k]) for k, p in zip(keyframe, seen, strict=True)])
+    pixel = seen[:, :2] / seen[:, 2:] * SCENE.intrinsics[:2] + SCENE.intrinsics[2:]
+    term = Sighting(keyframe=keyframe, place=jnp.asarray(place), pixel=jnp.asarray(pixel), weight=jnp.ones(12))
+    initial = eqx.tree_at(lambda s: s.intrinsics, initial, jnp.asarray(SCENE.intrinsics))
+    assert np.abs(initial.poses.wxyz_xyz - truth).max() > 5e-3
+    found = jax.jit(vg.solve)(problem.with_terms((term, problem.depth)), initial)
+    np.testing.assert_allclose(found.state.poses.wxyz_xyz, truth, atol=1e-6)
+
+
+class Fix(vg.terms.PoseTerm):
+    """Position of a camera."""
+
+    position: jax.Array
+
+    def residual(self, pose: jaxlie.SE3, camera: vg.cameras.AbstractCamera) -> jax.Array:
+        return pose.inverse().translation() - self.position
+
+
+class SecondFix(Fix):
+    """The same of another receiver."""
+
+    name = "second_fix"
+
+
+def test_a_second_list_of_one_class_does_not_take_the_place_of_the_first() -> None:
+    """Adding a second term of a name is an error that names the remedies, in `with_term` as in `pack`, and each remedy
+    works: the energy of both lists is their sum. Oracle: the energies of each alone.
+    """
+    problem, initial, _ = SCENE.pack()
+    first, second = (Fix(keyframe=[1], position=jnp.full((1, 3), at), weight=jnp.ones(1)) for at in (1.0, 2.0))
+    one = problem.with_term(first)
+    with pytest.raises(vg.InputError, match=r"`term` is a second `fix`.*replace=True.*`name`"):
+        one.with_term(second)
+    with pytest.raises(vg.InputError, match=r"`terms` holds a second term `fix`.*`name`"):
+        SCENE.pack(terms=[first, second])
+    size = lambda problem, name: float(vg.analysis.energy_terms(problem, initial)[name])
+    replaced = one.with_term(second, replace=True)
+    assert len(replaced.terms) == len(one.terms)
+    assert size(replaced, "fix") != size(one, "fix")
+    both = one.with_term(SecondFix(**vars(second)))
+    assert size(both, "fix") + size(both, "second_fix") == pytest.approx(size(one, "fix") + size(replaced, "fix"))
+    joined = Fix(keyframe=[1, 1], position=jnp.concatenate([first.position, second.position]), weight=jnp.ones(2))
+    assert size(problem.with_term(joined), "fix") == pytest.approx(size(one, "fix") + size(replaced, "fix"))
+
+
+def test_names_and_replacement() -> None:
+    # Proves how terms are found: by their class's name in snake case, replaced in place, added as the last, left out.
+    problem, _, _ = SCENE.pack()
+    names: Callable[[vg.Problem], list[str]] = lambda p: [term.name for term in p.terms]
+    own = LogDepth(log=problem.depth.mean, weight=problem.depth.weight)
+    assert names(problem.with_term(own)) == ["points", "lines", "depth", "intrinsics_prior", "log_depth"]
+    lighter = problem.lines.reweighted(0.5 * problem.lines.weight)
+    changed = problem.with_term(lighter)
+    assert names(changed) == names(problem)
+    np.testing.assert_array_equal(changed.lines.weight, lighter.weight)
+    assert names(problem.without_term("lines")) == ["points", "depth", "intrinsics_prior"]
+    with pytest.raises(AttributeError, match="no attribute and no term `imu`"):
+        _ = problem.imu

@@ -1,0 +1,110 @@
+"""A user's own residuals: each is one small class, and everything that is done with a problem works with it."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from vggtgeo.solvers.arrow import multiply, reduce
+
+import vggtgeo as vg
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+
+SOLVER = vg.SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
+
+
+@pytest.fixture(scope="module")
+def solved(own: tuple[vg.Problem, vg.State, vg.State]) -> vg.Solution:
+    return eqx.filter_jit(vg.solve)(own[0], own[1], solver=SOLVER)
+
+
+def without(problem: vg.Problem, *names: str) -> vg.Problem:
+    """The problem with the weights of these terms zero: of the same structure, so nothing is compiled again."""
+    for name in names:
+        term = getattr(problem, name)
+        problem = problem.with_term(term.reweighted(0 * term.weight), replace=True)
+    return problem
+
+
+def test_a_residual_that_is_written_is_the_residual_that_is_solved(own, solved) -> None:
+    # Proves that own terms move the optimum: from 1 cm off, exact fixes bring the centres to the truth. Oracle: truth.
+    problem, initial, truth = own
+    off = lambda state: float(jnp.abs(state.poses.inverse().translation() - truth.poses.inverse().translation()).max())
+    assert off(initial) > 5e-3
+    assert off(solved.state) < 1.5e-3, off(solved.state)
+    silent = without(problem, "position_fix", "point_to_plane", "step_of_wheels")
+    assert off(eqx.filter_jit(vg.solve)(silent, initial, solver=SOLVER).state) > 2 * off(solved.state)
+
+
+@pytest.mark.long
+def test_second_derivatives_are_derived(own) -> None:
+    # Proves gradient and exact Hessian with own terms of three kinds and an own kernel. Oracle: automatic
+    # differentiation of the energy after a retraction.
+    problem, state, _ = own
+    problem = problem.without_term("points").without_term("lines")  # tests/bundle/test_exact_hessian.py has theirs
+    ba = BundleAdjustment(problem)
+    flat, unflat = ravel_pytree(ba.zero_step(state))
+
+    @jax.jit
+    def both(problem, state):
+        ba = BundleAdjustment(problem)
+        total = lambda step: vg.energy(problem, ba.retract(state, unflat(step)))
+        system = ba.hessian(state)
+        matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
+        gradients = ravel_pytree(ba.gradient(state))[0], reduce(system).gradient
+        return matrix, gradients, jax.hessian(total)(flat), jax.grad(total)(flat)
+
+    matrix, (gradient, dense), hessian, expected = both(problem, state)
+    unit = 1 / np.sqrt(np.abs(np.diag(hessian)) + 1.0)
+    error = float(np.abs((matrix - hessian) * np.outer(unit, unit)).max())
+    assert error < 1e-9, error
+    size = float(np.abs(expected * unit).max())
+    for found in (gradient, np.concatenate([dense, gradient[len(dense) :]])):
+        error = float(np.abs((found - expected) * unit).max())
+        assert error < 1e-10 * size, error
+
+
+@pytest.mark.long
+def test_gradient_by_own_data(own) -> None:
+    # Proves that the optimum is differentiated by the data of a user's term, under `vmap` too. Oracle: finite
+    # differences of the solve.
+    problem, initial, _ = own
+    for name in ("lines", "step_of_wheels", "point_to_plane"):  # few terms compile quickly
+        problem = problem.without_term(name)
+    get = lambda p: p.position_fix.position
+
+    def loss(position: jax.Array) -> jax.Array:
+        moved = eqx.tree_at(get, problem, position)
+        return jnp.sum(jnp.sin(3 * vg.solve(moved, initial, solver=SOLVER).state.poses.wxyz_xyz))
+
+    value_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(loss)))
+    along = np.random.default_rng(0).normal(size=get(problem).shape)
+    steps = jnp.asarray([0.0, 1e-4, -1e-4])
+    values, gradients = value_and_gradient(get(problem) + steps[:, None, None] * along)
+    difference = float(values[1] - values[2]) / 2e-4
+    found = float(jnp.sum(gradients[0] * along))
+    assert abs(found - difference) < 1e-5 * abs(difference), (found, difference)
+
+
+@pytest.mark.long
+def test_own_terms_are_known_everywhere(own, solved) -> None:
+    # Proves that covariances shrink by an own fix, that observability and statistics name it, and that marginalisation
+    # takes it along. Oracle: the same problem without it; what is named.
+    problem, _, _ = own
+    known = eqx.filter_jit(vg.covariances)
+    less_known = without(problem, "position_fix")
+    sigma = lambda p: np.sqrt(np.trace(np.asarray(known(p, solved.state).poses)[2, :3, :3]))
+    assert sigma(problem) < 0.9 * sigma(less_known)
+    sizes = eqx.filter_jit(vg.analysis.residual_sizes)(problem, solved.state)
+    assert int(sizes.count["position_fix"]) == 2
+    assert "position_fix" in str(sizes)
+    found = eqx.filter_jit(vg.observability)(problem, solved.state)
+    assert "position_fix" in found.report()
+    gone = jax.jit(vg.marginalise)
+    prior = gone(problem.with_term(vg.no_prior(3)), solved.state, jnp.asarray(1))
+    less = gone(less_known.with_term(vg.no_prior(3)), solved.state, jnp.asarray(1))
+    information = lambda p: float(jnp.trace(p.root[:, 12:18].T @ p.root[:, 12:18]))
+    assert information(prior) > 1.001 * information(less)

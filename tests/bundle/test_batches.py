@@ -1,0 +1,134 @@
+"""Many windows at once give what each gives alone."""
+
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import Scene, make_scene
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+
+from vggtgeo.bundle.analysis.covariances import Covariances
+from vggtgeo.bundle.batches import Window, pack_batch, solve_batch
+from vggtgeo.bundle.observations import Observations
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import solution_like, solve
+from vggtgeo.io.errors import InputError
+
+SOLVER = SchurLevenbergMarquardt(max_iterations=40, rtol=1e-12)
+SCENES = [  # two shapes, to compile no more than those
+    make_scene(3, points=4, lines=2, samples=4, noise=0.5, seed=1),
+    make_scene(4, points=9, lines=0, noise=0.5, seed=2),
+    make_scene(3, points=4, lines=2, samples=4, noise=0.5, seed=3),
+]
+
+
+def window(scene: Scene) -> Window:
+    return scene.observations, scene.start_poses, scene.start_intrinsics, scene.start_inverse_depth
+
+
+def batch() -> tuple[Problem, State, list]:
+    return pack_batch([window(scene) for scene in SCENES], intrinsics_sigma=5.0)
+
+
+@pytest.mark.parametrize(
+    "at_once", [3, pytest.param(1, marks=pytest.mark.long), pytest.param(2, marks=pytest.mark.slow)]
+)
+def test_a_ragged_batch_gives_what_each_window_gives(at_once: int) -> None:
+    # Proves padding to one shape, mapping and vmapping, and `gather` of every window. Oracle: `solve` of each alone,
+    # packed to its own size.
+    problems, states, indices = batch()
+    found = eqx.filter_jit(solve_batch)(problems, states, solver=SOLVER, at_once=at_once)
+    for number, scene in enumerate(SCENES):
+        problem, state, index = scene.pack()
+        alone = solve_alone(problem, state)
+        assert float(found.energy[number]) == pytest.approx(float(alone.energy), rel=1e-9)
+        depths = indices[number].gather(found.state.inverse_depth[number])
+        np.testing.assert_allclose(depths, index.gather(alone.state.inverse_depth), rtol=1e-4)
+
+
+@eqx.filter_jit
+def solve_alone(problem: Problem, state: State):
+    return solve(problem, state, solver=SOLVER)
+
+
+def test_a_batch_can_be_printed() -> None:
+    # Proves that results of a batch are readable where there is no one number to show. Oracle: the shapes in the text.
+    one = solution_like(*SCENES[1].pack()[:2], SOLVER)
+    solutions = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one)
+    assert "energy=f64[2]" in str(solutions)
+    assert repr(solutions) == str(solutions)
+    zeros = lambda *shape: jnp.zeros(shape)
+    known = Covariances(zeros(4, 6, 6), zeros(4, 4), zeros(4, 9), zeros(4, 3, 6, 6), zeros())
+    assert "poses=f64[2,4,6,6]" in str(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), known))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("at_once", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_gradients_of_a_batch_are_those_of_its_windows(at_once: int) -> None:
+    # Proves `grad` through `solve_batch`, mapped and vmapped. Oracle: `grad` through `solve`, window by window.
+    problems, states, _ = batch()
+
+    def loss(weight: jax.Array, problem: Problem, run) -> jax.Array:
+        changed = eqx.tree_at(lambda p: p.points.weight, problem, weight)
+        return jnp.sum(run(changed).state.poses.wxyz_xyz ** 3)
+
+    together = lambda problem: solve_batch(problem, states, solver=SOLVER, at_once=at_once)
+    found = jax.jit(jax.grad(lambda weight: loss(weight, problems, together)))(problems.points.weight)
+    for number in range(len(SCENES)):
+        problem, state = jax.tree.map(lambda leaf, n=number: leaf[n], (problems, states))
+        expected = gradient_alone(problem, state)
+        np.testing.assert_allclose(found[number], expected, atol=1e-6 * float(jnp.abs(expected).max()))
+
+
+@eqx.filter_jit
+def gradient_alone(problem: Problem, state: State) -> jax.Array:
+    def loss(weight: jax.Array) -> jax.Array:
+        changed = eqx.tree_at(lambda p: p.points.weight, problem, weight)
+        return jnp.sum(solve(changed, state, solver=SOLVER).state.poses.wxyz_xyz ** 3)
+
+    return jax.grad(loss)(problem.points.weight)
+
+
+SHARED = """
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 2)
+from test_batches import SOLVER, SCENES, window
+from vggtgeo.bundle.batches import pack_batch, solve_batch
+problems, states, _ = pack_batch([window(SCENES[n]) for n in (0, 1, 2, 0)], intrinsics_sigma=5.0)
+run = jax.jit(lambda devices: solve_batch(problems, states, solver=SOLVER, devices=devices), static_argnums=0)
+two, one = run(tuple(jax.devices())), run(tuple(jax.devices()[:1]))
+assert len(two.energy.sharding.device_set) == 2, two.energy.sharding
+np.testing.assert_allclose(two.energy, one.energy, rtol=1e-12)
+"""
+
+
+@pytest.mark.long
+def test_a_batch_is_shared_out_over_devices() -> None:
+    # Proves sharding over two host devices. Oracle: the same batch on one device, in the same process.
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", SHARED]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_a_batch_that_cannot_be_shared_out_is_refused() -> None:
+    # Proves the message. Oracle: its text.
+    problems, states, _ = batch()
+    with pytest.raises(InputError, match="3 windows, `devices` 2 devices"):
+        solve_batch(problems, states, devices=jax.devices() * 2)
+
+
+def test_what_is_wrong_with_a_window_names_it() -> None:
+    # Proves the messages of `pack_batch`. Oracle: their texts.
+    good = window(SCENES[0])
+    bad = Observations(**{**vars(good[0]), "pixel": good[0].pixel[:-1]})
+    with pytest.raises(InputError, match=r"`windows\[1\]`: `pixel` has shape"):
+        pack_batch([good, (bad, *good[1:])])
+    with pytest.raises(InputError, match="`windows` is empty"):
+        pack_batch([])

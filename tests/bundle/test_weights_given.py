@@ -1,0 +1,76 @@
+"""One number as the weight of a whole term, and terms on landmarks that are given flat."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from own_terms import SCENE, PointToPlane, PositionFix, StepOfWheels
+
+import vggtgeo as vg
+
+
+class SquarePixels(vg.terms.CameraTerm):
+    """Both focal lengths are one."""
+
+    def residual(self, parameters: jax.Array) -> jax.Array:
+        return parameters[0] - parameters[1] - 1.0
+
+
+CENTRES, KEYFRAMES = jnp.arange(6.0).reshape(2, 3), [0, 2]
+STEPS = jnp.arange(6.0).reshape(2, 3)
+KINDS = {
+    "pose": lambda **weight: PositionFix(keyframe=KEYFRAMES, position=CENTRES, **weight),
+    "pair": lambda **weight: StepOfWheels(first=[0, 1], second=[1, 2], measured=STEPS, **weight),
+    "camera": SquarePixels,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("given", [{}, {"weight": 2.5}], ids=["default", "number"])
+def test_one_number_is_the_weight_of_each_observation(kind: str, given: dict[str, float]) -> None:
+    """A term with one number as weight, its default in particular, has the energy of one with a list of it, in
+    `with_term` and in `pack`. Oracle: the list, written out.
+    """
+    problem, initial, _ = SCENE.pack()
+    count = 1 if kind == "camera" else 2
+    listed = KINDS[kind](weight=jnp.full(count, given.get("weight", 1.0)))
+    name, short = listed.name, KINDS[kind](**given)
+    expected = vg.analysis.energy_terms(problem.with_term(listed), initial)[name]
+    assert float(expected) > 0
+    packed, start, _ = SCENE.pack(terms=[short])
+    for found, state in ((problem.with_term(short), initial), (packed, start)):
+        assert getattr(found, name).weight.shape == (count,)
+        assert float(vg.analysis.energy_terms(found, state)[name]) == pytest.approx(float(expected), rel=1e-12)
+
+
+def test_one_number_is_the_weight_of_each_row_of_a_flat_term() -> None:
+    """The same of a `FlatTerm`. Oracle: a list of that number."""
+    rows = {"normal": np.tile([0.0, 0.0, 1.0], (3, 1)), "distance": np.full(3, 2.0)}
+    at = {"landmark": SCENE.observations.point_landmark[:3], "edge": SCENE.observations.point_edge[:3]}
+    one, listed = (
+        SCENE.pack(terms=[vg.terms.FlatTerm(PointToPlane, {**rows, "weight": weight}, **at)])[0].point_to_plane.weight
+        for weight in (2.0, np.full(3, 2.0))
+    )
+    assert float(one.sum()) == 6.0
+    np.testing.assert_array_equal(one, listed)
+
+
+@pytest.mark.parametrize("weight", [{}, {"weight": jnp.ones(5)}], ids=["default", "listed"])
+def test_a_flat_term_on_edges_is_refused_by_name(weight: dict[str, jax.Array]) -> None:
+    """A term on edges with one row an observation, or one weight for all of its padding, is an error that names
+    `FlatTerm`, where JAX would speak of an axis. Oracle: the exception.
+    """
+    problem, _, _ = SCENE.pack()
+    flat = PointToPlane(normal=jnp.ones((5, 3)), distance=jnp.ones(5), **weight)
+    with pytest.raises(vg.InputError, match=r"`point_to_plane\.weight` has shape \(5?,?\).*FlatTerm"):
+        problem.with_term(flat)
+    with pytest.raises(vg.InputError, match=r"`point_to_plane\.weight` has shape \(5?,?\).*FlatTerm"):
+        SCENE.pack(terms=[flat])
+
+
+def test_flat_data_beside_padded_weights_are_refused_by_name() -> None:
+    """The field that is flat is the one that is named. Oracle: the exception."""
+    problem, _, _ = SCENE.pack()
+    half = PointToPlane(normal=jnp.ones((5, 3)), distance=jnp.ones(5), weight=problem.points.weight)
+    with pytest.raises(vg.InputError, match=r"`point_to_plane\.normal` has shape \(5, 3\).*FlatTerm"):
+        problem.with_term(half)

@@ -1,0 +1,336 @@
+"""The program: quick to help, one line for an error, and `solve` from file to file."""
+
+import importlib.metadata
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import typer
+from conftest import ROOT
+from invoked import invoke
+from problem_files import SCENE, arrays_of, write
+from typer.testing import CliRunner
+
+from vggtgeo.bundle.objective import energy
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.problem_file import load_problem
+from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command, make_app
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.jax_environment import cache_folder
+
+HEAVY = {"jax", "cv2", "matplotlib", "scipy", "onnxruntime", "rerun", "equinox", "numpy"}
+PROBE = """
+import sys
+sys.argv[1:] = {arguments!r}
+from vggtgeo.cli import main
+try:
+    main()
+finally:
+    print("heavy:", sorted({heavy!r} & set(sys.modules)), file=sys.stderr)
+"""
+
+
+def run_program(*arguments: str, cache: Path) -> subprocess.CompletedProcess[str]:
+    """The program in a process of its own; its last line on stderr names the slow packages it imported."""
+    source = PROBE.format(arguments=list(arguments), heavy=HEAVY)
+    environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
+    command = [sys.executable, "-c", source]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("solve", "--help"), ()])
+def test_help_imports_nothing_slow(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    # Proves that help is quick: no numerical package is imported for it. Oracle: `sys.modules` of a new process.
+    result = run_program(*arguments, cache=tmp_path)
+    assert result.stderr.splitlines()[-1] == "heavy: []", result.stderr
+    assert "Usage" in result.stdout + result.stderr
+
+
+def test_every_command_is_listed(tmp_path: Path) -> None:
+    # Proves that `--help` names each command of the table.
+    listing = invoke("--help").output
+    assert [entry.name for entry in COMMANDS if entry.name not in listing] == []
+
+
+@pytest.mark.parametrize("entry", COMMANDS, ids=lambda entry: entry.name)
+def test_the_table_of_commands_is_true(entry: CommandEntry) -> None:
+    # Proves that each entry finds its function, that it makes a command, and that help tells what its docstring says.
+    command = load_command(entry)
+    assert command.name == entry.name
+    assert command.help.splitlines()[0] == entry.summary
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch):
+    """Puts a command that raises a given exception in the place of `solve`."""
+
+    def install(error: BaseException) -> None:
+        def raising() -> None:
+            raise error
+
+        module = type(sys)("vggtgeo_test_raising")
+        module.__dict__["solve"] = raising
+        monkeypatch.setitem(sys.modules, "vggtgeo_test_raising", module)
+        monkeypatch.setattr(
+            sys.modules["vggtgeo.cli.main"], "COMMANDS", (CommandEntry("solve", "vggtgeo_test_raising", ""),)
+        )
+
+    return install
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (InputError("`x` is 3; it must be 4"), 2, "error: `x` is 3; it must be 4"),
+        (PermissionError(13, "Permission denied", "/root/x"), 2, "error: `/root/x`: Permission denied"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("by zero"), 1, "internal error: ZeroDivisionError: by zero (where: `vggtgeo --debug ...`)"),
+        (typer.Exit(7), 7, ""),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else None,
+)
+def test_an_error_is_one_line_and_a_code(failing, error: BaseException, code: int, message: str) -> None:
+    # Proves what a user sees of each kind of failure: one line on stderr, and an exit code that scripts can read.
+    failing(error)
+    result = invoke("solve")
+    assert result.exit_code == code
+    assert result.stderr.strip() == message
+    assert result.stdout == ""
+
+
+def test_a_warning_for_the_user_is_one_line_and_no_line_of_code(tmp_path: Path) -> None:
+    """Of the input or not, as of a network's answers that cannot be kept; others are shown as Python shows them."""
+    program = (
+        "import importlib, warnings; module = importlib.import_module('vggtgeo.cli.main')\n"
+        "def app():\n    warnings.warn('first\\nsecond', UserWarning); warnings.warn('odd', RuntimeWarning)\n"
+        "module.make_app = lambda: lambda prog_name: app()\n"
+        "module.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path)
+    first, *others = done.stderr.splitlines()
+    assert first == "warning: first second"
+    assert "RuntimeWarning: odd" in others[0]
+
+
+def test_debug_shows_the_traceback(failing) -> None:
+    # Proves that `--debug` lets the exception through, with its traceback.
+    failing(InputError("wrong"))
+    result = invoke("--debug", "solve")
+    assert isinstance(result.exception, InputError)
+
+
+def test_a_command_that_is_not_there() -> None:
+    # Proves that a typing error is answered with the command that was meant.
+    result = invoke("solv")
+    assert result.exit_code == 2
+    assert "solve" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("solv",), "No such command 'solv'. Did you mean 'solve'? (see `vggtgeo --help`)"),
+        (("--bad",), "No such option: --bad (see `vggtgeo --help`)"),
+        (("solve", "--bad"), "No such option: --bad (see `vggtgeo solve --help`)"),
+        (("run",), "Missing argument 'path' (see `vggtgeo run --help`)"),
+        (("demo", "--frames", "many"), "Invalid value for '--frames': "),
+        (("models", "verify"), "Missing argument 'file' (see `vggtgeo models verify --help`)"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line(arguments: tuple[str, ...], message: str) -> None:
+    # Proves that what typer finds wrong is said as briefly as everything else, with where to read on.
+    result = CliRunner().invoke(make_app(), list(arguments), prog_name="vggtgeo")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {message}")
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stdout == ""
+
+
+def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
+    # Proves that the program computes in 64 bits, keeps compiled code in the user's cache folder, adjusts on the
+    # processor, and, where it is told to use a GPU, leaves its memory to others.
+    script = (
+        "from vggtgeo.cli.jax_flags import set_jax_flags; set_jax_flags(); import jax, os; "
+        "print(jax.numpy.ones(1).dtype, jax.config.jax_compilation_cache_dir, "
+        "jax.config.jax_persistent_cache_min_compile_time_secs, os.environ['XLA_PYTHON_CLIENT_PREALLOCATE'], "
+        "jax.config.jax_platforms)"
+    )
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    compiled = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
+    for name in ("JAX_ENABLE_X64", "JAX_PLATFORMS", "XLA_PYTHON_CLIENT_PREALLOCATE", *compiled):
+        environment.pop(name, None)
+    command = [sys.executable, "-c", script]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
+    assert result.stdout.split() == ["float64", str(tmp_path / "vggtgeo" / "jax"), "0.0", "false", "cpu"]
+
+
+def test_no_cache_where_none_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a cache folder that cannot be made is done without.
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert cache_folder() is None
+
+
+def test_solve_from_file_to_file(tmp_path: Path) -> None:
+    # Proves the printed object and the written arrays. Oracle: the layout, and the energies' order.
+    problem, solution = write(tmp_path), tmp_path / "out" / "solution.npz"
+    result = invoke("solve", str(problem), "-o", str(solution), "--json", "--repeat", "3", "--max-steps", "3")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert list(report) == [
+        *("iterations", "energy_initial", "energy_final", "compile_s", "ms_per_iteration", "dtype", "result")
+    ]
+    assert (report["iterations"], report["result"], report["dtype"]) == (3, "max_iterations", "float64")
+    assert 0 < report["energy_final"] < report["energy_initial"]
+    assert report["ms_per_iteration"] > 0
+    start = arrays_of_start()
+    with np.load(solution) as arrays:
+        assert {name: arrays[name].shape for name in arrays.files} == {name: start[name].shape for name in start}
+        assert all(arrays[name].dtype == np.float64 for name in arrays.files)
+        assert np.abs(arrays["T"] - start["T"]).max() > 1e-4
+        np.testing.assert_allclose(arrays["T"][0], start["T"][0], atol=1e-15)
+
+
+def test_float32_reaches_the_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that `--dtype` casts the whole problem, and that energies and solution are in float64 all the same.
+    # Oracle: what the solver is given; it answers with its start, whose energy is known (test_solve.py does the rest).
+    def return_the_start(problem: Problem, start: State, max_steps: int, repeat: int):
+        leaves = jax.tree.leaves((problem, start))
+        assert {leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)} == {np.dtype(np.float32)}
+        return SimpleNamespace(state=start, iterations=0, result="max_iterations"), 1.0, 1.0
+
+    monkeypatch.setattr("vggtgeo.cli.timed_solve.timed_solve", return_the_start)
+    problem, solution = write(tmp_path), tmp_path / "solution.npz"
+    result = invoke("solve", str(problem), "-o", str(solution), "--dtype", "float32", "--json")
+    assert result.exit_code == 0, result.output
+    report, expected = json.loads(result.stdout), float(energy(*load_problem(problem)[:2]))
+    assert (report["dtype"], report["ms_per_iteration"]) == ("float32", None)
+    assert report["energy_initial"] == pytest.approx(expected, rel=1e-12)
+    assert report["energy_final"] == pytest.approx(expected, rel=1e-4)
+    assert report["energy_final"] != report["energy_initial"]
+    with np.load(solution) as arrays:
+        assert all(arrays[name].dtype == np.float64 for name in arrays.files)
+
+
+def test_solve_says_what_is_wrong(tmp_path: Path) -> None:
+    # Proves that a bad file or option ends with a message that names it, and writes nothing.
+    solution = tmp_path / "solution.npz"
+    spoilt = arrays_of_start()["T"]
+    spoilt[1, 4] = np.nan
+    problem = write(tmp_path, T_init=spoilt)
+    cases = [
+        ((str(tmp_path / "no.npz"),), "no.npz` does not exist"),
+        ((str(problem), "--max-steps", "0"), "--max-steps"),
+        ((str(problem), "--dtype", "float16"), "--dtype"),
+        ((str(problem), "--max-steps", "3"), "problem.npz`: `poses[1]` is"),
+    ]
+    for arguments, message in cases:
+        result = invoke("solve", *arguments, "-o", str(solution))
+        assert result.exit_code == 2, result.output
+        assert message in result.stderr
+    assert not solution.exists()
+
+
+def arrays_of_start() -> dict[str, np.ndarray]:
+    """The start of the problem that `write` writes, as a solution's arrays."""
+    arrays = arrays_of(SCENE)
+    return {"T": arrays["T_init"].copy(), "k": arrays["k_init"], "d": arrays["d_init"]}
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    # Proves that `--version` names the version, and ends well. Oracle: the package's metadata.
+    result = invoke("--version")
+    assert result.exit_code == 0
+    assert result.stdout == f"vggtgeo {importlib.metadata.version('vggtgeo')}\n"
+
+
+def test_a_device_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`JAX_PLATFORMS` of a device that JAX does not find was an internal error; oracle: the line."""
+
+    def raising(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
+    monkeypatch.setattr(jax, "devices", raising)
+    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
+    assert result.exit_code == 2
+    assert result.stderr == "error: JAX finds no device for JAX_PLATFORMS=cuda; unset it, or use cpu\n"
+
+
+@pytest.mark.parametrize(
+    ("switch", "error", "code", "line"),
+    [
+        ("JAX_DEBUG_NANS", FloatingPointError("nan"), 2, "error: JAX_DEBUG_NANS makes every NaN an error"),
+        ("JAX_NUMPY_DTYPE_PROMOTION", RuntimeError("strict"), 1, "the environment sets .*JAX_NUMPY_DTYPE_PROMOTION"),
+    ],
+)
+def test_a_switch_of_jax_that_ends_a_command_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, switch: str, error: Exception, code: int, line: str
+) -> None:
+    """What the environment asks of JAX was an internal error without a word of it; oracle: the line."""
+
+    def raising(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setenv(switch, "1")
+    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
+    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
+    assert result.exit_code == code
+    assert re.search(line, result.stderr)
+
+
+def test_a_solve_without_compilation_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`JAX_DISABLE_JIT=1` was an internal error after all the work; oracle: the line, and that nothing is written."""
+    monkeypatch.setenv("JAX_DISABLE_JIT", "1")
+    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
+    assert result.exit_code == 2
+    assert (
+        result.stderr == "error: the environment variable `JAX_DISABLE_JIT` is set, but `solve` needs JIT: unset it\n"
+    )
+    assert not (tmp_path / "solution.npz").exists()
+    assert invoke("data", "list").exit_code == 0
+
+
+def test_a_switch_of_jax_that_is_none_is_named(tmp_path: Path) -> None:
+    """`JAX_ENABLE_X64=maybe` was an internal error: JAX refuses it where it is imported; oracle: the line."""
+    command = [
+        sys.executable,
+        "-c",
+        "from vggtgeo.cli import main; main()",
+        "solve",
+        str(write(tmp_path)),
+        "-o",
+        "x.npz",
+    ]
+    environment = {**os.environ, "JAX_ENABLE_X64": "maybe"}
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
+    assert result.returncode == 2
+    assert result.stderr == "error: the environment variable `JAX_ENABLE_X64` is `maybe`; JAX expects true or false\n"
+
+
+@pytest.mark.parametrize(
+    ("flags", "unknown"),
+    [
+        ("--xla_cpu_multi_thread_eigen=false  --xla_nonsense=1", "--xla_nonsense"),
+        ("--xla_force_host_platform_device_count=2 --xla_cpu_enable_fast_math=false --xla_dump_to=/tmp/--x", None),
+        ("", None),
+    ],
+)
+def test_a_flag_that_xla_does_not_know_is_told(
+    flags: str, unknown: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """XLA itself ends the process in C++; flags that it knows pass. Oracle: the line."""
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    result = CliRunner().invoke(make_app(), ["solve", "no.npz", "-o", "x.npz"])
+    assert result.exit_code == 2
+    told = f"the environment variable `XLA_FLAGS` has `{unknown}`, which jaxlib"
+    assert result.stderr.startswith(f"error: {told}" if unknown else "error: `no.npz` does not exist"), result.stderr

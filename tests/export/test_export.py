@@ -1,0 +1,494 @@
+"""Files for other programs: read back by the programs' own packages, and reprojected."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import struct
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+import pytest
+from plyfile import PlyData
+from posed_keyframes import keyframe_of, slots_of
+from recorded_run import recorded_run
+from reported import raises, warns
+from scipy.spatial.transform import Rotation
+from small_disk import small_disk
+from typer.testing import CliRunner
+from vggtgeo.models.roles import LineMatches, PointMatches
+
+import vggtgeo as vg
+from vggtgeo.cli.main import make_app
+from vggtgeo.datasets import open_sequence
+from vggtgeo.export import FORMATS, export
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.mapping.tracks import Tracks, make_tracks
+from vggtgeo.results.scene import SCENE, Scene, write_scene
+from vggtgeo.slam.sparse_map.covisibility import Pair
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+
+INTRINSICS = np.array([200.0, 210.0, 79.5, 59.5])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short simulated run with depth."""
+    place = tmp_path_factory.mktemp("run") / "room"
+    vg.Result.of(recorded_run().slam).save(place, depth=True)
+    return place
+
+
+def _keyframe(number: int, pose: np.ndarray, pixels: np.ndarray) -> Keyframe:
+    image = np.full((120, 160, 3), 10 * (number + 1), np.uint8)
+    return keyframe_of(number, image, pose, slots_of(pixels, np.ones(len(pixels))), np.full((120, 160), np.nan))
+
+
+def test_tracks_join_matches_and_leave_out_what_misses() -> None:
+    # Proves that matches chained over three views are one track with the point they show, that a false match costs its
+    # observation and not the point, and that two views from one place give no point. Oracle: the points projected.
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (30, 2)), rng.uniform(2, 3, 30)])
+    poses = [np.eye(4) for _ in range(3)]
+    for number, pose in enumerate(poses):
+        pose[0, 3] = -0.2 * number
+        pose[:3, :3] = Rotation.from_rotvec([0, 0.03 * number, 0]).as_matrix()
+    pixels = [rigid.project(points, pose, INTRINSICS) for pose in poses]
+    false = pixels[2].copy()
+    false[:5] += 15.0
+    keyframes = [
+        _keyframe(i, pose, seen) for i, (pose, seen) in enumerate(zip(poses, (*pixels[:2], false), strict=True))
+    ]
+    rows, none = np.arange(30), np.zeros(0, int)
+    pairs = [
+        Pair(i, i + 1, PointMatches(rows, rows, keyframes[i].features.pixels, keyframes[i + 1].features.pixels,
+        np.ones(30)),
+             LineMatches(none, none, np.zeros(0)))
+        for i in range(2)
+    ]  # fmt: skip
+    tracks = make_tracks(keyframes, pairs, INTRINSICS)
+    assert len(tracks) == 30
+    assert len(tracks.point) == 3 * 30 - 5
+    order = np.argsort(tracks.points[:, 0])
+    np.testing.assert_allclose(tracks.points[order], points[np.argsort(points[:, 0])], atol=2e-3)
+    assert tracks.mean_error(np.array(poses), INTRINSICS) < 0.05
+    assert set(tracks.colours.ravel()) == {10}
+    still = [_keyframe(i, np.eye(4), pixels[0]) for i in range(3)]
+    assert len(make_tracks(still, pairs, INTRINSICS)) == 0
+    assert len(make_tracks(keyframes, [], INTRINSICS)) == 0
+
+
+def test_colmap_reads_the_model_and_finds_the_error_that_is_stated(folder: Path, tmp_path: Path) -> None:
+    # Proves the layout, the half pixel, the poses and the tracks: COLMAP's own reprojection error is the stated one.
+    # Oracle: pycolmap.
+    pycolmap = pytest.importorskip("pycolmap")
+    stated = export(folder, "colmap", tmp_path)
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    scene = Scene.load(folder)
+    assert model.num_images() == len(scene.frames) == stated["images"]
+    assert model.num_points3D() == len(scene.tracks) == stated["points"]
+    assert stated["points"] > 50
+    model.update_point_3d_errors()
+    error = stated["mean_reprojection_error_over_points_px"]
+    assert model.compute_mean_reprojection_error() == pytest.approx(error, abs=1e-3)
+    assert 0.01 < error < 2.0
+    for image in model.images.values():
+        assert cv2.imread(str(tmp_path / "images" / image.name)).shape[:2] == scene.size[::-1]
+
+
+def test_the_model_s_bytes_are_those_of_the_format(folder: Path, tmp_path: Path) -> None:
+    # Proves camera, first image and the points' tracks without COLMAP. Oracle: the format's description, read by hand.
+    export(folder, "colmap", tmp_path)
+    scene = Scene.load(folder)
+    camera = struct.unpack("<QiiQQ4d", (tmp_path / "sparse/0/cameras.bin").read_bytes())
+    assert camera[:5] == (1, 1, 1, *scene.size)
+    np.testing.assert_allclose(camera[5:], scene.intrinsics + [0, 0, 0.5, 0.5])
+    raw = (tmp_path / "sparse/0/images.bin").read_bytes()
+    count, number, *pose, camera_id = struct.unpack_from("<Qi7di", raw)
+    assert (count, number, camera_id) == (len(scene.frames), 1, 1)
+    np.testing.assert_allclose(Rotation.from_quat(pose[:4], scalar_first=True).as_matrix(), scene.poses[0, :3, :3])
+    np.testing.assert_allclose(pose[4:], scene.poses[0, :3, 3])
+
+
+def test_nerfstudio_s_poses_and_depth_are_those_of_the_run(folder: Path, tmp_path: Path) -> None:
+    # Proves axes, half pixel and depth unit: a pixel carried to the world by the written pose and depth is the one that
+    # the run's own pose and depth give. Oracle: the run's folder.
+    counts = export(folder, "nerfstudio", tmp_path)
+    written, scene = json.loads((tmp_path / "transforms.json").read_text()), Scene.load(folder)
+    read = open_sequence(tmp_path)  # the reader takes back what was written
+    assert (type(read).__name__, len(read), read.has_depth) == ("Nerfstudio", len(scene.frames), True)
+    np.testing.assert_allclose(read.camera.intrinsics, scene.intrinsics, atol=1e-9)
+    np.testing.assert_allclose(read.ground_truth().poses, np.linalg.inv(scene.poses), atol=1e-6)
+    assert counts["depth_images"] == len(scene.frames) == len(written["frames"])
+    row, column = 120, 200
+    for view, frame in enumerate(written["frames"]):
+        depth = cv2.imread(str(tmp_path / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)[row, column] / 1000
+        assert "mask_path" not in frame
+        if not depth:
+            continue
+        x, y = (column + 0.5 - written["cx"]) / written["fl_x"], (row + 0.5 - written["cy"]) / written["fl_y"]
+        found = np.array(frame["transform_matrix"]) @ [x * depth, -y * depth, -depth, 1.0]
+        own = cv2.imread(str(folder / f"depth/{scene.frames[view]:06d}.depth.png"), cv2.IMREAD_UNCHANGED)[row, column]
+        pixel = np.array([[float(column), float(row)]])
+        expected = rigid.unproject(pixel, np.array([5000.0 / own]), scene.poses[view], scene.intrinsics)
+        np.testing.assert_allclose(found[:3], expected[0], atol=2e-3)
+    assert len(vg.Result.load(folder).cloud) > 100
+    assert (tmp_path / written["ply_file_path"]).is_file()
+
+
+def test_the_mesh_opens_elsewhere(folder: Path, tmp_path: Path) -> None:
+    # Proves that the GLB holds the run's mesh, upright, in its colours, dull. Oracle: trimesh, and its own PLY.
+    trimesh = pytest.importorskip("trimesh")
+    counts = export(folder, "glb", tmp_path)
+    (found,) = trimesh.load(tmp_path / "map.glb").geometry.values()
+    mesh = Mesh.load_ply(folder / "mesh.ply")
+    assert counts == {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    assert len(found.faces) == len(mesh.faces) > 100
+    np.testing.assert_allclose(found.bounds, _bounds(mesh.vertices * [1, -1, -1]), atol=1e-5)
+    assert found.visual.material.metallicFactor == 0
+
+
+def _shown_glb(place: Path) -> np.ndarray:
+    """Colours of a GLB as a viewer shows them: linear factors (glTF 2.0, 3.9.2), by the transfer function of sRGB."""
+    raw = (place / "map.glb").read_bytes()
+    length = struct.unpack_from("<I", raw, 12)[0]
+    head, content = json.loads(raw[20 : 20 + length]), raw[20 + length + 8 :]
+    accessor = head["accessors"][head["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    view = head["bufferViews"][accessor["bufferView"]]
+    kind, full = {5121: (np.uint8, 255), 5123: (np.uint16, 65535), 5126: (np.float32, 1)}[accessor["componentType"]]
+    assert accessor.get("normalized", False) == (full != 1)
+    assert view["byteOffset"] % 4 == 0
+    width = {"VEC3": 3, "VEC4": 4}[accessor["type"]]
+    values = np.frombuffer(content, kind, width * accessor["count"], view["byteOffset"]).reshape(-1, width) / full
+    assert (values[:, 3:] == 1).all()
+    linear = values[:, :3]
+    return np.rint(255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+
+
+def _shown_las(place: Path) -> np.ndarray:
+    laspy = pytest.importorskip("laspy")
+    points = laspy.read(place / "map.las")
+    return np.column_stack([points.red, points.green, points.blue]) / 257
+
+
+def _shown_ply(name: str) -> Callable[[Path], np.ndarray]:
+    def shown(place: Path) -> np.ndarray:
+        vertices = PlyData.read(str(place / name))["vertex"]
+        return np.column_stack([vertices[channel] for channel in ("red", "green", "blue")])
+
+    return shown
+
+
+def _shown_colmap(place: Path) -> np.ndarray:
+    pycolmap = pytest.importorskip("pycolmap")
+    points = pycolmap.Reconstruction(str(place / "sparse/0")).points3D
+    return np.array([points[number].color for number in sorted(points)])
+
+
+@pytest.mark.parametrize(
+    ("to", "shown", "own"),
+    [
+        ("glb", _shown_glb, lambda folder: Mesh.load_ply(folder / "mesh.ply").colours),
+        ("ply", _shown_ply("mesh.ply"), lambda folder: Mesh.load_ply(folder / "mesh.ply").colours),
+        ("ply", _shown_ply("cloud.ply"), lambda folder: PointCloud.load_ply(folder / "map.ply").colours),
+        ("nerfstudio", _shown_ply("points.ply"), lambda folder: PointCloud.load_ply(folder / "map.ply").colours),
+        ("las", _shown_las, lambda folder: PointCloud.load_ply(folder / "map.ply").colours),
+        ("colmap", _shown_colmap, lambda folder: Scene.load(folder).tracks.colours),
+    ],
+    ids=["glb", "mesh.ply", "cloud.ply", "points.ply", "las", "colmap"],
+)
+def test_colours_are_shown_as_those_of_the_pictures(
+    folder: Path,
+    tmp_path: Path,
+    to: str,
+    shown: Callable[[Path], np.ndarray],
+    own: Callable[[Path], np.ndarray],
+) -> None:
+    # Proves that a reader which follows each format shows the run's colours, to the last bit, dark ones included.
+    # Oracle: the formats' descriptions; the colours of the run's own files, some of them all tones of grey.
+    run = shutil.copytree(folder, tmp_path / "run")
+    for name, kind in (("map.ply", PointCloud), ("mesh.ply", Mesh)):
+        made = kind.load_ply(run / name)
+        tones = np.arange(len(made.colours), dtype=np.int64) % 256
+        replace(made, colours=np.column_stack([tones, 255 - tones, tones // 8]).astype(np.uint8)).save_ply(run / name)
+    export(run, to, tmp_path / "out")
+    np.testing.assert_array_equal(shown(tmp_path / "out"), own(run))
+
+
+@pytest.mark.long
+def test_every_frame_with_its_picture(tmp_path: Path) -> None:
+    # Proves that frames which are no keyframes are in the exports, with their poses, pictures and depth, once the run
+    # kept them. Oracle: the run's trajectory and frames; pycolmap, whose reprojection error stays the stated one.
+    run, frames = recorded_run(), recorded_run().sequence
+    result = vg.Result.of(run.slam)
+    folder = tmp_path / "room"
+    result.save(folder, depth="every", frames=frames)
+    scene = Scene.load(folder)
+    assert scene.frames.tolist() == [record.frame for record in run.slam.frames]
+    np.testing.assert_allclose(np.linalg.inv(scene.poses), result.trajectory.poses, atol=1e-9)
+    export(folder, "nerfstudio", tmp_path / "n")
+    written = json.loads((tmp_path / "n/transforms.json").read_text())["frames"]
+    assert len(written) == len(scene.frames) > len(run.slam.keyframes)
+    assert all((tmp_path / "n" / frame["depth_file_path"]).is_file() for frame in written)
+    true = np.array([frame.image for frame in frames.frames()], int)
+    for row, read in enumerate(open_sequence(tmp_path / "n").frames()):
+        assert np.abs(true - read.image).mean(axis=(1, 2, 3)).argmin() == row
+    stated = export(folder, "colmap", tmp_path / "c")
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction(str(tmp_path / "c/sparse/0"))
+    assert model.num_images() == len(scene.frames)
+    model.update_point_3d_errors()
+    error = stated["mean_reprojection_error_over_points_px"]
+    assert model.compute_mean_reprojection_error() == pytest.approx(error, abs=1e-3)
+
+
+def test_borders_that_no_pixel_fills_are_masked(tmp_path: Path) -> None:
+    # Proves that both formats say which pixels an undistorted picture made up, and neither does where there are none.
+    result = vg.Result.of(recorded_run().slam)
+    height, width = result.record.slam.keyframes[0].size
+    seen = np.ones((height, width), bool)
+    seen[:, :3] = False
+    replace(result, record=replace(result.record, valid=seen)).save(tmp_path / "run", depth=True)
+    export(tmp_path / "run", "nerfstudio", tmp_path / "n")
+    export(tmp_path / "run", "colmap", tmp_path / "c")
+    frames = json.loads((tmp_path / "n/transforms.json").read_text())["frames"]
+    names = [f"c/masks/{Path(frame['file_path']).name}.png" for frame in frames]
+    for name in (*names, *(f"n/{frame['mask_path']}" for frame in frames)):
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED) > 0, seen)
+
+
+def _bounds(points: np.ndarray) -> np.ndarray:
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def test_points_for_surveyors(folder: Path, tmp_path: Path) -> None:
+    # Proves places to half a millimetre, upwards as z, and colours of the LAS file. Oracle: laspy, and the run's cloud.
+    laspy = pytest.importorskip("laspy")
+    export(folder, "las", tmp_path)
+    found, cloud = laspy.read(tmp_path / "map.las"), vg.Result.load(folder).cloud
+    x, y, z = np.array(found.x), np.array(found.y), np.array(found.z)
+    np.testing.assert_allclose(np.column_stack([x, -z, y]), cloud.points, atol=6e-4)
+    np.testing.assert_array_equal(np.asarray(found.red) // 257, cloud.colours[:, 0])
+
+
+def test_paths_and_clouds_as_text_and_ply(folder: Path, tmp_path: Path) -> None:
+    # Proves TUM, KITTI and PLY, through the command line. Oracle: the run's own trajectory and map.
+    result = vg.Result.load(folder)
+    for name in ("tum", "kitti", "ply"):
+        done = CliRunner().invoke(
+            make_app(), ["export", str(folder), "--to", name, "-o", str(tmp_path / name), "--json"]
+        )
+        assert done.exit_code == 0, done.output
+        assert json.loads(done.stdout)["format"] == name
+    rows = np.loadtxt(tmp_path / "kitti/poses.txt").reshape(-1, 3, 4)
+    np.testing.assert_allclose(rows, result.trajectory.poses[:, :3], atol=1e-8)
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "kitti/times.txt"), result.trajectory.timestamps, atol=1e-6)
+    assert (tmp_path / "tum/trajectory.txt").read_bytes() == (folder / "trajectory.txt").read_bytes()
+    assert (tmp_path / "ply/cloud.ply").read_bytes() == (folder / "map.ply").read_bytes()
+    assert (tmp_path / "ply/mesh.ply").read_bytes() == (folder / "mesh.ply").read_bytes()
+
+
+def _changed(folder: Path, place: Path) -> Path:
+    """A copy of the run, to be damaged."""
+    return Path(shutil.copytree(folder, place / "copy", ignore=shutil.ignore_patterns("export")))
+
+
+def test_an_export_again_replaces_what_an_export_wrote(folder: Path, tmp_path: Path) -> None:
+    # Proves that a second export replaces the first, in the run's own place also where an older version, which kept no
+    # record, wrote it; and that somebody's file elsewhere stays. Oracle: the files.
+    copy = _changed(folder, tmp_path)
+    own = copy / "export/tum"
+    for target in (None, own, tmp_path / "out"):
+        place = target or own
+        export(copy, "tum", target)
+        written = (place / "trajectory.txt").read_bytes()
+        (place / "trajectory.txt").write_text("old")
+        if place == own:
+            (place / ".vggtgeo-export").unlink()
+        export(copy, "tum", target)
+        assert (place / "trajectory.txt").read_bytes() == written
+    (tmp_path / "out/.vggtgeo-export").unlink()
+    (tmp_path / "out/trajectory.txt").write_text("somebody's")
+    with pytest.raises(vg.InputError, match="was not written by an export"):
+        export(copy, "tum", tmp_path / "out")
+    assert (tmp_path / "out/trajectory.txt").read_text() == "somebody's"
+
+
+def test_no_export_mixes_its_images_with_those_of_a_recording(folder: Path, tmp_path: Path) -> None:
+    # Proves that an export into a recording is refused, whose next run would read both; a second one over the first is
+    # not. Oracle: the files that lie there.
+    recording = tmp_path / "recording"
+    (recording / "images").mkdir(parents=True)
+    shutil.copy(next((folder / "images").iterdir()), recording / "images/mine.jpg")
+    for to in ("nerfstudio", "tum"):
+        with pytest.raises(vg.InputError, match="recording` is a recording; give another folder"):
+            export(folder, to, recording)
+    assert [path.name for path in sorted((recording / "images").iterdir())] == ["mine.jpg"]
+    for to in ("nerfstudio", "colmap", "nerfstudio"):
+        export(folder, to, tmp_path / "new")
+    shutil.copy(recording / "images/mine.jpg", tmp_path / "new/images")
+    with raises("mine.jpg"):
+        export(folder, "nerfstudio", tmp_path / "new")
+
+
+def test_a_full_disk_leaves_the_record_of_what_exports_wrote(folder: Path, tmp_path: Path) -> None:
+    # Proves that an export that cannot note its files any more names the folder, and that the next one still knows the
+    # files of the one before as its own. Oracle: the record's bytes, and that next export.
+    target = tmp_path / "out"
+    export(folder, "tum", target)
+    before = (target / ".vggtgeo-export").read_bytes()
+
+    def other(source: Path, stage: Path) -> dict[str, float]:
+        (stage / f"{'x' * 200}.txt").touch()
+        return {}
+
+    with patch.dict(FORMATS, tum=other), small_disk(100), pytest.raises(OSError, match=r"out/\.vggtgeo-export"):
+        export(folder, "tum", target)
+    assert (target / ".vggtgeo-export").read_bytes() == before
+    with patch.dict(FORMATS, tum=other), small_disk(0), raises(target, error=OSError):
+        export(folder, "tum", target)
+    export(folder, "tum", target)
+
+
+def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) -> None:
+    # Proves that pictures and depth that are none are named, and that what an earlier export wrote stays as it was,
+    # without a trace of the new one. Oracle: the files before.
+    copy, target = _changed(folder, tmp_path), tmp_path / "out"
+    export(copy, "nerfstudio", target)
+    before = {path: path.read_bytes() for path in target.rglob("*") if path.is_file()}
+    depth, picture = next((copy / "depth").glob("*.depth.png")), sorted((copy / "images").iterdir())[-1]
+    whole = depth.read_bytes()
+    cv2.imwrite(str(depth), np.zeros((4, 4, 3), np.uint8))
+    with raises("depth.png", "(4, 4, 3)"):
+        export(copy, "nerfstudio", target)
+    depth.write_bytes(whole)
+    for content, message in ((b"", picture.name), (None, "images/")):
+        picture.unlink() if content is None else picture.write_bytes(content)
+        for name in ("nerfstudio", "colmap"):
+            with pytest.raises(vg.InputError, match=message):
+                export(copy, name, target)
+    assert {path: path.read_bytes() for path in target.rglob("*") if path.is_file()} == before
+    assert {path.name for path in target.iterdir()} == {path.relative_to(target).parts[0] for path in before}
+    with pytest.raises(vg.InputError, match="is the folder of the run itself"):
+        export(copy, "colmap", copy)
+
+
+def test_targets_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None:
+    # Proves that an export does not write among the run's own pictures nor below a file, and leaves no empty folder
+    # where it fails. Oracle: sentences, and the files before.
+    copy = _changed(folder, tmp_path)
+    before = sorted(copy.rglob("*"))
+    with pytest.raises(vg.InputError, match="which is the run's own; give another"):
+        export(copy, "colmap", copy / "images/model")
+    file = tmp_path / "file"
+    file.write_text("somebody's")
+    for target in (file, file / "below"):
+        with pytest.raises(vg.InputError, match=r"/file` is not a folder"):
+            export(copy, "tum", target)
+    (copy / "map.ply").unlink()
+    with raises("map.ply"):
+        export(copy, "las")
+    assert sorted(copy.rglob("*")) == [path for path in before if path.name != "map.ply"]
+
+
+def test_pieces_that_nothing_ties_to_the_map_are_left_out(tmp_path: Path) -> None:
+    # Proves that keyframes of another piece of the map, which stand anywhere, are in no COLMAP model, with their
+    # pictures and what they saw. Oracle: the run whole, and with its last keyframe cut off.
+    slam = recorded_run().slam
+    last = slam.keyframes[-1].number
+    cut = replace(
+        slam,
+        map=replace(
+            slam.map,
+            pairs=tuple(pair for pair in slam.map.pairs if last not in pair.key),
+            factors=tuple(factor for factor in slam.map.factors if last not in factor.keyframes),
+        ),
+    )
+    whole, left = Scene.of(slam), Scene.of(cut)
+    assert list(left.frames) == list(whole.frames[:-1])
+    assert left.tracks.view.max() < len(left.frames)
+    assert 0 < len(left.tracks.point) < len(whole.tracks.point)
+    write_scene(tmp_path, cut)
+    assert {path.name for path in (tmp_path / "images").iterdir()} == {
+        left.image_name(k) for k in range(len(left.frames))
+    }
+
+
+def test_clouds_that_a_format_cannot_hold_are_named(folder: Path, tmp_path: Path) -> None:
+    # Proves the error of a cloud wider than LAS counts millimetres. Oracle: the sentence.
+    pytest.importorskip("laspy")
+    copy = _changed(folder, tmp_path)
+    PointCloud(np.array([[0.0, 0, 0], [3e6, 0, 0]]), np.zeros((2, 3), np.uint8)).save_ply(copy / "map.ply")
+    with pytest.raises(vg.InputError, match=r"map.ply` .*3e\+06 m.*2147484 m"):
+        export(copy, "las", tmp_path / "out")
+
+
+def test_a_run_without_points_or_surfaces_is_refused(folder: Path, tmp_path: Path) -> None:
+    # Proves that a format is not written of nothing, and that the error has the verdict's reason; where the format
+    # needs neither points nor surfaces, a failed verdict is told and the files are written. Oracle: sentences, files.
+    copy = _changed(folder, tmp_path)
+    summary = json.loads((copy / "summary.json").read_text())
+    verdict = {"level": "failed", "reasons": ["only 3 % of the frames were tracked"], "segments": []}
+    (copy / "summary.json").write_text(json.dumps({**summary, "verdict": verdict}))
+    (copy / "mesh.ply").unlink()
+    PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)).save_ply(copy / "map.ply")
+    scene = Scene.load(copy)
+    none = Tracks(*(getattr(scene.tracks, field.name)[:0] for field in fields(Tracks)))
+    SCENE.write(copy / "scene.npz", replace(scene, tracks=none))
+    for name, sentence in (
+        ("colmap", r"scene.npz` .*\(the verdict of the run is failed: only 3 %"),
+        ("nerfstudio", r"map.ply` has no points \(the verdict of the run is failed: only 3 %"),
+        ("ply", "has no points"),
+        ("las", "has no points"),
+        ("glb", "`--dense mvs`"),
+    ):
+        with pytest.raises(vg.InputError, match=sentence):
+            export(copy, name)
+        assert not (copy / "export" / name).exists()
+    with warns("3 %"):
+        export(copy, "tum")
+    assert (copy / "export/tum/trajectory.txt").is_file()
+
+
+def test_an_export_says_what_it_lacks_and_what_its_error_is_of(folder: Path, tmp_path: Path) -> None:
+    # Proves the hint of a nerfstudio export without depth images, and the words beside COLMAP's reprojection error.
+    # Oracle: the sentences.
+    copy = _changed(folder, tmp_path)
+    shutil.rmtree(copy / "depth")
+    with warns("--save-depth"):
+        export(copy, "nerfstudio")
+    done = CliRunner().invoke(make_app(), ["export", str(copy), "--to", "colmap"])
+    assert re.search(r", 0\.\d+ px mean reprojection error over points$", done.stdout.strip()), done.stdout
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
+    # Proves the errors of an empty folder, an unknown format, and a scene of another layout, or damaged.
+    with raises("summary.json"):
+        export(tmp_path, "colmap")
+    with raises("to", "colmap", "'obj'"):
+        export(folder, "obj")
+    assert set(FORMATS) == {"colmap", "nerfstudio", "ply", "glb", "las", "tum", "kitti"}
+    replace(SCENE, version=99).write(tmp_path / "scene.npz", 0)
+    with raises("scene.npz", 99):
+        Scene.load(tmp_path)
+    scene = Scene.load(folder)
+    for name, wrong in (
+        ("view", replace(scene, tracks=replace(scene.tracks, view=scene.tracks.view + 1000))),
+        ("poses", replace(scene, poses=np.zeros(3))),
+        ("frames", replace(scene, frames=np.array([3.0]))),
+        ("frames", replace(scene, frames=0 * scene.frames)),
+        ("Tracks", scene.tracks),
+    ):
+        SCENE.write(tmp_path / "scene.npz", wrong)
+        with raises("scene.npz", name):
+            Scene.load(tmp_path)
+    (tmp_path / "scene.npz").write_bytes((folder / "scene.npz").read_bytes()[:100])
+    with raises("scene.npz"):
+        Scene.load(tmp_path)

@@ -1,0 +1,269 @@
+"""Makers of files that are wrong, one way each; every maker writes into a folder and gives the file or the folder."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tiny_sequences as tiny
+from changed_file import with_arrays, with_header
+from picture_bytes import TURN
+from problem_files import SCENE, arrays_of
+
+from vggtgeo.bundle.problem_file import save_problem
+
+WIDTH, HEIGHT = 64, 48
+
+
+def picture(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """A smooth random picture, uint8 [H, W, 3]."""
+    noise = np.random.default_rng(seed).integers(0, 255, (height, width, 3)).astype(np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 1.5)
+
+
+def frames(folder: Path, count: int = 3, calibration: str | bytes | None = "55 55 31.5 23.5\n") -> Path:
+    """A folder of good images."""
+    for row in range(count):
+        tiny.write_image(folder / f"{row}.png", picture(row))
+    if calibration is not None:
+        content = calibration.encode() if isinstance(calibration, str) else calibration
+        (folder / "calibration.txt").write_bytes(content)
+    return folder
+
+
+def with_image(content: Callable[[], bytes], suffix: str = ".png") -> Callable[[Path], Path]:
+    """Good images, of which the second is replaced by these bytes."""
+
+    def make(folder: Path) -> Path:
+        frames(folder / "frames")
+        (folder / "frames/1.png").unlink()
+        (folder / f"frames/1{suffix}").write_bytes(content())
+        return folder / "frames"
+
+    return make
+
+
+def beside(change: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """Good images, and something that `change` does in their folder."""
+
+    def make(folder: Path) -> Path:
+        change(frames(folder / "frames"))
+        return folder / "frames"
+
+    return make
+
+
+def recorded(make: Callable[[Path], Path], change: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """A recording in the layout of a benchmark or an app, in which `change` has changed something."""
+
+    def both(folder: Path) -> Path:
+        place = make(folder / "scan")
+        change(place)
+        return place
+
+    return both
+
+
+def encoded(suffix: str, image: np.ndarray | None = None, *options: int) -> bytes:
+    """A whole file of an image."""
+    return cv2.imencode(suffix, picture(1) if image is None else image, list(options))[1].tobytes()
+
+
+def cut_jpeg(progressive: bool = False) -> bytes:
+    """Half a JPEG, with an end mark."""
+    whole = encoded(".jpg", picture(1, 320, 240), cv2.IMWRITE_JPEG_PROGRESSIVE, int(progressive))
+    return whole[: len(whole) // 2] + b"\xff\xd9"
+
+
+def damaged_jpeg() -> bytes:
+    """A JPEG of which bytes in the middle are others, so that the blocks after them come to lie elsewhere."""
+    whole = bytearray(encoded(".jpg", picture(1)))
+    place = len(whole) // 2
+    whole[place : place + 32] = np.random.default_rng(0).integers(0, 255, 32).astype(np.uint8).tobytes()
+    return bytes(whole)
+
+
+def turned_jpeg() -> bytes:
+    """A JPEG that asks to be turned by 90 degrees."""
+    part = b"Exif\0\0" + TURN
+    whole = encoded(".jpg")
+    return whole[:2] + b"\xff\xe1" + struct.pack(">H", len(part) + 2) + part + whole[2:]
+
+
+def huge_png(width: int = 60000, height: int = 60000) -> bytes:
+    """A PNG of some bytes that declares more pixels than fit into memory."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
+    )
+
+
+def rgbd(change: Callable[[Path], Any]) -> Callable[[Path], Path]:
+    """A TUM folder in which `change` has changed something."""
+
+    def make(folder: Path) -> Path:
+        tiny.tum(folder / "desk", count=4)
+        change(folder / "desk")
+        return folder / "desk"
+
+    return make
+
+
+def every_depth(image: Callable[[], np.ndarray]) -> Callable[[Path], Path]:
+    """A TUM folder whose depth images are all of this kind."""
+
+    def change(folder: Path) -> None:
+        for file in (folder / "depth").iterdir():
+            cv2.imwrite(str(file), image())
+
+    return rgbd(change)
+
+
+def write(name: str, content: str | bytes) -> Callable[[Path], Any]:
+    """Writes one file of a folder anew."""
+    return lambda folder: (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def video(path: Path, count: int = 12, walk: bool = False) -> Path:
+    """A video that can be read: pictures that have nothing in common, or a walk along one."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+    scene = picture(0, WIDTH + count, HEIGHT)
+    for row in range(count):
+        writer.write(np.ascontiguousarray(scene[:, row : row + WIDTH]) if walk else picture(row))
+    writer.release()
+    return path
+
+
+def holed_video(folder: Path) -> Path:
+    """A video whose data are zeros from four tenths to half, as a download in pieces leaves them."""
+    whole = bytearray(video(folder / "clip.mp4", 40, walk=True).read_bytes())
+    start = whole.index(b"mdat") + 4
+    length = int.from_bytes(whole[start - 8 : start - 4], "big") - 8
+    hole = slice(start + length * 4 // 10, start + length * 5 // 10)
+    whole[hole] = bytes(hole.stop - hole.start)
+    (folder / "clip.mp4").write_bytes(whole)
+    (folder / "calibration.txt").write_text("55 55 31.5 23.5")
+    return folder / "clip.mp4"
+
+
+def problem(**changes: Any) -> Callable[[Path], Path]:
+    """A problem file of the flat layout with other arrays; None leaves one out; functions get what was there."""
+
+    def make(folder: Path) -> Path:
+        arrays: dict[str, Any] = dict(arrays_of(SCENE))
+        for name, change in changes.items():
+            arrays[name] = change(np.array(arrays[name])) if callable(change) else change
+        np.savez(folder / "problem.npz", **{name: array for name, array in arrays.items() if array is not None})
+        return folder / "problem.npz"
+
+    return make
+
+
+def put(index: Any, value: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """A copy with `value` at `index`."""
+
+    def change(array: np.ndarray) -> np.ndarray:
+        array[index] = value
+        return array
+
+    return change
+
+
+def without_keyframe(number: int) -> Callable[[Path], Path]:
+    """A problem in which no match of positive weight reaches a keyframe."""
+    seen = SCENE.observations
+    touches = lambda edge: (seen.edges[edge] == number).any(axis=1)
+    return problem(
+        pt_weight=np.where(touches(seen.point_edge), 0.0, seen.point_weight),
+        ln_weight=np.where(touches(seen.line_edge), 0.0, seen.line_weight),
+    )
+
+
+def member(name: str, header: dict[str, Any] | None, data: bytes = b"", **changes: Any) -> Callable[[Path], Path]:
+    """A problem file in which the member `name` has a header and data of one's own."""
+
+    def make(folder: Path) -> Path:
+        good = problem(**{name: None}, **changes)(folder)
+        file = io.BytesIO()
+        if header is not None:
+            np.lib.format.write_array_header_1_0(file, header)
+        with zipfile.ZipFile(good, "a", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(f"{name}.npy", file.getvalue() + data)
+        return good
+
+    return make
+
+
+def saved(
+    arrays: Callable[[dict[str, np.ndarray]], Any] = lambda old: None,
+    header: Callable[[dict[str, Any]], Any] = lambda old: None,
+) -> Callable[[Path], Path]:
+    """A problem that `save_problem` wrote, with other arrays or another header."""
+
+    def make(folder: Path) -> Path:
+        save_problem(folder / "saved.npz", *SCENE.pack())
+        return with_header(with_arrays(folder / "saved.npz", arrays), header)
+
+    return make
+
+
+def nested(header: dict[str, Any]) -> None:
+    """A header whose tree is nested 900 times."""
+    header["tree"] = []
+    for _ in range(900):
+        header["tree"] = [header["tree"]]
+
+
+def file(name: str, content: str | bytes) -> Callable[[Path], Path]:
+    """One file alone."""
+
+    def make(folder: Path) -> Path:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    return make
+
+
+def lengthened(path: Path, size: int = 20_000_000_000) -> Path:
+    """A file with a hole behind what it holds, so that it is of any size and takes no space."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    os.truncate(path, size)
+    return path
+
+
+def truth(lines: str | bytes) -> Callable[[Path], Path]:
+    """A trajectory file."""
+    return file("truth.txt", lines)
+
+
+def walk(path: Path, seed: int, count: int = 60, start: float = 0.0) -> Path:
+    """A trajectory with turns of its own, 30 poses a second."""
+    rng = np.random.default_rng(seed)
+    position, angle = rng.normal(size=(count, 3)).cumsum(0) * 0.02, rng.normal(size=count).cumsum() * 0.1
+    rows = [
+        f"{start + row / 30:.6f} {x} {y} {z} 0 {np.sin(a / 2)} 0 {np.cos(a / 2)}"
+        for row, ((x, y, z), a) in enumerate(zip(position, angle, strict=True))
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def ply(header: str, data: bytes = b"") -> Callable[[Path], Path]:
+    """A PLY file."""
+    return file("map.ply", f"ply\n{header}end_header\n".encode() + data)

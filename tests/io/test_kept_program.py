@@ -1,0 +1,189 @@
+"""Programs that are kept between processes: what runs is what was written, and nothing is kept that has no lasting
+name.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vggtgeo as vg
+from vggtgeo.io import kept_program
+from vggtgeo.io.kept_program import KeptProgram
+from vggtgeo.slam.window.sliding_window import solve_jit
+
+TRACED: list[str] = []
+
+
+class Pair(NamedTuple):
+    sum: jax.Array
+    scaled: jax.Array
+
+
+def pair(first: jax.Array, second: jax.Array, factor: float) -> Pair:
+    TRACED.append("pair")
+    return Pair(first + second, factor * first)
+
+
+def _as_pair(first: jax.Array, second: jax.Array, factor: float) -> Pair:
+    return Pair(first, second)
+
+
+@pytest.fixture
+def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Where programs are kept, of this module, too."""
+    place = tmp_path / "programs"
+    monkeypatch.setattr(kept_program, "_folder", lambda: place)
+    monkeypatch.setattr(kept_program, "LASTING", (*kept_program.LASTING, __name__.split(".")[0]))
+    TRACED.clear()
+    return place
+
+
+ONE, TWO = np.arange(3.0), np.full(3, 2.0)
+
+
+def _expected(found: Pair, factor: float) -> None:
+    np.testing.assert_array_equal(found.sum, ONE + TWO)
+    np.testing.assert_array_equal(found.scaled, factor * ONE)
+
+
+def test_another_process_traces_nothing(folder: Path) -> None:
+    """A second program object is a second process: it reads what the first wrote; oracle: NumPy, and a count."""
+    _expected(KeptProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
+    _expected(KeptProgram(pair, _as_pair)(jnp.asarray(ONE), jnp.asarray(TWO), 3.0), 3.0)
+    assert TRACED == ["pair"]
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_shapes_and_static_parts_have_programs_of_their_own(folder: Path) -> None:
+    program = KeptProgram(pair, _as_pair)
+    for factor in (3.0, 4.0, 3.0):
+        _expected(program(ONE, TWO, factor), factor)
+    assert program(np.ones(2), np.ones(2), 3.0).sum.shape == (2,)
+    assert program.prepared == 3
+    assert len(list(folder.iterdir())) == 3
+
+
+def test_a_program_takes_what_a_program_returned(folder: Path) -> None:
+    """Without a second compilation: such arrays name their device, which is another case for JAX's own `jit`. Oracle:
+    JAX's count.
+    """
+    compiled: list[str] = []
+    count = lambda name, seconds, **_: compiled.append(name) if "backend_compile" in name else None
+    program = KeptProgram(pair, _as_pair)
+    first = program(jnp.asarray(ONE), jnp.asarray(TWO), 3.0)
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        again = program(first.sum, first.scaled, 3.0)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
+    np.testing.assert_array_equal(again.sum, ONE + TWO + 3 * ONE)
+    assert compiled == []
+
+
+ELSEWHERE = """
+import jax, numpy as np
+jax.config.update("jax_num_cpu_devices", 2)
+import test_kept_program as own
+from vggtgeo.io import kept_program
+kept_program.LASTING = (*kept_program.LASTING, "test_kept_program")
+program = kept_program.KeptProgram(own.pair, own._as_pair)
+for device in (*jax.devices(), jax.devices()[0]):
+    found = program(jax.device_put(own.ONE, device), jax.device_put(own.TWO, device), 3.0)
+    assert found.sum.devices() == {device}, found.sum.devices()
+    np.testing.assert_array_equal(found.sum, own.ONE + own.TWO)
+assert program.prepared == 1
+"""
+
+
+@pytest.mark.long
+def test_arrays_on_another_device_stay_there(tmp_path: Path) -> None:
+    """On two devices of one processor; oracle: NumPy, and where the result lies."""
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", ELSEWHERE]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert len(list((tmp_path / "programs").iterdir())) == 1
+
+
+def test_changed_sources_have_another_program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    KeptProgram(pair, _as_pair)(ONE, TWO, 3.0)
+    monkeypatch.setattr(kept_program, "_sources", lambda: "changed")
+    KeptProgram(pair, _as_pair)(ONE, TWO, 3.0)
+    assert TRACED == ["pair", "pair"]
+    assert len(list(folder.iterdir())) == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"no program", None], ids=["empty", "text", "half"])
+def test_a_damaged_file_is_made_anew(folder: Path, content: bytes | None) -> None:
+    KeptProgram(pair, _as_pair)(ONE, TWO, 3.0)
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2] if content is None else content)
+    _expected(KeptProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
+    _expected(KeptProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
+    assert TRACED == ["pair", "pair"]
+
+
+def test_what_has_no_lasting_name_is_not_kept(folder: Path) -> None:
+    """A function made inside a function, and a kernel of a user's own: another process may mean another by it."""
+
+    class Own(vg.kernels.AbstractKernel):
+        def rho(self, s: jax.Array) -> jax.Array:
+            return s
+
+    _expected(KeptProgram(lambda *given: pair(*given[:2], given[2]), _as_pair)(ONE, TWO, 3.0), 3.0)
+    assert kept_program._lasting_name(Own()) is None
+    assert kept_program._lasting_name((1.0, Own)) is None
+    assert kept_program._lasting_name(vg.kernels.Cauchy(1.0)) is not None
+    assert not folder.exists()
+
+
+def test_a_result_of_another_structure_is_not_kept(folder: Path) -> None:
+    _expected(KeptProgram(pair, lambda first, second, factor: first)(ONE, TWO, 3.0), 3.0)
+    assert not folder.exists()
+
+
+def test_a_folder_that_cannot_be_written_costs_time_alone(folder: Path) -> None:
+    folder.write_text("a file")
+    _expected(KeptProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
+
+
+def test_traced_arguments_pass_through(folder: Path) -> None:
+    program = KeptProgram(pair, _as_pair)
+    slope = jax.grad(lambda first: jnp.sum(program(first, jnp.asarray(TWO), 3.0).scaled))(jnp.asarray(ONE))
+    np.testing.assert_array_equal(slope, np.full(3, 3.0))
+    assert not folder.exists()
+
+
+def test_without_a_cache_nothing_is_kept() -> None:
+    """JAX's own switches decide: its folder, and whether it keeps anything."""
+    assert kept_program._folder() == Path(jax.config.jax_compilation_cache_dir) / "programs"
+    jax.config.update("jax_enable_compilation_cache", False)
+    try:
+        assert kept_program._folder() is None
+    finally:
+        jax.config.update("jax_enable_compilation_cache", True)
+
+
+@pytest.mark.long
+def test_a_kept_solve_is_the_solve(folder: Path) -> None:
+    """The whole solution, read from a file; oracle: `solve` under `jit`, to the last digit."""
+    window = vg.simulate_window(noise=0.5)
+    problem, initial, _ = window.pack()
+    solver = vg.SchurLevenbergMarquardt(max_iterations=8, record_iterations=True)
+    for _ in range(2):
+        found = KeptProgram(solve_jit._function, solve_jit._result)(problem, initial, solver)
+    assert len(list(folder.iterdir())) == 1
+    expected = jax.jit(lambda p, i: vg.solve(p, i, solver=solver))(problem, initial)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -1,0 +1,255 @@
+"""The lens of a camera that nobody calibrated is found, and taken out of the map. Truth: what pixels were bent by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from distorted_sequence import Bent
+from recorded_run import ROLES, SETTINGS, recorded_run
+from reported import raises
+from vggtgeo.models.classical import NoDepth, SiftMatcher
+
+import vggtgeo as vg
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry import pinhole
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.camera_models import SquarePinhole
+from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
+from vggtgeo.slam.global_map.global_adjustment import _taken_lens, undistorted
+from vggtgeo.slam.known_map import as_map, entered
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.tracker import SeenPoints
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.judge import aligned
+from vggtgeo.slam.verdict.witness import FrameEvidence
+
+WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
+_solve = eqx.filter_jit(vg.solve)
+
+
+def bent(window: vg.data.SimulatedWindow, *distortion: float) -> vg.data.SimulatedWindow:
+    """Its key points and matches as a lens draws them."""
+    lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *distortion, 0.0, 0.0]))
+    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
+    curve = lambda pixels: np.asarray(
+        jax.vmap(lambda pixel: lens.project(straight.unproject(pixel)))(jnp.asarray(pixels))
+    )
+    seen = window.observations
+    return replace(window, observations=replace(seen, point_target=curve(seen.point_target), pixel=curve(seen.pixel)))
+
+
+def found_in(window: vg.data.SimulatedWindow, focal: float) -> FoundLens:
+    """Adjusted as a pinhole that begins `focal` times too long, as a guess does, then sought."""
+    _, _, cx, cy = window.intrinsics
+    guess = np.array([focal * window.intrinsics[0], cx, cy])
+    packed = vg.pack(
+        window.observations,
+        window.start,
+        guess,
+        1.0 / window.observations.depth_mean,
+        intrinsics_sigma=np.full(3, 0.3 * guess[0]),
+        camera=SquarePinhole,
+    )
+    problem = packed[0]
+    size = (round(2 * cy + 1), round(2 * cx + 1))
+    solve = lambda problem, state: _solve(problem, state).state
+    found = find_lens(problem, solve(problem, packed[1]), size, solve)
+    assert found is not None
+    return found
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(2))
+def test_a_lens_is_found(seed: int) -> None:
+    # Proves that distortion that nobody told is found beside a focal length that begins 10 % off, and how far it moves
+    # pixels. Oracle: the lens that the pixels were bent with.
+    window = vg.simulate_window(seed=seed, **WINDOW)
+    found = found_in(bent(window, -0.15, 0.05), 1.1)
+    f, _, cx, cy = found.camera.intrinsics
+    assert f == pytest.approx(window.intrinsics[0], rel=0.01)
+    assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.camera}"
+    corner = np.hypot(cx, cy) / f
+    drawn = lambda k1, k2, r: f * r * (k1 * r**2 + k2 * r**4)
+    inside = np.linspace(0, 0.7 * corner, 20)
+    k1, k2, *tangential = found.camera.distortion
+    assert np.abs(drawn(k1, k2, inside) - drawn(-0.15, 0.05, inside)).max() < 1.5
+    assert tangential == [0.0, 0.0]
+    assert found.warp == pytest.approx(np.abs(drawn(k1, k2, np.linspace(0, corner * 1.07, 50))).max(), rel=0.3)
+
+
+@pytest.mark.long
+def test_no_lens_is_found_where_there_is_none() -> None:
+    # Proves that noise alone is no lens, in six windows. Oracle: the pinhole that they were drawn with.
+    found = [found_in(vg.simulate_window(seed=seed, **WINDOW), 1.1) for seed in range(6)]
+    assert not any(each.pays for each in found), [(each.gain, each.needed, each.camera) for each in found]
+
+
+def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
+    # Proves that a focal length below zero, or NaN, as a solver may end with, does not end the run. Oracle: the rule.
+    window = vg.simulate_window(3, 12, 0)
+    _, _, cx, cy = window.intrinsics
+    guess = window.observations, window.start, np.array([window.intrinsics[0], cx, cy])
+    problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, camera=SquarePinhole)
+    for focal in (-1.0, float("nan")):
+        ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[0].set(f))
+        assert find_lens(problem, state, (480, 640), ends_at) is None
+
+
+def test_few_keyframes_tell_no_lens() -> None:
+    # Proves that as many keyframes as the camera has parameters explain any lens, and so tell none. Oracle: the count.
+    packed = []
+    for keyframes in (5, 7):
+        window = vg.simulate_window(keyframes, 12, 0)
+        _, _, cx, cy = window.intrinsics
+        guess = window.observations, window.start, np.array([window.intrinsics[0], cx, cy])
+        problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, camera=SquarePinhole)
+        packed.append(find_lens(problem, state, (480, 640), lambda _, state: state))
+    few, enough = packed
+    assert few is not None
+    assert enough is not None
+    assert few.needed == float("inf")
+    assert enough.needed < float("inf")
+
+
+def test_a_lens_that_does_not_pay_is_not_taken() -> None:
+    # Proves that the state stays where matches do not ask for a lens, or it folds the image. Oracle: the state.
+    slam = settled(recorded_run().states[-1])
+    assert slam.window.solved is not None
+    adjustment, state = slam.window.solved
+    left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
+    for found in (None, left_out, replace(left_out, warp=float("inf"))):
+        assert _taken_lens(slam, adjustment, found) is slam
+
+
+def test_a_lens_that_folds_the_image_is_none() -> None:
+    # Proves that coefficients that draw a farther point nearer, as bad data may ask for, move pixels without a bound,
+    # and that a lens that keeps their order does not. Oracle: k1 = -1 folds at a radius of 0.58 focal lengths, and the
+    # corner's is 0.71; 0.1 moves the farthest corner by what solves the cubic.
+    assert largest_shift(replace(LENS, distortion=(-1.0, 0.0, 0.0, 0.0))) == float("inf")
+    # k1 = -0.35 folds between the sides, 0.57 away, and the corners: a picture without its corners. There the
+    # derivative of r - 0.35 r^3 is zero, and the shift 0.35 r^3.
+    folded = largest_shift(replace(LENS, distortion=(-0.35, 0.0, 0.0, 0.0)))
+    assert folded == pytest.approx(LENS.intrinsics[0] * 0.35 * (1 / np.sqrt(1.05)) ** 3, rel=0.02)
+    f, _, cx, cy = LENS.intrinsics
+    corner = np.hypot(max(cx, 160 - cx), max(cy, 120 - cy)) / f
+    (ideal,) = [root.real for root in np.roots([0.1, 0.0, 1.0, -corner]) if abs(root.imag) < 1e-9]
+    shift = largest_shift(replace(LENS, distortion=(0.1, 0.0, 0.0, 0.0)))
+    assert shift == pytest.approx(f * (corner - ideal), rel=0.02)
+
+
+LENS = Camera((140.0, 140.0, 80.0, 58.0), 160, 120, (-0.2, 0.03, 0.0, 0.0), known=False)
+
+
+@cache
+def run_of_room() -> Slam:
+    *_, slam = vg.run(vg.simulate("room", 6, size=(160, 120), rate=10.0), ROLES, SETTINGS)
+    return settled(slam)
+
+
+def redrawn(pixels: np.ndarray) -> np.ndarray:
+    """Ideal pixels as the lens draws them: by this package's model, not by OpenCV."""
+    lens = vg.cameras.RadialTangential(jnp.asarray([*LENS.intrinsics, *LENS.distortion]))
+    rays = jnp.asarray(pinhole.rays(pixels.reshape(-1, 2), LENS.intrinsics))
+    return np.asarray(jax.vmap(lens.project)(rays)).reshape(pixels.shape)
+
+
+def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
+    # Proves that key points (those of frames, too), matches, segments and samples are where the ideal camera has them,
+    # pictures and depth are resampled alike, and poses and depths stay. Oracle: each goes back through the lens to its
+    # old place.
+    before = run_of_room()
+    kept = SeenPoints(np.arange(2, dtype=np.int32), np.array([[20.0, 15.0], [140.0, 90.0]], np.float32))
+    before = replace(
+        before, tracker=replace(before.tracker, frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
+    )
+    assert can_undistort(before.keyframes)
+    after = undistorted(before, LENS)
+    assert after.camera.lens is LENS
+    np.testing.assert_array_equal(after.intrinsics, LENS.intrinsics)
+    for old, new in zip(before.keyframes, after.keyframes, strict=True):
+        for name in ("points", "samples"):
+            moved, place = getattr(new, name), getattr(old, name)
+            np.testing.assert_allclose(redrawn(moved.pixels), place.pixels, atol=1e-3)
+            np.testing.assert_array_equal(moved.inverse_depth, place.inverse_depth)
+        np.testing.assert_allclose(redrawn(new.features.pixels), old.features.pixels, atol=1e-3)
+        ends = new.lines.segments.endpoints
+        np.testing.assert_allclose(redrawn(ends), old.lines.segments.endpoints, atol=1e-3)
+        np.testing.assert_array_equal(new.pose, old.pose)
+        grid = np.stack(np.meshgrid(np.arange(60, 100), np.arange(40, 80)), -1).reshape(-1, 2)
+        columns, rows = np.rint(redrawn(grid.astype(float))).astype(int).T
+        np.testing.assert_array_equal(new.depth[grid[:, 1], grid[:, 0]], old.depth[rows, columns])
+        off = new.image[grid[:, 1], grid[:, 0]].astype(int) - old.image[rows, columns]
+        assert np.median(np.abs(off)) <= 8
+    for old_pair, new_pair in zip(before.map.pairs, after.map.pairs, strict=True):
+        np.testing.assert_allclose(redrawn(new_pair.points.pixels_i), old_pair.points.pixels_i, atol=1e-3)
+        np.testing.assert_allclose(redrawn(new_pair.points.pixels_j), old_pair.points.pixels_j, atol=1e-3)
+    last = after.frames[-1].seen
+    assert last is not None
+    np.testing.assert_allclose(redrawn(last.pixels), kept.pixels, atol=1e-3)
+
+
+def test_corners_of_the_verdict_go_through_the_lens() -> None:
+    # Proves that the witness sees the same camera as the map. Oracle: what it is given, back through the lens.
+    slam = undistorted(run_of_room(), LENS)
+    seen = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]], np.float32)
+    nothing = np.zeros(3, np.float32)
+    noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing) for r in slam.frames]
+    given = aligned(slam, Claim.of(slam), noted)
+    assert given is not None
+    assert len(given) == len(slam.frames) > 1
+    np.testing.assert_allclose(redrawn(given[0].pixels), seen, atol=1e-3)
+
+
+def test_descriptors_that_hold_their_image_keep_the_pinhole() -> None:
+    # Proves that a map whose matcher looks at images of its own is left alone. Oracle: the rule.
+    slam = run_of_room()
+    first = slam.keyframes[0]
+    other = replace(first, features=replace(first.features, descriptors=object()))
+    assert not can_undistort((other, *slam.keyframes[1:]))
+
+
+def test_a_camera_that_was_found_goes_with_its_map() -> None:
+    # Proves that a map of a guessed camera takes the calibration that its run found, and refuses another, such as what
+    # the run began with; and that a run in the map holds what was found. Oracle: the rule.
+    guess = np.array([160.0, 160.0, 79.5, 59.5])
+    known = as_map(undistorted(run_of_room(), LENS))
+    known = replace(known, camera=replace(known.camera, given=guess, sigma=np.full(4, 48.0)))
+    within = entered(known, replace(LENS, known=True), SiftMatcher())
+    assert within.camera.self_calibrated
+    assert within.camera.given.tolist() == list(LENS.intrinsics)
+    with raises("140.0", "80.0", "58.0"):
+        entered(known, Camera((160.0, 160.0, 79.5, 59.5), 160, 120), SiftMatcher())
+
+
+@pytest.mark.slow  # three minutes: first passes, a run, its last adjustment
+def test_a_phone_without_calibration_from_end_to_end(tmp_path: Path) -> None:
+    # Proves that images alone, of an unknown lens that bends corners by many pixels, give its focal length to 3 %, a
+    # word on it, a summary that says it, and a map that frames as they were drawn are found in again. Oracle: the lens
+    # that drew them.
+    office = vg.simulate("office", 60, size=(320, 240), rate=10.0)
+    frames = Bent(office, replace(office.camera, distortion=(-0.08, -0.02, 0.0, 0.0)))
+    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), dense="none")
+    lens = result.summary["lens"]
+    assert lens["fx"] == pytest.approx(frames.lens.intrinsics[0], rel=0.03)
+    assert result.intrinsics[0] == pytest.approx(lens["fx"], rel=0.01)
+    assert any(note.startswith("self-calibration") and "k1" in note for note in result.summary["notes"])
+    assert evaluate_trajectory(result.trajectory, frames.ground_truth()).sim3.statistics.rmse < 0.02
+    result.save_map(tmp_path / "office.map")
+    known = vg.load_map(tmp_path / "office.map")
+    assert known.camera.lens is not None
+    fixed = replace(vg.SlamSettings(), keyframes=replace(vg.SlamSettings().keyframes, localise_only=True))
+    *_, again = vg.run(frames, vg.Roles(depth=NoDepth()), fixed, start=20, end=24, known_map=known)
+    places = [np.linalg.inv(again.pose(record))[:3, 3] for record in again.frames if record.tracked]
+    assert len(places) >= 3
+    own = result.trajectory.poses[20:24, :3, 3][-len(places) :]
+    span = np.linalg.norm(np.ptp(result.trajectory.poses[:, :3, 3], axis=0))
+    assert np.linalg.norm(np.array(places) - own, axis=1).max() < 0.02 * span

@@ -1,0 +1,250 @@
+"""Self-calibration: an unknown camera is estimated on calibration frames, and the run begins with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from killed import Killed, KilledAfter
+from recorded_run import FRAMES, ROLES, SETTINGS, recorded_run, walk
+from vggtgeo.models.onnx.bounds import Refusals
+
+import vggtgeo as vg
+import vggtgeo.results.reconstruction as reconstruction
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.errors import InputWarning
+from vggtgeo.results.checkpoints import Checkpoints
+from vggtgeo.slam import self_calibration
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pipeline import begin
+from vggtgeo.slam.run import run_frames
+from vggtgeo.slam.settings.presets import Perception
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.window_steps import camera_prior
+
+GUESS = Camera.guess(320, 240)
+LENS = Camera((280.0, 280.0, 158.0, 121.0), 320, 240, (-0.1, 0.01, 0.0, 0.0), known=False)
+
+
+def found(**camera: Any) -> Slam:
+    """What the last adjustment of self-calibration gives: the recorded run's map, with a camera of its own."""
+    slam = recorded_run().slam
+    keyframes = (slam.keyframes * self_calibration.MIN_KEYFRAMES)[: self_calibration.MIN_KEYFRAMES]
+    estimate = replace(slam.camera, intrinsics=np.array(LENS.intrinsics), **camera)
+    return replace(slam, map=replace(slam.map, keyframes=keyframes), camera=estimate)
+
+
+def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
+    """The state that self-calibration gives whose last adjustment ends with `end`."""
+    monkeypatch.setattr(
+        self_calibration, "run_frames", lambda *_: iter([replace(end, camera=replace(end.camera, lens=None))])
+    )
+    monkeypatch.setattr(self_calibration, "finish", lambda *_: end)
+    return self_calibration.self_calibrate(tuple, GUESS, ROLES, SETTINGS)
+
+
+def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that camera and lens are handed on, with a word for the user, and nothing else of the pass.
+    slam = begun(monkeypatch, found(lens=LENS))
+    assert slam is not None
+    assert slam.camera.self_calibrated
+    assert slam.camera.lens == LENS
+    assert slam.intrinsics.tolist() == slam.camera.given.tolist() == list(LENS.intrinsics)
+    for focal in (280.0, 5000.0):
+        far = replace(slam, camera=replace(slam.camera, given=np.array([focal, focal, 158.0, 121.0])))
+        assert not far.camera.calibrated, "the last adjustment estimates it once more"
+    assert (slam.frames, slam.keyframes, slam.map.factors) == ((), (), ())
+    assert "280.0 px (images of 320 x 240), lens distortion k1 -0.100" in slam.notes[0]
+    plain = begun(monkeypatch, found())
+    assert plain is not None
+    assert plain.camera.lens is None
+    assert plain.notes[0].endswith("focal length 280.0 px (images of 320 x 240)")
+
+
+def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
+    # Proves that a window of two keyframes leaves a camera that nobody gave where it is, that one of three does not,
+    # and that the verdict knows which of them it has. Oracle: the standard deviations of the priors.
+    slam = recorded_run().slam
+    wide = replace(slam, camera=replace(slam.camera, sigma=np.full(4, 100.0), self_calibrated=False))
+    for count, held in ((2, True), (3, False)):
+        slam = replace(wide, map=replace(wide.map, keyframes=wide.keyframes[:count]))
+        assert bool(camera_prior(slam).sigma[0] < 1.0) == held
+        numbers = frozenset(range(count))
+        pairs = tuple(pair for pair in wide.map.pairs if numbers.issuperset(pair.key))
+        frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
+        assert (
+            Claim.of(
+                replace(
+                    slam,
+                    map=replace(slam.map, pairs=pairs, factors=(), roots=(0,)),
+                    tracker=replace(slam.tracker, frames=frames),
+                )
+            ).guessed
+            == held
+        )
+
+
+def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a camera far from the one that frames were tracked with is tried on them, at most three times in all,
+    # and that one pass is enough where it is near. Oracle: the cameras that the passes are told to find.
+    tracked: list[float] = []
+
+    def run(_: Any, camera: Camera, __: Any, ___: Any, ____: Clock, before: Slam | None) -> Any:
+        tracked.append(camera.intrinsics[0] if before is None else before.intrinsics[0])
+        slam = found()
+        return iter(
+            [replace(slam, camera=replace(slam.camera, intrinsics=tracked[-1] * np.array([1.0, 1.0, 0.5, 0.4])))]
+        )
+
+    def end(slam: Slam, *_: Any) -> Slam:
+        return replace(
+            slam, camera=replace(slam.camera, intrinsics=np.array([answers[len(tracked) - 1]] * 2 + [160.0, 120.0]))
+        )
+
+    monkeypatch.setattr(self_calibration, "run_frames", run)
+    monkeypatch.setattr(self_calibration, "finish", end)
+    guess = GUESS.intrinsics[0]
+    for answers, cameras in (([1.01 * guess], [guess]), ([400.0, 300.0, 280.0], [guess, 400.0, 300.0])):
+        tracked.clear()
+        slam = self_calibration.self_calibrate(tuple, GUESS, ROLES, SETTINGS)
+        assert tracked == pytest.approx(cameras)
+        assert slam is not None
+        assert slam.intrinsics[0] == pytest.approx(answers[len(cameras) - 1])
+    assert "3 passes" in slam.notes[0]
+
+
+def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a map of few keyframes, without depth fewer than ten, with it fewer than three, frames that were lost,
+    # and a focal length that is none give no camera.
+    whole = found()
+    for metric, least in ((False, 10), (True, 3)):
+        of = lambda count, metric=metric: replace(
+            whole, map=replace(whole.map, metric=metric, keyframes=whole.keyframes[:count])
+        )
+        assert begun(monkeypatch, of(least)) is not None
+        assert begun(monkeypatch, of(least - 1)) is None
+    lost = tuple(replace(record, tracked=row > 5) for row, record in enumerate(whole.frames))
+    assert begun(monkeypatch, replace(whole, tracker=replace(whole.tracker, frames=lost))) is None
+    assert (
+        begun(monkeypatch, replace(whole, camera=replace(whole.camera, intrinsics=np.array([1e6, 1e6, 160.0, 120.0]))))
+        is None
+    )
+
+
+def test_how_free_a_guess_is() -> None:
+    # Proves that the focal length of a guess is free, and that its principal point stays near the middle. Oracle: the
+    # settings' words.
+    sigma = begin(GUESS, ROLES).camera.sigma
+    assert sigma == pytest.approx([0.3 * GUESS.intrinsics[0]] * 2 + [0.02 * 320, 0.02 * 240])
+
+
+def test_windows_hold_a_found_camera() -> None:
+    # Proves that a self-calibrated camera stays where it is while frames are tracked, and that a guess does not: a
+    # focal length that is 10 % too long. Oracle: the number that it began with.
+    wrong = np.array(walk().camera.intrinsics) * [1.1, 1.1, 1.0, 1.0]
+    guess = replace(walk().camera, intrinsics=tuple(wrong.tolist()), known=False)
+    ends = []
+    for camera_found in (True, False):
+        first = begin(guess, ROLES)
+        first = replace(first, camera=replace(first.camera, self_calibrated=camera_found))
+        *_, slam = run_frames(iter(recorded_run().frames), guess, ROLES, SETTINGS, Clock(), first)
+        ends.append(settled(slam).intrinsics)
+    held, free = ends
+    assert held == pytest.approx(wrong, abs=0.1)
+    assert np.abs(free - wrong).max() > 1.0
+
+
+class _Passes:
+    """Stands for self-calibration: counts the frames of each call, and gives a camera."""
+
+    def __init__(self, camera: Camera | None = LENS) -> None:
+        self.counts: list[int] = []
+        self._camera = camera
+
+    def __call__(self, frames: Callable[[], Iterable[Frame]], camera: Camera, roles: Any, settings: Any) -> Slam | None:
+        self.counts.append(len(list(frames())))
+        if self._camera is None:
+            return None
+        own = np.array(self._camera.intrinsics)
+        slam = begin(camera, roles)
+        return replace(slam, camera=replace(slam.camera, intrinsics=own, given=own, self_calibrated=True))
+
+
+def settings(frames: int = 150) -> vg.SlamSettings:
+    """Those of the recorded run with a last adjustment, which no test of this file comes to."""
+    base = vg.SlamSettings()
+    return replace(SETTINGS, camera=replace(base.camera, calibration_frames=frames), refinement=base.refinement)
+
+
+def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **options: Any) -> vg.Result:
+    """A run without a last adjustment, whose self-calibration is `passes`."""
+    monkeypatch.setattr(reconstruction, "self_calibrate", passes)
+    monkeypatch.setattr(reconstruction, "finish", lambda slam, *_: slam)
+    monkeypatch.setattr(reconstruction, "CompileAhead", lambda _: vg.Callback())
+    given = {"roles": ROLES, "settings": settings(), "dense": "none", **options}
+    return vg.reconstruct(SequenceView(walk(), GUESS, has_depth=True) if frames is None else frames, **given)
+
+
+@pytest.mark.long
+def test_a_guessed_camera_is_sought_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that the run begins with what self-calibration found, over as many frames as the setting says of those that
+    # were selected, and with the guess where that finds none.
+    passes = _Passes()
+    result = run(monkeypatch, passes)
+    assert result.intrinsics == pytest.approx(np.array(LENS.intrinsics), abs=0.1)
+    assert "self-calibration" in result.summary["seconds_by_stage"]
+    run(monkeypatch, passes, settings=settings(2), start=1, stride=3)
+    assert passes.counts == [FRAMES, 2]
+    assert run(monkeypatch, _Passes(None), end=3).record.slam.camera.given.tolist() == list(GUESS.intrinsics)
+
+
+def test_no_self_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a known camera, frames that come once, and the setting 0 need none.
+    passes = _Passes()
+    run(monkeypatch, passes, walk(), end=3)
+    run(monkeypatch, passes, iter(recorded_run().frames[:3]))
+    run(monkeypatch, passes, settings=settings(0), end=3)
+    assert passes.counts == []
+
+
+@pytest.mark.long
+def test_a_resumed_run_seeks_no_camera_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that a run which was killed after self-calibration goes on with the camera that it found.
+    kept = Checkpoints(tmp_path / "kept", every=0)
+    with pytest.raises(Killed):
+        run(monkeypatch, _Passes(), callbacks=[KilledAfter(3)], checkpoints=kept)
+    again = _Passes()
+    result = run(monkeypatch, again, checkpoints=replace(kept, resume=True))
+    assert again.counts == []
+    assert result.record.slam.camera.self_calibrated
+    assert result.intrinsics == pytest.approx(np.array(LENS.intrinsics), abs=0.1)
+
+
+def test_warnings_of_calibration_frames_count_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that warnings about the input and answers that were refused count once, though frames are read twice.
+    class Warns(SequenceView):
+        def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Any:
+            reconstruction.warnings.warn("frame 1 is odd", InputWarning, stacklevel=2)
+            return super().frames(start, end, stride)
+
+    counts = Refusals(asked=1)
+
+    class Refused(_Passes):
+        def __call__(self, *given: Any) -> Slam | None:
+            counts.note(5, 5, left=False)
+            return super().__call__(*given)
+
+    roles = Perception(ROLES, {}, {"depth": counts})
+    with pytest.warns(InputWarning, match="odd") as told:
+        result = run(monkeypatch, Refused(), Warns(walk(), GUESS, has_depth=True), roles=roles, end=3)
+    assert [str(warning.message) for warning in told].count("frame 1 is odd") == 1
+    assert result.record.warnings.count("frame 1 is odd") == 1
+    assert counts == Refusals(asked=1)

@@ -1,0 +1,191 @@
+"""Arrow-shaped systems against dense algebra, on random systems that no camera ever made."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from arrow_systems import BLOCK, NODES, SLOTS, Dense, assemble, free_part, random_system
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    ArrowVector,
+    back_substitute,
+    carry_to_nodes,
+    dense_gradient,
+    inverse_landmark_hessian,
+    multiply,
+    reduce,
+)
+from vggtgeo.solvers.band_cholesky import BandCholesky
+from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
+from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
+from vggtgeo.solvers.covariance import ArrowCovariance, covariance
+from vggtgeo.solvers.exact_model import exact_model
+from vggtgeo.solvers.reduced import DenseCholesky
+
+from vggtgeo.bundle.analysis.weakest import sparse_matrix
+
+
+def flat(vector: ArrowVector) -> np.ndarray:
+    return np.concatenate([vector.dense, np.ravel(vector.landmarks)])
+
+
+def unflat(values: np.ndarray) -> ArrowVector:
+    dense = len(values) - NODES * SLOTS
+    return ArrowVector(jnp.asarray(values[:dense]), jnp.asarray(values[dense:].reshape(NODES, SLOTS)))
+
+
+KINDS = {
+    "Gauss-Newton": {},
+    "twisted": {"twisted": True},
+    "in groups": {"grouped": True},
+    "in groups, twisted": {"grouped": True, "twisted": True},
+}
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def pair(request: pytest.FixtureRequest) -> tuple[ArrowSystem, Dense]:
+    system = random_system(**KINDS[request.param])
+    return system, assemble(system)
+
+
+def test_multiply_is_the_dense_product(pair: tuple[ArrowSystem, Dense]) -> None:
+    # Proves that the arrow holds the whole matrix. Oracle: the dense matrix times a random vector.
+    system, dense = pair
+    values = np.random.default_rng(1).normal(size=len(dense.gradient))
+    error = np.abs(flat(jax.jit(multiply)(system, unflat(values))) - dense.matrix @ values).max()
+    assert error < 1e-12 * np.abs(dense.matrix).max()
+
+
+def test_reduce_is_the_dense_schur_complement(pair: tuple[ArrowSystem, Dense]) -> None:
+    # Proves the reduced matrix and right-hand side. Oracle: block elimination by numpy on the dense matrix.
+    system, dense = pair
+    reduced, size = jax.jit(reduce)(system), len(system.free)
+    coupling, hessian = dense.matrix[:size, size:], np.diag(dense.matrix[size:, size:])
+    inverse = np.divide(1, hessian, out=np.zeros_like(hessian), where=hessian != 0)
+    scale = np.abs(dense.matrix).max()
+    np.testing.assert_allclose(reduced.hessian, dense.matrix[:size, :size], atol=1e-12 * scale)
+    np.testing.assert_allclose(reduced.gradient, dense.gradient[:size], atol=1e-12 * scale)
+    np.testing.assert_allclose(reduced.schur, coupling * inverse @ coupling.T, atol=1e-12 * scale)
+    np.testing.assert_allclose(reduced.schur_gradient, coupling * inverse @ dense.gradient[size:], atol=1e-12 * scale)
+    gradient, diagonal = jax.jit(dense_gradient)(system)
+    np.testing.assert_allclose(gradient, reduced.gradient, atol=1e-12 * scale)
+    np.testing.assert_allclose(diagonal, np.diag(reduced.hessian), atol=1e-12 * scale)
+
+
+def test_back_substitute_and_carry(pair: tuple[ArrowSystem, Dense]) -> None:
+    # Proves `-V^-1 (h + W' x)` and `W z`. Oracle: the blocks of the dense matrix.
+    system, dense = pair
+    rng, size = np.random.default_rng(2), len(system.free)
+    x, z = rng.normal(size=size), rng.normal(size=NODES * SLOTS)
+    inverse = np.ravel(inverse_landmark_hessian(system))
+    expected = -inverse * (dense.gradient[size:] + dense.matrix[size:, :size] @ x)
+    np.testing.assert_allclose(np.ravel(jax.jit(back_substitute)(system, jnp.asarray(x))), expected, atol=1e-12)
+    carried = jax.jit(carry_to_nodes)(system, jnp.asarray(z.reshape(NODES, SLOTS)))
+    np.testing.assert_allclose(carried, dense.matrix[:size, size:] @ z, atol=1e-12)
+
+
+def test_solve_exactly_is_the_dense_solve(pair: tuple[ArrowSystem, Dense]) -> None:
+    # Proves the adjoint's solve, also of an indefinite matrix. Oracle: numpy on the free, determined coordinates.
+    system, dense = pair
+    values = np.random.default_rng(3).normal(size=len(dense.gradient))
+    free = free_part(system)
+    expected = np.zeros_like(values)
+    expected[free] = np.linalg.solve(dense.matrix[np.ix_(free, free)], values[free])
+    found = flat(jax.jit(lambda system, vector: exact_model(system).solve(vector))(system, unflat(values)))
+    error = np.abs(found - expected).max() / np.abs(expected).max()
+    assert error < 1e-10
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+@pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
+def test_a_damped_step_is_the_dense_solve(damping: float, grouped: bool) -> None:
+    # Proves one Levenberg-Marquardt step and the decrease it predicts. Oracle: the dense damped normal equations.
+    system = random_system(grouped=grouped)
+    dense, free = assemble(system), free_part(system)
+    matrix, gradient = dense.matrix[np.ix_(free, free)], dense.gradient[free]
+    expected = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), -gradient)
+    step, predicted = damped_step(system, jnp.asarray(damping))
+    error = np.abs(flat(step)[free] - expected).max() / np.abs(expected).max()
+    assert error < 1e-9
+    assert np.all(np.delete(flat(step), free) == 0)
+    decrease = -gradient @ expected - expected @ matrix @ expected / 2
+    assert float(predicted) == pytest.approx(decrease, rel=1e-9)
+
+
+@eqx.filter_jit
+def damped_step(system: ArrowSystem, damping: jax.Array) -> tuple[ArrowVector, jax.Array]:
+    solver = DenseCholesky()
+    return solver.step(system, solver.prepare(system), damping)
+
+
+def test_a_flat_gauge_is_held() -> None:
+    # Proves that where elimination leaves the energy flat along the gauge direction, the step solves the equations and
+    # does not move along it. Oracle: the pseudo-inverse of the dense reduced matrix.
+    system = random_system()
+    size = len(system.free)
+    direction = np.zeros(size)
+    direction[[2, 3]] = [0.6, 0.8]
+    reduced, off = reduce(system), np.eye(size) - np.outer(direction, direction)
+    matrix, rhs = reduced.hessian - reduced.schur, reduced.schur_gradient - reduced.gradient
+    flat_system = eqx.tree_at(
+        lambda s: (s.prior_hessian, s.prior_gradient, s.gauge),
+        system,
+        (
+            system.prior_hessian + off @ matrix @ off - matrix,
+            system.prior_gradient + rhs - off @ rhs,
+            jnp.asarray(direction[:, None]),
+        ),
+    )
+    step, _ = damped_step(flat_system, jnp.asarray(0.0))
+    free = np.asarray(system.free)
+    expected = np.linalg.pinv((off @ matrix @ off)[np.ix_(free, free)], rcond=1e-10) @ (off @ rhs)[free]
+    error = np.abs(np.asarray(step.dense)[free] - expected).max() / np.abs(expected).max()
+    assert error < 1e-9
+    assert abs(float(direction @ step.dense)) < 1e-9
+
+
+SOLVERS = {
+    "dense": DenseCholesky(),
+    "band": BandCholesky(2),
+    "conjugate gradients by a band": ConjugateGradients(BandPreconditioner(1), rtol=1e-12),
+    "conjugate gradients by blocks": ConjugateGradients(BlockJacobi(), rtol=1e-12),
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_groups_are_solved_and_inverted_by_every_solver(name: str, grouped: tuple[ArrowSystem, Dense]) -> None:
+    # Proves a damped step, the covariances of nodes, shared coordinates and landmarks, in every storage of the blocks.
+    # Oracle: numpy's solve and inverse of the dense matrix.
+    (system, dense), solver, damping = grouped, SOLVERS[name], 0.1
+    free, size = free_part(system), len(system.free)
+    matrix = dense.matrix[np.ix_(free, free)]
+    expected, inverse = np.zeros(len(dense.gradient)), np.zeros_like(dense.matrix)
+    expected[free] = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), -dense.gradient[free])
+    inverse[np.ix_(free, free)] = np.linalg.inv(matrix)
+
+    @jax.jit
+    def both(system: ArrowSystem) -> tuple[ArrowVector, ArrowCovariance]:
+        step = solver.step(system, solver.prepare(system), jnp.asarray(damping))[0]
+        return step, covariance(system, solver)
+
+    step, known = both(system)
+    np.testing.assert_allclose(flat(step), expected, atol=1e-9 * np.abs(expected).max())
+    nodes = NODES * BLOCK
+    np.testing.assert_allclose(known.shared, inverse[nodes:size, nodes:size], atol=1e-9 * np.abs(inverse).max())
+    for node in range(NODES):
+        own = slice(node * BLOCK, (node + 1) * BLOCK)
+        np.testing.assert_allclose(known.nodes[node], inverse[own, own], atol=1e-9 * np.abs(inverse).max())
+    variances = np.ravel(known.landmarks)
+    seen = np.isfinite(variances)
+    assert seen.sum() == NODES * SLOTS - 1
+    np.testing.assert_allclose(variances[seen], np.diag(inverse)[size:][seen], rtol=1e-8)
+
+
+def test_groups_as_sparse_blocks(grouped: tuple[ArrowSystem, Dense]) -> None:
+    # Proves the blocks of the weakest directions. Oracle: the dense Schur complement.
+    system, _ = grouped
+    found = sparse_matrix(reduced_blocks(system, sparse_layout(system)), sparse_layout(system)).toarray()
+    reduced = jax.jit(reduce)(system)
+    expected = np.asarray(reduced.hessian - reduced.schur)
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())

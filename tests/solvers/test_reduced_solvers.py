@@ -1,0 +1,226 @@
+"""Every way to solve the reduced system gives the same step and ends at the same energy as dense Cholesky."""
+
+from dataclasses import replace
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import make_scene
+from sequence_problems import KEYFRAMES, REACH, TIGHT, Pairs, packed, sequence
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
+from vggtgeo.solvers.band_cholesky import BandCholesky
+from vggtgeo.solvers.block_band import assemble_bands, band_layout
+from vggtgeo.solvers.conjugate_gradients import (
+    BandPreconditioner,
+    BlockJacobi,
+    ConjugateGradients,
+    HostProduct,
+)
+from vggtgeo.solvers.flat_directions import flat_stiffness
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.node_order import longest, narrow_order
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.solver_choice import MUCH_DENSE, choose_reduced_solver, default_solver
+
+LOOPS = ((0, 8), (1, 6), (2, 7))
+SOLVERS = {
+    "band": BandCholesky(REACH),
+    "conjugate gradients, block Jacobi": ConjugateGradients(BlockJacobi(), HostProduct(), **TIGHT),
+    "conjugate gradients, narrow band": ConjugateGradients(BandPreconditioner(1), HostProduct(), **TIGHT),
+}
+Step = tuple[ArrowVector, jax.Array]
+
+
+@jax.jit
+def linearise(problem: Problem, state: State) -> ArrowSystem:
+    return BundleAdjustment(problem).linearise(state)
+
+
+@cache
+def linearised(loops: Pairs = ()) -> ArrowSystem:
+    """A system with a held pose in the middle and one held intrinsic, besides the first pose."""
+    held = np.isin(np.arange(KEYFRAMES), [0, 3])
+    return linearise(*packed(sequence(loops), fixed_pose=held, fixed_intrinsics=np.array([False, True, False, False])))
+
+
+@eqx.filter_jit
+def damped_step(solver: AbstractReducedSolver, system: ArrowSystem, damping: jax.Array) -> Step:
+    return solver.step(system, solver.prepare(system), damping)
+
+
+def step_error(solver: AbstractReducedSolver, system: ArrowSystem, damping: float) -> tuple[float, float]:
+    """Largest relative difference to the step of dense Cholesky, and that of the predicted decreases."""
+    expected, decrease = damped_step(DenseCholesky(), system, jnp.asarray(damping))
+    step, predicted = damped_step(solver, system, jnp.asarray(damping))
+    error = lambda a, b: float(jnp.abs(a - b).max() / jnp.abs(b).max())
+    worst = max(error(step.dense, expected.dense), error(step.landmarks, expected.landmarks))
+    assert np.all(np.asarray(step.dense)[~np.asarray(system.free)] == 0)
+    return worst, abs(float(predicted / decrease) - 1)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_step_is_that_of_dense_cholesky(name: str) -> None:
+    # Proves each solver's step and predicted decrease, held coordinates included. Oracle: dense Cholesky.
+    for damping in (1e-6, 1.0):
+        error, decrease = step_error(SOLVERS[name], linearised(), damping)
+        assert error < 1e-8, (damping, error)
+        assert decrease < 1e-10, (damping, decrease)
+
+
+def test_a_band_in_another_order_takes_closed_loops() -> None:
+    # Proves that a folded order keeps the step exact where edges are too long in their own. Oracle: dense Cholesky.
+    system = linearised(LOOPS)
+    ends = np.stack([system.graph.source, system.graph.target], 1)
+    place = narrow_order(KEYFRAMES, ends)
+    reach = longest(place, ends)
+    assert reach < longest(np.arange(KEYFRAMES), ends)
+    for damping in (1e-6, 1.0):
+        error, decrease = step_error(BandCholesky(reach, jnp.asarray(place)), system, damping)
+        assert error < 1e-8, (damping, error)
+        assert decrease < 1e-10, (damping, decrease)
+
+
+@pytest.mark.parametrize("name", [name for name in SOLVERS if "conjugate" in name])
+def test_closed_loops_leave_the_step_exact(name: str) -> None:
+    # Proves that edges longer than the band only slow conjugate gradients down. Oracle: dense Cholesky.
+    error, decrease = step_error(SOLVERS[name], linearised(LOOPS), 1e-4)
+    assert error < 1e-8
+    assert decrease < 1e-10
+
+
+def test_a_band_that_leaves_edges_out_stays_positive() -> None:
+    # Proves that the preconditioner of a graph with loops is positive definite without any damping. Oracle: eigenvalues
+    # of the band written out as a dense matrix.
+    hessian, schur = jax.jit(lambda system: assemble_bands(system, band_layout(system, 1, None)))(linearised(LOOPS))
+    band = jax.tree.map(lambda a, b: np.asarray(a - b), hessian, schur)
+    groups, width, shared = band.border.shape
+    size = groups * width
+    matrix = np.zeros((size + shared, size + shared))
+    for group in range(groups):
+        rows = slice(group * width, (group + 1) * width)
+        matrix[rows, rows] = band.groups[group, 0]
+        if group + 1 < groups:
+            matrix[rows.stop : rows.stop + width, rows] = band.groups[group, 1]
+    matrix[:size, size:] = band.border.reshape(size, shared)
+    matrix[size:, size:] = band.corner
+    matrix = np.tril(matrix) + np.tril(matrix, -1).T
+    matrix[size:, :size] = band.border.reshape(size, shared).T
+    matrix[:size, size:] = matrix[size:, :size].T
+    used = np.diag(matrix) > 0
+    scale = 1 / np.sqrt(np.diag(matrix)[used])
+    assert np.linalg.eigvalsh(scale[:, None] * matrix[np.ix_(used, used)] * scale).min() > 0
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_free_scale_is_held(name: str) -> None:
+    # Proves that without depth priors the step does not change the scale. Oracle: dense Cholesky, and the direction.
+    scene = sequence()
+    scene = scene.with_observations(depth_weight=np.zeros(len(scene.observations.host)))
+    system = linearise(*packed(scene, fixed_intrinsics=True))
+    assert float(flat_stiffness(system)[0]) > 0
+    error, _ = step_error(SOLVERS[name], system, 0.0)
+    assert error < 1e-6
+    step, _ = damped_step(SOLVERS[name], system, jnp.asarray(0.0))
+    assert abs(float(system.gauge[:, 0] @ step.dense)) < 1e-8 * float(jnp.linalg.norm(step.dense))
+
+
+@pytest.mark.long
+def test_the_same_energy_is_reached() -> None:
+    # Proves that whole solves agree: the band on a sequence, inexact steps on one with loops (the default forcing term
+    # costs no accuracy at the end). Oracle: the energy that dense Cholesky reaches.
+    for scene, solver in ((sequence(), BandCholesky(REACH)), (sequence(LOOPS), ConjugateGradients())):
+        problem, state = packed(scene)
+        expected, found = (converged(problem, state, each) for each in (DenseCholesky(), solver))
+        assert found == pytest.approx(expected, rel=1e-9)
+
+
+def converged(problem: Problem, state: State, solver: AbstractReducedSolver) -> float:
+    """Energy at the optimum."""
+    iteration = SchurLevenbergMarquardt(rtol=1e-13, max_iterations=60, reduced_solver=solver)
+    return float(eqx.filter_jit(solve)(problem, state, solver=iteration).energy)
+
+
+def test_a_marginalisation_prior_needs_no_band() -> None:
+    # Proves that conjugate gradients take a prior that couples all poses. Oracle: dense Cholesky. The band refuses it.
+    system = linearised()
+    root = np.random.default_rng(0).normal(size=(len(system.free),) * 2) * 10
+    prior = jnp.asarray(root @ root.T).at[-4:, -4:].add(system.prior_hessian)
+    coupled = eqx.tree_at(lambda s: s.prior_hessian, system, prior)
+    error, _ = step_error(SOLVERS["conjugate gradients, narrow band"], coupled, 1e-4)
+    assert error < 1e-8
+    with pytest.raises(ValueError, match="marginalisation prior"):
+        damped_step(BandCholesky(REACH), coupled, jnp.asarray(1e-4))
+
+
+def test_a_reach_below_one_is_refused() -> None:
+    # Proves the message. Oracle: its text.
+    with pytest.raises(ValueError, match="`reach` is 0; it must be at least 1"):
+        BandCholesky(0)
+
+
+def many(keyframes: int, pairs: np.ndarray) -> Problem:
+    """A problem of so many keyframes, one landmark each, observed along the given edges."""
+    scene = make_scene(2, points=1, lines=0)
+    seen = replace(
+        scene.observations,
+        edges=pairs,
+        host=np.arange(keyframes),
+        pixel=np.full((keyframes, 2), 100.0),
+        point_edge=np.arange(len(pairs)),
+        point_landmark=pairs[:, 0],
+        point_target=np.full((len(pairs), 2), 90.0),
+        point_weight=np.ones(len(pairs)),
+        **{name: np.ones(keyframes) for name in ("depth_mean", "depth_sigma", "depth_weight")},
+    )
+    poses = np.tile(scene.poses[:1], (keyframes, 1))
+    guess = replace(scene, observations=seen, start_poses=poses, start_inverse_depth=np.ones(keyframes))
+    return guess.pack()[0]
+
+
+def test_the_choice_follows_the_graph() -> None:
+    # Proves the rule of `choose_reduced_solver`. Oracle: graphs whose shape is known by construction.
+    i = np.arange(60)
+    chain = np.stack([i[:-2], i[2:]], 1)
+    loops = np.stack([i[:5], i[-5:]], 1)
+    assert choose_reduced_solver(many(20, chain[:18])) == DenseCholesky()
+    assert choose_reduced_solver(many(60, chain)) == BandCholesky(2)
+    assert choose_reduced_solver(many(60, chain).with_term(no_prior(60, jnp.float64))) == DenseCholesky()
+    closed = choose_reduced_solver(many(60, np.concatenate([chain, loops])))
+    assert isinstance(closed, BandCholesky)
+    assert closed.reach <= 6
+    ring = choose_reduced_solver(many(60, np.stack([i, (i + 2) % 60], 1)))
+    assert isinstance(ring, BandCholesky)
+    assert ring.reach <= 4
+    assert sorted(np.asarray(ring.place)) == list(i)
+    assert choose_reduced_solver(many(60, chain).with_term(no_prior(60, jnp.float64))) == DenseCholesky()
+    # Random chords make a graph without any narrow order.
+    many_nodes = np.arange(200)
+    chain = np.stack([many_nodes[:-2], many_nodes[2:]], 1)
+    chords = np.random.default_rng(0).permutation(200).reshape(-1, 2)
+    chords = chords[np.abs(chords[:, 0] - chords[:, 1]) > 20]
+    assert choose_reduced_solver(many(200, np.concatenate([chain, chords]))) == ConjugateGradients(
+        BandPreconditioner(2)
+    )
+    scattered = np.random.default_rng(1).integers(0, 200, (600, 2))
+    scattered = np.unique(scattered[scattered[:, 0] != scattered[:, 1]], axis=0)
+    assert choose_reduced_solver(many(200, scattered)) == ConjugateGradients()
+
+
+def test_a_solve_without_a_word_follows_the_graph() -> None:
+    # Proves which linear solver `solve` takes by itself, and that a dense one of many keyframes in `jit` is told.
+    # Oracle: a chain, whose band is known, and the text of the warning.
+    i = np.arange(MUCH_DENSE + 1)
+    chain = many(len(i), np.stack([i[:-1], i[1:]], 1))
+    assert default_solver(chain).reduced_solver == BandCholesky(1)
+    taken = []
+    with pytest.warns(UserWarning, match="of 301 keyframes inside `jit` takes a dense linear solver"):
+        jax.make_jaxpr(lambda problem: taken.append(default_solver(problem)))(chain)
+    assert taken[0].reduced_solver == DenseCholesky()
