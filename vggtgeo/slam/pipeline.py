@@ -158,11 +158,14 @@ def _track(
         with clock.measure("relocalise"):
             found = relocalise(TrackingInput(data, slam.intrinsics, roles), slam.keyframes, slam.tracker) or found
     grows = bool(slam.window.members) and not settings.keyframes.localise_only
-    if grows and not slam.metric and found is not None and not found.accepted:
+    # Few points that agree by half are often wrong; where the frame shows more of the newest keyframe, that decides.
+    doubtful = found is not None and not (found.accepted and found.evidence.points_strong)
+    if grows and not slam.metric and doubtful:
         with clock.measure("track"):
             newest = slam.keyframes[slam.window.members[-1]]
             given = TrackingInput(data, slam.intrinsics, roles, _prior(slam))
-            found = track_by_rays(given, newest, usual_step(slam.keyframes, frame.index)) or found
+            by_rays = track_by_rays(given, newest, usual_step(slam.keyframes, frame.index))
+            found = by_rays if by_rays is not None and by_rays.accepted else found
     return slam, data, found
 
 
