@@ -45,13 +45,13 @@ def put(name: str, change: Change, folder: Path) -> Path:
 
 
 NETWORKS: dict[str, tuple[Change, str]] = {
-    "an output's name": (replaced(b"\x04mask", b"\x04mas\xff"), "its names or metadata are no text"),
-    "its metadata": (replaced(b"random", b"rando\xff"), "its names or metadata are no text"),
+    "an output's name": (replaced(b"\x04mask", b"\x04mas\xff"), "names or metadata"),
+    "its metadata": (replaced(b"random", b"rando\xff"), "names or metadata"),
     "a name of weights beside it that is too long for a file": (
         lambda whole: whole + b"\x0a\x08location\x12" + b"\xff" * 256,
-        "is not an ONNX file that can be read",
+        "onnxruntime",
     ),
-    "a node's input": (replaced(b"value of mask", b"value of mas\xff", 1), "is not an ONNX file that can be read"),
+    "a node's input": (replaced(b"value of mask", b"value of mas\xff", 1), "onnxruntime"),
 }
 
 

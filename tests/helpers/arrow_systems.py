@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
     EdgeGraph,
@@ -142,13 +141,3 @@ def assemble(system: ArrowSystem) -> Dense:
 def free_part(system: ArrowSystem) -> np.ndarray:
     """Indices of the coordinates that are neither held nor undetermined."""
     return np.nonzero(np.concatenate([system.free, np.ravel(system.landmark_hessian != 0)]))[0]
-
-
-@pytest.fixture(scope="module")
-def grouped() -> tuple[ArrowSystem, Dense]:
-    """A system in groups whose prior is on the shared coordinates alone, and its matrix."""
-    system = random_system(grouped=True)
-    system = eqx.tree_at(lambda s: s.prior_hessian, system, system.prior_hessian[-system.shared :, -system.shared :])
-    whole = np.zeros((len(system.free),) * 2)
-    whole[-system.shared :, -system.shared :] = system.prior_hessian
-    return system, assemble(eqx.tree_at(lambda s: s.prior_hessian, system, jnp.asarray(whole)))

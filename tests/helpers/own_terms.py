@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scenes import make_scene
 
 import vggtgeo as vg
@@ -79,8 +78,3 @@ def with_own_terms(**options: Any) -> tuple[vg.Problem, vg.State, vg.State]:
     """A problem with the terms above; its start and the truth."""
     problem, initial, _ = SCENE.pack(terms=own_terms(), **options)
     return problem, initial, SCENE.at_truth(**options)[1]
-
-
-@pytest.fixture(scope="module")
-def own() -> tuple[vg.Problem, vg.State, vg.State]:
-    return with_own_terms()

@@ -153,6 +153,16 @@ SOLVERS = {
 }
 
 
+@pytest.fixture(scope="module")
+def grouped() -> tuple[ArrowSystem, Dense]:
+    """A system in groups whose prior is on the shared coordinates alone, and its matrix."""
+    system = random_system(grouped=True)
+    system = eqx.tree_at(lambda s: s.prior_hessian, system, system.prior_hessian[-system.shared :, -system.shared :])
+    whole = np.zeros((len(system.free),) * 2)
+    whole[-system.shared :, -system.shared :] = system.prior_hessian
+    return system, assemble(eqx.tree_at(lambda s: s.prior_hessian, system, jnp.asarray(whole)))
+
+
 @pytest.mark.parametrize("name", SOLVERS)
 def test_groups_are_solved_and_inverted_by_every_solver(name: str, grouped: tuple[ArrowSystem, Dense]) -> None:
     # Proves a damped step, the covariances of nodes, shared coordinates and landmarks, in every storage of the blocks.

@@ -202,7 +202,8 @@ def _chance(fit: Fit, part: slice) -> float:
     if not known.any():
         return 1.0
     covariance = fit.covariance[part, part][np.ix_(known, known)]
-    statistic = value[known] @ np.linalg.solve(covariance, value[known]) / known.sum()
+    # A pseudoinverse: exact paths without turns determine an offset in fewer directions than it has numbers.
+    statistic = value[known] @ np.linalg.pinv(covariance, hermitian=True) @ value[known] / known.sum()
     return float(fisher.sf(statistic, known.sum(), fit.degrees))
 
 

@@ -8,12 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from own_terms import with_own_terms
 from vggtgeo.solvers.arrow import multiply, reduce
 
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 
 SOLVER = vg.SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
+
+
+@pytest.fixture(scope="module")
+def own() -> tuple[vg.Problem, vg.State, vg.State]:
+    return with_own_terms()
 
 
 @pytest.fixture(scope="module")

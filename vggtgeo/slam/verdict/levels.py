@@ -1,6 +1,6 @@
 """The numbers that decide. Those of methods (windows, iterations) stand where they are used.
 
-They are set on the half "set" of `benchmarks/verdict_bank.py`; no recording of a real camera moved one.
+They were set on simulated runs, and are measured on those of `benchmarks/verdict_bank.py`.
 """
 
 import numpy as np
