@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import numpy as np
 from jax.dtypes import canonicalize_dtype
 from jax.typing import DTypeLike
 
+from vggtgeo.bundle import terms as term_package
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.observed import check_tied
 from vggtgeo.bundle.packing import pack
@@ -23,15 +26,7 @@ from vggtgeo.bundle.pair_checks import check_kinds
 from vggtgeo.bundle.precision import check_precision
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.saved_checks import check_problem
-from vggtgeo.bundle.terms.baseline import BaselinePrior
-from vggtgeo.bundle.terms.depth import DepthPrior
-from vggtgeo.bundle.terms.host_pixel import HostPixel
-from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.line import LineTerm
-from vggtgeo.bundle.terms.marginal import MarginalPrior
-from vggtgeo.bundle.terms.point import PointTerm
-from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
-from vggtgeo.bundle.terms.rotation import RotationPrior
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import camera_models as cameras
 from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
 from vggtgeo.io.errors import InputError
@@ -42,13 +37,11 @@ from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 
 PROBLEM_CLASSES: tuple[type, ...] = (
     *(Problem, State, Edges, SlotIndex, jaxlie.SE3, jaxlie.SO3),
-    *(PointTerm, LineTerm, HostPixel, DepthPrior, IntrinsicsPrior, MarginalPrior),
-    *(RelativePose, SurfaceAlignment, RotationPrior, BaselinePrior),
     *(Square, Huber, Cauchy, GemanMcClure, Barron),
     *(cameras.Pinhole, cameras.RadialTangential, cameras.KannalaBrandt),
     *(cameras.SquarePinhole, cameras.SquareRadialTangential, cameras.SquareKannalaBrandt),
 )
-"""All classes of the package that a saved problem may have."""
+"""Classes of the package that a saved problem may have, besides those of `bundle/terms/`."""
 PROBLEM = Format("problem", 2, by_name(PROBLEM_CLASSES), True, ": pass your own classes as `terms`")
 
 LAYOUT: dict[str, tuple[str | int, ...]] = {
@@ -184,6 +177,13 @@ def save_solution(path: Path, state: State, index: SlotIndex) -> None:
         )
 
 
+def _package_terms() -> list[type]:
+    """Return the classes of terms in `bundle/terms/`, so that a new file there is all that a new residual needs."""
+    names = [f"{term_package.__name__}.{found.name}" for found in pkgutil.iter_modules(term_package.__path__)]
+    kinds = [kind for name in names for kind in vars(import_module(name)).values() if isinstance(kind, type)]
+    return [kind for kind in kinds if issubclass(kind, AbstractTerm) and kind.__module__ in names]
+
+
 def _classes(value: Any) -> Iterator[type]:
     """Yield the classes in a tree of modules."""
     if isinstance(value, type):
@@ -214,7 +214,7 @@ def _load_saved(
     path: Path, terms: Sequence[type], convert: Callable[[str, np.ndarray], Any]
 ) -> tuple[Problem, State, SlotIndex]:
     try:
-        layout = PROBLEM.with_classes(terms)
+        layout = PROBLEM.with_classes((*_package_terms(), *terms))
     except ValueError as error:
         raise InputError(f"`terms`: {error}") from None
     saved, _ = layout.read(path, np.asarray)
