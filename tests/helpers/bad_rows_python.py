@@ -31,6 +31,7 @@ from vggtgeo.export import export
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputWarning
+from vggtgeo.learning import window_dataset
 from vggtgeo.results.source import open_source
 from vggtgeo.simulation import Sensor
 from vggtgeo.slam.run import in_order
@@ -129,12 +130,17 @@ def dataset(
 
 def index(place: Path, **changes: Any) -> None:
     """Another index."""
-    (place / "windows.json").write_text(json.dumps({"version": 1, "windows": 3} | changes))
+    (place / "windows.json").write_text(json.dumps({"version": window_dataset.VERSION, "windows": 3} | changes))
 
 
 def labels(place: Path, poses: Any) -> None:
     """Other labels of one window."""
-    np.savez_compressed(place / "0000001.labels.npz", poses=poses)
+    window_dataset.LABELS.write(place / "0000001.labels.npz", {"poses": poses})
+
+
+def objects(place: Path) -> None:
+    """Labels of one window that another program wrote."""
+    np.savez_compressed(place / "0000001.labels.npz", poses=np.array([{}], object))
 
 
 def result() -> vg.Result:
@@ -297,7 +303,7 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("a window dataset of another version", dataset(lambda place: index(place, version=9))),
     ("a window whose labels are not there", dataset(lambda place: (place / "0000001.labels.npz").unlink())),
     ("a window whose labels are no archive", dataset(lambda place: (place / "0000001.labels.npz").write_text("x"))),
-    ("a window whose labels are Python objects", dataset(lambda place: labels(place, np.array([{}], object)))),
+    ("a window whose labels are Python objects", dataset(objects)),
     ("a window whose labels have another shape", dataset(lambda place: labels(place, np.zeros(2)))),
     ("a window whose labels are 300 MB, packed", dataset(lambda place: labels(place, np.zeros(40_000_000)))),
     ("`batches` of a size that is a text", dataset(lambda place: None, lambda data: data.batches("2"))),
@@ -307,7 +313,6 @@ CALLS: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`stack_windows` of no window", lambda _: vg.learning.stack_windows([])),
     ("`WindowWriter` into a folder that holds windows", dataset(written)),
     ("`WindowWriter`: a label that is an object", lambda folder: written(folder, poses=object())),
-    ("`WindowWriter`: a label called `file`", lambda folder: written(folder, file=1.0)),
     ("depth in millimetres, in floats", stream(lambda: [(IMAGES[0], DEPTH * 1000), (IMAGES[1], DEPTH * 1000)])),
     ("depth that is infinite", stream(lambda: [(IMAGES[0], DEPTH * np.inf)])),
     ("an index that is a text", stream(lambda: [frame(0), frame(1, index="1")])),

@@ -34,8 +34,8 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 
 _INDEX = "windows.json"
-_VERSION = 2
-_LABELS = Format("set of labels", 1, {}, compressed=True)
+VERSION = 2
+LABELS = Format("set of labels", 1, {}, compressed=True)
 
 
 class LabelledWindow(NamedTuple):
@@ -84,7 +84,7 @@ class WindowWriter:
             raise InputError(f"`{self.folder}` holds windows already; give a new folder")
         self._check(problem, initial, arrays)
         save_problem(self.folder / _name(self.count), problem, initial, index)
-        _LABELS.write(self.folder / f"{self.count:07d}.labels.npz", arrays)
+        LABELS.write(self.folder / f"{self.count:07d}.labels.npz", arrays)
         self.count += 1
 
     def __enter__(self) -> Self:
@@ -92,7 +92,7 @@ class WindowWriter:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
-            write_json(self.folder / _INDEX, {"version": _VERSION, "windows": self.count})
+            write_json(self.folder / _INDEX, {"version": VERSION, "windows": self.count})
 
     def _check(self, problem: Problem, initial: State, labels: Mapping[str, np.ndarray]) -> None:
         shape = _shapes((problem, initial)), {name: array.shape for name, array in labels.items()}
@@ -166,8 +166,8 @@ class WindowDataset:
             version, count = index["version"], index["windows"]
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"`{place}` is no complete folder of windows; write one first") from None
-        if type(version) is not int or version != _VERSION:
-            raise InputError(f"`{place / _INDEX}` is of version {version!r:.20}; this program reads {_VERSION}")
+        if type(version) is not int or version != VERSION:
+            raise InputError(f"`{place / _INDEX}` is of version {version!r:.20}; this program reads {VERSION}")
         if type(count) is not int or count < 0:
             raise InputError(f"`{place / _INDEX}` counts {count!r:.20} windows; expected a number: write it again")
         for row in {0, count - 1} - {-1}:
@@ -186,7 +186,7 @@ class WindowDataset:
         if not 0 <= row < self.count:
             raise IndexError(f"window {row} of {self.count}")
         problem, initial, _ = load_arrays(self.folder / _name(row), self.terms)
-        labels, _ = _LABELS.read(self.folder / f"{row:07d}.labels.npz")
+        labels, _ = LABELS.read(self.folder / f"{row:07d}.labels.npz")
         return LabelledWindow(problem, initial, labels)
 
     def order(self, seed: int, epoch: int = 0) -> np.ndarray:

@@ -82,6 +82,8 @@ def metre_of(points: np.ndarray, pose: np.ndarray) -> float:
     The mean inverse depth tells how far the image moves for a motion of one unit. In the first views of a map it is
     about `1 / NOMINAL_DEPTH`, and thresholds are in metres there; where all is far away, places are known worse.
     """
+    if not len(points):
+        return 1.0
     depth = points @ pose[2, :3] + pose[2, 3]
     return float(len(points) / (NOMINAL_DEPTH * np.sum(1.0 / depth)))
 
