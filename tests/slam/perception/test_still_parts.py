@@ -292,7 +292,7 @@ def test_a_run_with_text_in_the_picture_is_as_good_as_one_without(tmp_path: Path
         cv2.imwrite(str(file), picture)
     with pytest.warns(InputWarning, match="% of the image is a static overlay"):
         result = vg.reconstruct(tmp_path / "room", dense="none")
-    assert 0.1 < result.summary["still_parts"] < 0.35
+    assert 0.1 < result.summary["static_overlay"] < 0.35
     off = vg.SlamSettings(camera=vg.settings.CameraSettings(static_overlay=False))
     without = vg.reconstruct(tmp_path / "room", settings=off, dense="none")
     assert "still_parts" not in without.summary
