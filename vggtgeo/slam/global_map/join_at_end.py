@@ -25,7 +25,7 @@ from vggtgeo.slam.threads import map_in_threads
 
 ALIKE = 2
 """Keyframes of the other submap that are verified for each of a submap's, those that look most like it."""
-LEAST_AGREEING = 2
+MIN_AGREEING = 2
 """Keyframes of a submap that must agree on where it is."""
 
 
@@ -58,7 +58,7 @@ def _joined(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Ro
         trial = _moved(slam, loop, set(other))
         agreeing = [one for one in loops if one.agrees(trial)]
         placed = {number for one in agreeing for number in one.pair.key if number in other}
-        if len(placed) >= LEAST_AGREEING and (best is None or len(agreeing) > len(best[1])):
+        if len(placed) >= MIN_AGREEING and (best is None or len(agreeing) > len(best[1])):
             best = trial, agreeing
     if best is None:
         return None
