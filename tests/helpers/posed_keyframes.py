@@ -14,7 +14,9 @@ def slots_of(pixels: np.ndarray, inverse: np.ndarray) -> Slots:
     return Slots(pixels, inverse, inverse, 0.01 * inverse, one, one, np.nan * one)
 
 
-def keyframe_of(number: int, image: np.ndarray, pose: np.ndarray, points: Slots, depth: np.ndarray) -> Keyframe:
+def keyframe_of(
+    number: int, image: np.ndarray, pose: np.ndarray, points: Slots, depth: np.ndarray, sigma: float = 0.01
+) -> Keyframe:
     none = np.zeros(0)
     return Keyframe(
         number=number,
@@ -24,7 +26,7 @@ def keyframe_of(number: int, image: np.ndarray, pose: np.ndarray, points: Slots,
         images=KeyframeImages(
             image,
             depth.astype(np.float16),
-            np.full(depth.shape, 0.01, np.float16),
+            np.full(depth.shape, sigma, np.float16),
             np.where(np.isfinite(depth), 255, 0).astype(np.uint8),
         ),
         features=Features(points.pixels, np.ones(len(points.pixels))),

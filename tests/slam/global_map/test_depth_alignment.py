@@ -9,15 +9,14 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from posed_keyframes import keyframe_of, slots_of
 from scenes import make_scene
 from scipy.linalg import expm
-from vggtgeo.models.roles import Features, LineFeatures, Segments
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.depth_alignment import FARTHEST, LEAST_COSINE, Surface, align, align_pairs
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 INTRINSICS = np.array([260.0, 255.0, 159.5, 119.5])
 SIZE = (240, 320)
@@ -46,27 +45,8 @@ def moved(pose: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 def keyframe(number: int, pose: np.ndarray, depth: np.ndarray, sigma: float = 0.01) -> Keyframe:
     """A keyframe that has seen depth alone, of relative standard deviation `sigma`."""
-    none, nobody = np.zeros(0), np.zeros((0, 2))
-    slots = Slots(nobody, none, none, none, none, none, none)
-    segments = Segments(np.zeros((0, 2, 2)), none)
-    return Keyframe(
-        number=number,
-        frame=number,
-        timestamp=float(number),
-        pose=pose,
-        images=KeyframeImages(
-            np.zeros((*SIZE, 3), np.uint8),
-            depth.astype(np.float16),
-            np.full(SIZE, sigma, np.float16),
-            np.full(SIZE, 255, np.uint8),
-        ),
-        features=Features(nobody, none, np.zeros((0, 1))),
-        lines=LineFeatures(segments, None),
-        line_depths=nobody,
-        points=slots,
-        samples=slots,
-        sample_segment=np.zeros(0, int),
-    )
+    nothing = slots_of(np.zeros((0, 2)), np.zeros(0))
+    return keyframe_of(number, np.zeros((*SIZE, 3), np.uint8), pose, nothing, depth, sigma)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ They were set on simulated runs, and are measured on those of `benchmarks/verdic
 import numpy as np
 
 LEVEL = 1e-6
-"""Significance of an alternative. Nine are tried in each window."""
+"""Significance of an alternative; eight families are tried in each window."""
 LIKELIER = -2.0 * float(np.log(LEVEL))
 """Minus twice the log likelihood ratio at that level, of two explanations with as many parameters."""
 SIGMAS = 2.0
