@@ -39,7 +39,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows, term_residuals, used_slots
 from vggtgeo.bundle.resolution import MAJORITY, finer_than_precision
 from vggtgeo.bundle.terms.edge import EdgeTerm, ImageTerm
-from vggtgeo.bundle.terms.node import PairTerm, PoseTerm, node_jacobians, node_residuals
+from vggtgeo.bundle.terms.node import PairTerm, PoseTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
@@ -136,11 +136,15 @@ class Diagnosis(eqx.Module):
         )
 
 
-def diagnose(problem: Problem, start: State, state: State) -> Diagnosis:
-    """The faults of a prepared problem at `state`; positions are looked at where the iteration starts."""
+def diagnose(problem: Problem, start: State, state: State, energy: Float[Array, ""] | None = None) -> Diagnosis:
+    """The faults of a prepared problem at `state`; positions are looked at where the iteration starts.
+
+    energy: of the problem at `state`, where it is known.
+    """
     terms = problem.terms
-    found = [_observed(problem, term, state) for term in terms]
-    rigid = [_rigid(problem, term, state) for term in terms]
+    slopes = [_at_both(problem, term, start, state) for term in terms]
+    found = [_observed(problem, term, state, own) for term, own in zip(terms, slopes, strict=True)]
+    saved, motion = _saved(problem, state, slopes)
     rows = sum((count_rows(problem, term, state) for term in terms), jnp.asarray(0))
     unknowns = jnp.sum(free_coordinates(problem)) + jnp.sum(used_slots(problem))
     unknowns += sum((2 * jnp.sum(pixel.present()) for pixel in problem.pixel_terms), jnp.asarray(0))
@@ -149,10 +153,12 @@ def diagnose(problem: Problem, start: State, state: State) -> Diagnosis:
         value=jnp.stack([_first(own.present & ~own.value) for own in found]),
         derivative=jnp.stack([_first(own.present & ~own.derivative) for own in found]),
         rejected=jnp.stack([_rejected(term, own) for term, own in zip(terms, found, strict=True)]).astype(dtype),
-        unresolved=jnp.stack([_unresolved(problem, term, start) for term in terms]).astype(dtype),
-        saved=jnp.stack([saved for saved, _ in rigid]).astype(dtype),
-        motion=jnp.stack([motion for _, motion in rigid]).astype(dtype),
-        energy=2 * prepared_energy(problem, state),
+        unresolved=jnp.stack(
+            [_unresolved(problem, term, start, own) for term, own in zip(terms, slopes, strict=True)]
+        ).astype(dtype),
+        saved=saved.astype(dtype),
+        motion=motion.astype(dtype),
+        energy=2 * (prepared_energy(problem, state) if energy is None else energy),
         redundancy=rows - unknowns,
         names=tuple(term.name for term in terms),
         shapes=tuple(jnp.shape(term.weight) for term in terms),
@@ -201,9 +207,35 @@ class Observed(NamedTuple):
     """Of one residual."""
 
 
-def _observed(problem: Problem, term: AbstractTerm, state: State) -> Observed:
+class _Slopes(NamedTuple):
+    """Residuals of a term on poses and their derivatives by local coordinates, where the iteration starts and where it
+    ends.
+    """
+
+    residual: Float[Array, "2 m k"]
+    jacobian: Float[Array, "2 m k d"]
+
+
+def _at_both(problem: Problem, term: AbstractTerm, start: State, state: State) -> _Slopes | None:
+    """None for another term, and without observations. Of both states in one program: it is compiled once."""
+    if not isinstance(term, PoseTerm | PairTerm) or not len(term.weight):
+        return None
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), start, state)
+    return _Slopes(*jax.vmap(lambda at: node_derivatives(term, at.poses.wxyz_xyz, cameras_of(problem, at)))(both))
+
+
+def _observed(problem: Problem, term: AbstractTerm, state: State, slopes: _Slopes | None) -> Observed:
     if isinstance(term, EdgeTerm):
         return _observed_on_edges(problem, term, state)
+    if slopes is not None:
+        residual, jacobian = slopes.residual[1], slopes.jacobian[1]
+        return Observed(
+            present=term.weights != 0,
+            squared=term.weights * jnp.sum(residual**2, 1),
+            value=jnp.all(jnp.isfinite(residual), 1),
+            derivative=jnp.all(jnp.isfinite(jacobian), (1, 2)),
+            entries=residual.shape[1],
+        )
     zero = jnp.zeros(state.num_unknowns, state.inverse_depth.dtype)
     # One derivative along all coordinates together is not finite if any is not.
     residuals = lambda step: term_residuals(problem, term, state.moved(step))
@@ -259,7 +291,7 @@ def _rejected(term: AbstractTerm, own: Observed) -> Float[Array, ""]:
     return _share((own.squared > level) & (rises < -rounding), own.present)
 
 
-def _unresolved(problem: Problem, term: AbstractTerm, state: State) -> Float[Array, ""]:
+def _unresolved(problem: Problem, term: AbstractTerm, state: State, slopes: _Slopes | None) -> Float[Array, ""]:
     eps = float(jnp.finfo(state.inverse_depth.dtype).eps)
     away = jnp.sum(state.poses.translation() ** 2, -1)
     if isinstance(term, ImageTerm) and term.weight.size:
@@ -270,40 +302,66 @@ def _unresolved(problem: Problem, term: AbstractTerm, state: State) -> Float[Arr
         depth = state.inverse_depth[row, term.first_slot : term.first_slot + term.weight.shape[1]]
         farther = jnp.maximum(away[source], away[target])[:, None]
         return _share(finer_than_precision(term.weights, (focal * depth) ** 2, farther, eps), term.weights != 0)
-    if isinstance(term, PoseTerm | PairTerm) and len(term.weight):
-        slopes = node_jacobians(term, state.poses.wxyz_xyz, cameras_of(problem, state))
-        moved: Array = jnp.zeros(len(term.weight), slopes.dtype)
+    if slopes is not None and isinstance(term, PoseTerm | PairTerm):
+        jacobian = slopes.jacobian[0]
+        moved: Array = jnp.zeros(len(term.weight), jacobian.dtype)
         for place, index in enumerate(term.touched()):
-            by_position = slopes[:, :, lie.TANGENT * place : lie.TANGENT * place + 3]
+            by_position = jacobian[:, :, lie.TANGENT * place : lie.TANGENT * place + 3]
             moved = jnp.maximum(moved, jnp.sum(by_position**2, (1, 2)) * away[index])
-        return _share(finer_than_precision(term.weights, moved / slopes.shape[1], 1.0, eps), term.weights != 0)
+        return _share(finer_than_precision(term.weights, moved / jacobian.shape[1], 1.0, eps), term.weights != 0)
     return jnp.zeros(())
 
 
-def _rigid(problem: Problem, term: AbstractTerm, state: State) -> tuple[Float[Array, ""], Float[Array, "6"]]:
-    """`g' K^+ g` and `-K^+ g` of the gradient and Hessian of a term by a rigid motion of all poses together."""
-    if not isinstance(term, PoseTerm | PairTerm) or not len(term.weight):
-        return jnp.zeros(()), jnp.zeros(lie.TANGENT)
-    poses, cameras = state.poses.wxyz_xyz, cameras_of(problem, state)
-    anchor = jaxlie.SE3(poses[jnp.argmax(problem.fixed_pose)].astype(poses.dtype))
-    carry = jax.vmap(lambda pose: lie.adjoint(lie.relative(anchor, jaxlie.SE3(pose))))(poses)
-    slopes, residual = node_jacobians(term, poses, cameras), node_residuals(term, poses, cameras).T
+class _Rigid(NamedTuple):
+    """A term's gradient and Hessian by a rigid motion of all poses together, and what the poses feel one by one."""
+
+    gradient: Float[Array, "6"]
+    hessian: Float[Array, "6 6"]
+    size: Float[Array, "6"]
+
+
+def _rigid(term: AbstractTerm, carry: Float[Array, "n 6 6"], slopes: _Slopes | None) -> _Rigid:
+    if slopes is None or not isinstance(term, PoseTerm | PairTerm):
+        nothing = jnp.zeros((lie.TANGENT, lie.TANGENT), carry.dtype)
+        return _Rigid(nothing[0], nothing, nothing[0])
+    residual, jacobian = slopes.residual[1], slopes.jacobian[1]
     pull = term.weights * term.kernel.weight(term.weights * jnp.sum(residual**2, 1))
     parts = [
-        jnp.einsum("mka,mab->mkb", slopes[:, :, lie.TANGENT * place : lie.TANGENT * (place + 1)], carry[index])
+        jnp.einsum("mka,mab->mkb", jacobian[:, :, lie.TANGENT * place : lie.TANGENT * (place + 1)], carry[index])
         for place, index in enumerate(term.touched())
     ]
     along = sum(parts[1:], parts[0])
-    gradient = jnp.einsum("m,mka,mk->a", pull, along, residual)
-    hessian = jnp.einsum("m,mka,mkb->ab", pull, along, along)
+    return _Rigid(
+        gradient=jnp.einsum("m,mka,mk->a", pull, along, residual),
+        hessian=jnp.einsum("m,mka,mkb->ab", pull, along, along),
+        size=jnp.asarray(sum(jnp.einsum("m,mka->a", pull, part**2) for part in parts)),
+    )
+
+
+def _carried(problem: Problem, state: State) -> Float[Array, "n 6 6"]:
+    """Tangent of each pose by that of a rigid motion, in the axes of the first held camera."""
+    poses = state.poses.wxyz_xyz
+    anchor = jaxlie.SE3(poses[jnp.argmax(problem.fixed_pose)])
+    return lie.adjoint(jax.vmap(lambda pose: lie.relative(anchor, jaxlie.SE3(pose)))(poses))
+
+
+def _saved(
+    problem: Problem, state: State, slopes: list[_Slopes | None]
+) -> tuple[Float[Array, " k"], Float[Array, "k 6"]]:
+    """`g' K^+ g` and `-K^+ g` of each term, of its gradient and Hessian by a rigid motion."""
+    if not any(own is not None for own in slopes):
+        return jnp.zeros(len(slopes)), jnp.zeros((len(slopes), lie.TANGENT))
+    carry = _carried(problem, state)
+    terms = [_rigid(term, carry, own) for term, own in zip(problem.terms, slopes, strict=True)]
+    gradient, hessian, size = (jnp.stack(parts) for parts in zip(*terms, strict=True))
     # Balanced by what the poses feel one by one: a relative term feels no common motion but by rounding.
-    size = sum(jnp.einsum("m,mka->a", pull, part**2) for part in parts)
     scale = jnp.sqrt(jnp.where(size > 0, size, 1.0))
-    balanced = hessian / scale[:, None] / scale[None, :]
-    finite = jnp.all(jnp.isfinite(balanced)) & jnp.all(jnp.isfinite(gradient))
-    values, vectors = jnp.linalg.eigh(jnp.where(finite, balanced, jnp.eye(lie.TANGENT, dtype=balanced.dtype)))
+    balanced = hessian / scale[:, :, None] / scale[:, None, :]
+    finite = jnp.all(jnp.isfinite(balanced), (1, 2)) & jnp.all(jnp.isfinite(gradient), 1)
+    safe = jnp.where(finite[:, None, None], balanced, jnp.eye(lie.TANGENT, dtype=balanced.dtype))
+    values, vectors = jnp.linalg.eigh(safe)
     kept = values > 100 * lie.TANGENT * jnp.finfo(values.dtype).eps
-    forces = vectors.T @ (jnp.where(finite, gradient, 0.0) / scale)
-    step = vectors @ jnp.where(kept, forces / jnp.where(kept, values, 1.0), 0.0) / scale
+    forces = jnp.einsum("kab,ka->kb", vectors, jnp.where(finite[:, None], gradient, 0.0) / scale)
+    step = jnp.einsum("kab,kb->ka", vectors, jnp.where(kept, forces / jnp.where(kept, values, 1.0), 0.0)) / scale
     held = jnp.any(problem.fixed_pose)
-    return jnp.where(held, gradient @ step, 0.0), -step
+    return jnp.where(held, jnp.sum(jnp.where(finite[:, None], gradient, 0.0) * step, 1), 0.0), -step

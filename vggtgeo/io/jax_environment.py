@@ -1,6 +1,7 @@
 """Global settings of JAX and BLAS for a program of this package, as environment variables."""
 
 import os
+from importlib import metadata
 from pathlib import Path
 
 SHORTEST_CACHED_COMPILATION = 0.0
@@ -22,11 +23,23 @@ def jax_environment() -> dict[str, str]:
         "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
         "OPENBLAS_NUM_THREADS": "1",
     }
+    if fast_compilation() is not None:
+        found["XLA_FLAGS"] = str(fast_compilation())
     folder = cache_folder()
     if folder is not None:
         found["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         found["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(SHORTEST_CACHED_COMPILATION)
     return found
+
+
+def fast_compilation() -> str | None:
+    """Return the flag of XLA that halves the compilation of a solve on a CPU; None from jaxlib 0.11 on, which ends the
+    process that sets it.
+
+    Fused loops then do not go through MLIR. An iteration takes up to 8 % longer (`benchmarks/host_pixels.py --time`).
+    """
+    version = tuple(map(int, metadata.version("jaxlib").split(".")[:2]))
+    return "--xla_cpu_use_fusion_emitters=false" if version < (0, 11) else None
 
 
 def own_cache() -> Path | None:

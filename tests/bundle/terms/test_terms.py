@@ -36,8 +36,10 @@ from vggtgeo.bundle.objective import (
     view_of,
 )
 from vggtgeo.bundle.terms.edge import EdgeTerm
-from vggtgeo.bundle.terms.node import DenseTerm
+from vggtgeo.bundle.terms.node import DenseTerm, node_derivatives, node_residuals
 from vggtgeo.bundle.terms.relative_pose import quadratic
+from vggtgeo.geometry import lie
+from vggtgeo.geometry.camera_models import Cameras
 from vggtgeo.slam.sparse_map.factors import (
     MeasuredBaseline,
     MeasuredRelativePose,
@@ -343,3 +345,30 @@ def test_names_and_replacement() -> None:
     assert names(problem.without_term("lines")) == ["points", "depth", "intrinsics_prior"]
     with pytest.raises(AttributeError, match="no attribute and no term `imu`"):
         _ = problem.imu
+
+
+class TwiceRelative(vg.terms.RelativePose):
+    """A user's own residual on the fields of a relative pose."""
+
+    def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, "6"]:
+        return 2 * super().residual(first, second) + first.translation()[0]
+
+
+@pytest.mark.parametrize("kind", [vg.terms.RelativePose, TwiceRelative])
+def test_derivatives_of_a_relative_pose_are_those_of_its_residual(kind: type[vg.terms.RelativePose]):
+    """Derivatives by the relative tangent, carried to both poses; oracle: central differences of the residual."""
+    rng = np.random.default_rng(3)
+    poses, measured = (jaxlie.SE3.exp(jnp.asarray(rng.normal(size=(2, 6)))).wxyz_xyz for _ in range(2))
+    root = jnp.asarray(rng.normal(size=(1, 6, 6)))
+    term = kind(first=[0], second=[1], measured=measured[:1], root=root, weight=jnp.ones(1))
+    cameras = Cameras(jnp.ones(4), vg.cameras.Pinhole)
+    value, jacobian = (found[0] for found in node_derivatives(term, poses, cameras))
+
+    def residual(step: np.ndarray) -> np.ndarray:
+        moved = lie.move(jaxlie.SE3(poses), jnp.asarray(step).reshape(2, 6)).wxyz_xyz
+        return np.asarray(node_residuals(term, moved, cameras)[:, 0])
+
+    steps = 1e-6 * np.eye(12)
+    differences = np.stack([(residual(step) - residual(-step)) / 2e-6 for step in steps], 1)
+    np.testing.assert_allclose(value, residual(np.zeros(12)), atol=1e-12)
+    np.testing.assert_allclose(jacobian, differences, atol=1e-7)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool
 
 from vggtgeo.bundle.objective import cameras_of
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm, node_jacobians
+from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 
@@ -28,7 +28,7 @@ def changing(problem: Problem, term: AbstractTerm, state: State) -> AbstractTerm
         slopes = jnp.moveaxis(jax.jacfwd(term.residuals)(state.parameters), 1, 0)
         free = jnp.broadcast_to(free_parameters.reshape(-1), (len(slopes), problem.num_parameters))
     elif isinstance(term, PoseTerm | PairTerm):
-        slopes = node_jacobians(term, state.poses.wxyz_xyz, cameras_of(problem, state))
+        slopes = node_derivatives(term, state.poses.wxyz_xyz, cameras_of(problem, state))[1]
         parts = [jnp.repeat(~problem.fixed_pose[index][:, None], lie.TANGENT, 1) for index in term.touched()]
         if isinstance(term, PoseTerm):
             cameras = problem.camera_of

@@ -17,6 +17,7 @@ from vggtgeo.bundle.terms.term import (
     Local,
     check_residual,
     local_model,
+    reweighted_model,
     reweighted_rows,
     robust_energy,
 )
@@ -25,6 +26,7 @@ from vggtgeo.geometry.camera_models import AbstractCamera, Cameras
 from vggtgeo.io.errors import InputError
 
 _Index = Int[Array, " m"]
+ValueAndJacobian = tuple[Float[Array, " k"], Float[Array, "k d"]]
 
 
 def _indices(given: Any) -> Array:
@@ -68,11 +70,22 @@ class PoseTerm(AbstractTerm):
         """The residual of one observation as a function of `(xi, parameters of the keyframe's camera)`."""
 
         def function(step: Array) -> Array:
-            pose = lie.move(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
+            pose = lie.move_at_zero(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
             camera = cameras.of(touched[0], step[lie.TANGENT :])
             return check_residual(self, self.holding(data).residual(pose, camera))
 
         return function
+
+    def value(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Array:
+        """The residual of one observation."""
+        pose = jaxlie.SE3(poses[touched[0]])
+        return check_residual(self, self.holding(data).residual(pose, cameras.of(touched[0])))
+
+    def derivatives(
+        self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
+    ) -> ValueAndJacobian:
+        """The residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
+        return _differentiated(self, data, touched, poses, cameras)
 
     def touched(self) -> tuple[_Index, ...]:
         """Keyframes of each observation."""
@@ -120,11 +133,22 @@ class PairTerm(AbstractTerm):
         """The residual of one observation as a function of `(xi_i, xi_j)`."""
 
         def function(step: Array) -> Array:
-            first = lie.move(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
-            second = lie.move(jaxlie.SE3(poses[touched[1]]), step[lie.TANGENT :])
+            first = lie.move_at_zero(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
+            second = lie.move_at_zero(jaxlie.SE3(poses[touched[1]]), step[lie.TANGENT :])
             return check_residual(self, self.holding(data).residual(first, second))
 
         return function
+
+    def value(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Array:
+        """The residual of one observation."""
+        first, second = (jaxlie.SE3(poses[index]) for index in touched)
+        return check_residual(self, self.holding(data).residual(first, second))
+
+    def derivatives(
+        self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
+    ) -> ValueAndJacobian:
+        """The residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
+        return _differentiated(self, data, touched, poses, cameras)
 
     def touched(self) -> tuple[_Index, ...]:
         """Keyframes of each observation."""
@@ -219,7 +243,7 @@ class DenseTerm(AbstractTerm):
         split = lie.TANGENT * len(poses.wxyz_xyz)
 
         def residual(step: Array) -> Array:
-            moved = lie.move(poses, step[:split].reshape(-1, lie.TANGENT))
+            moved = lie.move_at_zero(poses, step[:split].reshape(-1, lie.TANGENT))
             return self.residual(moved, parameters + step[split:])
 
         return local_model(self, self.weights, residual, split + len(parameters), correction, exact)
@@ -227,20 +251,15 @@ class DenseTerm(AbstractTerm):
 
 def node_residuals(term: NodeTerm, poses: Float[Array, "n 7"], cameras: Cameras) -> Float[Array, "k m"]:
     """Residuals of all observations of a pose or pair term, the residual's own axis first."""
-
-    def one(data: dict, touched: tuple[Array, ...]) -> Array:
-        return term.local(data, touched, poses, cameras)(jnp.zeros(term.local_size(cameras), poses.dtype))
-
+    one = lambda data, touched: term.value(data, touched, poses, cameras)
     return jax.vmap(one, out_axes=-1)(term.data(), term.touched())
 
 
-def node_jacobians(term: NodeTerm, poses: Float[Array, "n 7"], cameras: Cameras) -> Float[Array, "m k d"]:
-    """Derivatives of all residuals of a pose or pair term by the local coordinates of each."""
-
-    def one(data: dict, touched: tuple[Array, ...]) -> Array:
-        zero = jnp.zeros(term.local_size(cameras), poses.dtype)
-        return jax.jacfwd(term.local(data, touched, poses, cameras))(zero)
-
+def node_derivatives(
+    term: NodeTerm, poses: Float[Array, "n 7"], cameras: Cameras
+) -> tuple[Float[Array, "m k"], Float[Array, "m k d"]]:
+    """Residuals of all observations of a pose or pair term, and their derivatives by the local coordinates of each."""
+    one = lambda data, touched: term.derivatives(data, touched, poses, cameras)
     return jax.vmap(one)(term.data(), term.touched())
 
 
@@ -254,7 +273,18 @@ def node_models(
     """Hessian and gradient of each observation of a pose or pair term by its local coordinates."""
 
     def one(data: dict, weight: Array, touched: tuple[Array, ...]) -> tuple[Array, Array]:
-        residual = term.local(data, touched, poses, cameras)
-        return local_model(term, weight, residual, term.local_size(cameras), correction, exact)
+        if exact:
+            residual = term.local(data, touched, poses, cameras)
+            return local_model(term, weight, residual, term.local_size(cameras), None, exact=True)
+        value, jacobian = term.derivatives(data, touched, poses, cameras)
+        return reweighted_model(term, weight, value, jacobian, correction)
 
     return jax.vmap(one)(term.data(), term.weights, term.touched())
+
+
+def _differentiated(
+    term: NodeTerm, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
+) -> ValueAndJacobian:
+    residual = term.local(data, touched, poses, cameras)
+    zero = jnp.zeros(term.local_size(cameras), poses.dtype)
+    return residual(zero), jax.jacfwd(residual)(zero)

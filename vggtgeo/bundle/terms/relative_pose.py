@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.terms.node import PairTerm
+from vggtgeo.bundle.terms.node import PairTerm, ValueAndJacobian
 from vggtgeo.geometry import lie
+from vggtgeo.geometry.camera_models import Cameras
 
 
 class RelativePose(PairTerm):
@@ -41,6 +43,22 @@ class RelativePose(PairTerm):
 
     def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, "6"]:
         return self.root @ lie.boxminus(lie.relative(first, second), jaxlie.SE3(self.measured))
+
+    def derivatives(
+        self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
+    ) -> ValueAndJacobian:
+        """By the tangent of the relative pose, `eta = x_j - Ad(T_j T_i^-1) x_i`: half of the work, and of the
+        compilation.
+        """
+        if type(self).residual is not RelativePose.residual:
+            return super().derivatives(data, touched, poses, cameras)
+        relative = lie.relative(*(jaxlie.SE3(poses[index]) for index in touched))
+        own = self.holding(data)
+        error = lie.relative(jaxlie.SE3(own.measured), relative)
+        residual = lambda eta: own.root @ lie.log(lie.move_at_zero(error, eta))
+        zero = jnp.zeros(lie.TANGENT, poses.dtype)
+        by_second = jax.jacfwd(residual)(zero)
+        return residual(zero), jnp.concatenate([-by_second @ lie.adjoint(relative), by_second], 1)
 
 
 def quadratic(

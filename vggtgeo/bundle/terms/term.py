@@ -283,7 +283,17 @@ def local_model(
         energy: Local = lambda local: term.kernel.rho(weight * jnp.sum(residual(local) ** 2)) / 2
         gradient, hessian = jax.grad(energy), jax.jacfwd(jax.grad(energy))
         return hessian(zero), gradient(zero)
-    value, jacobian = residual(zero), jax.jacfwd(residual)(zero)
+    return reweighted_model(term, weight, residual(zero), jax.jacfwd(residual)(zero), correction)
+
+
+def reweighted_model(
+    term: AbstractTerm,
+    weight: Float[Array, ""],
+    value: Float[Array, " k"],
+    jacobian: Float[Array, "k d"],
+    correction: Float[Array, ""] | None,
+) -> tuple[Float[Array, "d d"], Float[Array, " d"]]:
+    """Reweighted Hessian and gradient of one observation's energy, of its residual and that one's derivatives."""
     rows, pull = reweighted_rows(term.kernel, weight, value, jacobian.T, correction)
     return rows @ rows.T, rows @ pull
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -36,10 +37,10 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 
 def _solve(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:
-    return solve(problem, initial, solver=solver)
+    return solve(problem, initial, solver=solver, diagnosis=False)
 
 
-solve_jit = KeptProgram(_solve, solution_like)
+solve_jit = KeptProgram(_solve, functools.partial(solution_like, diagnosis=False))
 
 
 def window_size(settings: SlamSettings) -> PaddedSize:
