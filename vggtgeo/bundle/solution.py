@@ -252,7 +252,7 @@ def solution_like(
     """A solution of the structure of the one of these, without its numbers: for what keeps programs."""
     count, number = jnp.asarray(0), jnp.zeros(())
     tries = jnp.zeros(solver.max_iterations + 1)
-    moved = jax.tree.map(lambda part: jnp.zeros((len(tries), *part.shape)), BundleAdjustment(problem).recorded(initial))
+    moved = jnp.zeros((len(tries), *initial.poses.wxyz_xyz.shape))
     return Solution(
         state=initial,
         energy=number,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -42,11 +43,16 @@ def demo(
     from vggtgeo.cli.run_sequence import Output, RunArguments, run_and_write
     from vggtgeo.simulation import simulate
     from vggtgeo.slam.settings.slam_settings import Roles
+    from vggtgeo.slam.window.sliding_window import warm_up
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(rerun) if rerun else None
     slam_settings = pipeline_settings(settings, assignments or (), {})
-    sequence = simulate(world.scene, world.frames, world.seed, rate=10.0, size=SIZE)
+    # While the light of the scene is computed, what every window needs is compiled.
+    with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
+        compiled = pool.submit(warm_up, slam_settings)
+        sequence = simulate(world.scene, world.frames, world.seed, rate=10.0, size=SIZE)
+        compiled.result()
     if not (report.quiet or report.as_json):
         typer.echo(f"simulated scene `{world.scene}`: all results below are from a simulation")
     run_and_write(
