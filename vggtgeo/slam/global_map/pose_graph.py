@@ -12,8 +12,8 @@ spread, too, and not left where it happened. Loops have a Cauchy kernel, widened
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2 as chi_square
@@ -21,10 +21,12 @@ from scipy.stats import chi2 as chi_square
 from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
-from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.relative_pose import RelativePose
 from vggtgeo.geometry import rigid
+from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.global_map.global_shape import padded_count
 from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, relative_pose_rows
 from vggtgeo.slam.tracking.evidence import tangent
@@ -43,7 +45,12 @@ nothing."""
 DENSE_POSES = 200
 """Poses up to which the factor is dense, whatever the loops are; it takes some 20 ms."""
 
-solve_graph_jit = eqx.filter_jit(solve)
+
+def _solve_graph(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:
+    return solve(problem, initial, solver=solver, graduation=GRADUATION, diagnosis=False)
+
+
+solve_graph_jit = KeptProgram(_solve_graph, partial(solution_like, diagnosis=False))
 
 
 class LoopClosure(RelativePose):
@@ -93,7 +100,7 @@ def solve_pose_graph(graph: PoseGraph) -> Untangled:
     small = count <= DENSE_POSES
     reduced = DenseCholesky() if small else choose_reduced_solver(problem)
     solver = SchurLevenbergMarquardt(max_iterations=ITERATIONS, rtol=1e-6, reduced_solver=reduced)
-    solution = solve_graph_jit(problem, initial, solver=solver, graduation=GRADUATION)
+    solution = solve_graph_jit(problem, initial, solver)
     poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64)[:count])
     if not np.isfinite(poses).all():
         return Untangled(graph.poses, np.zeros(len(graph.loops), bool))
