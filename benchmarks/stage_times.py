@@ -1,0 +1,107 @@
+"""Where the time of a run goes: seconds of each stage, cold (nothing compiled before) and warm.
+
+    D=../shared/data
+    .venv/bin/python benchmarks/stage_times.py $D/redkitchen $D/icl-office $D/corridor-office $D/building-walk
+    .venv/bin/python benchmarks/stage_times.py demo
+
+A column a run: c for cold or w for warm, then d with depth, r without, u without depth and calibration (`--runs d r
+u`). Stages marked "own thread" run beside the others; "processor" counts all threads, "memory" is the peak. `--end N`
+takes the first N frames. Clips are not mapped densely, the demo is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import vggtgeo as vg
+from vggtgeo.cli.demo import SIZE
+from vggtgeo.datasets.views import SequenceView
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.jax_environment import jax_environment
+
+RUNS = {"d": "with depth", "r": "without depth", "u": "without depth, camera unknown"}
+
+
+def main() -> None:
+    """Print a table for each clip."""
+    options = _options()
+    if options.one:
+        print(json.dumps(_summary(options.clips[0], options.one, options.end)))
+        return
+    for clip in options.clips:
+        columns = {}
+        for kind in options.runs:
+            with tempfile.TemporaryDirectory() as cache:
+                for state in ("c", "w"):
+                    columns[state + kind] = _measured(clip, kind, cache, options.end)
+        _print(clip, columns)
+
+
+def _summary(clip: str, kind: str, end: int | None) -> dict[str, Any]:
+    sequence = vg.simulate("office", 45, rate=10.0, size=SIZE) if clip == "demo" else vg.read(clip)
+    camera = Camera.guess(sequence.camera.width, sequence.camera.height) if kind == "u" else sequence.camera
+    view = SequenceView(sequence, camera, kind == "d" and sequence.has_depth)
+    result = vg.reconstruct(view, end=end, dense="auto" if clip == "demo" else "none")
+    with tempfile.TemporaryDirectory() as folder:
+        result.save(folder)
+        summary: dict[str, Any] = json.loads((Path(folder) / "summary.json").read_text())
+    return summary
+
+
+def _measured(clip: str, kind: str, cache: str, end: int | None) -> dict[str, float]:
+    """Seconds by stage of one run in a process of its own."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))}
+    os.environ["XDG_CACHE_HOME"] = cache
+    environment |= {"XDG_CACHE_HOME": cache, **jax_environment()}
+    program = [sys.executable, __file__, clip, "--one", kind, *(["--end", str(end)] if end else [])]
+    before, began = _processor(), time.perf_counter()
+    printed = subprocess.run(program, check=True, env=environment, capture_output=True, text=True).stdout
+    whole, processor = time.perf_counter() - began, _processor() - before
+    summary = json.loads(printed.splitlines()[-1])
+    stages: dict[str, float] = summary["seconds_by_stage"]
+    inside = stages.pop("all")
+    counts = {"frames": summary["frames"], "keyframes": summary["keyframes"]}
+    ends = {
+        "imports, writing": whole - inside,
+        "whole": whole,
+        "processor": processor,
+        "memory, GB": summary["peak_memory_gb"],
+    }
+    return {**counts, **stages, **ends}
+
+
+def _processor() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _print(clip: str, columns: dict[str, dict[str, float]]) -> None:
+    stages = list(dict.fromkeys(name for column in columns.values() for name in column))
+    last = ["imports, writing", "whole", "processor", "memory, GB"]
+    print(f"\n| {Path(clip).name} | {' | '.join(columns)} |\n|---" + "|---" * len(columns) + "|")
+    for name in [*(stage for stage in stages if stage not in last), *last]:
+        digits = 0 if name in ("frames", "keyframes") else 1
+        row = [f"{column.get(name, 0):.{digits}f}" for column in columns.values()]
+        print(f"| {name} | {' | '.join(row)} |", flush=True)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("clips", nargs="+", help="folders, or `demo`")
+    parser.add_argument("--runs", nargs="+", choices=RUNS, default=["d"])
+    parser.add_argument("--end", type=int)
+    parser.add_argument("--one", choices=RUNS, help="this run of one clip, in this process")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
