@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("maps.webp"))
     given = parser.parse_args()
     measured, alone = vg.Result.load(given.measured), vg.Result.load(given.pictures)
-    error = vg.evaluate_trajectory(alone.trajectory, measured.trajectory).sim3
+    error = vg.evaluate(alone.trajectory, measured.trajectory).sim3
     placed = replace(alone.cloud, points=error.alignment.points(alone.cloud.points))
     views = [walk_in(cloud, measured.trajectory, WIDTH) for cloud in (measured.cloud, placed)]
     rows = np.flatnonzero(np.any([(view != BACKGROUND).any((1, 2)) for view in views], axis=0))

@@ -188,7 +188,7 @@ def main() -> None:
         sequence, name = vg.simulate(given.scene, given.frames, rate=10.0), f"simulated {given.scene}"
     watcher = Watcher()
     result = vg.reconstruct(sequence, callbacks=[watcher])
-    error = vg.evaluate_trajectory(result.trajectory, sequence.ground_truth()).se3.statistics.rmse
+    error = vg.evaluate(result.trajectory, sequence.ground_truth()).se3.statistics.rmse
     save(pages(result, watcher.moments, name, error, given.every), given.out, given.quality)
 
 

@@ -31,7 +31,6 @@ from .bundle.solution import Solution as Solution
 from .bundle.solution import solve as solve
 from .bundle.solver_choice import choose_reduced_solver as choose_reduced_solver
 from .datasets import open_sequence as open_sequence
-from .evaluation import evaluate_trajectory as evaluate_trajectory
 from .figures.plot import plot as plot
 from .geometry.camera import Camera as Camera
 from .geometry.trajectory import Trajectory as Trajectory

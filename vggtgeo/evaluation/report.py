@@ -131,7 +131,7 @@ def evaluate_trajectory(
     Example:
         >>> import vggtgeo as vg
         >>> truth = vg.simulate("room", 30).ground_truth()
-        >>> vg.evaluate_trajectory(truth.select(slice(0, 20)), truth).matched
+        >>> vg.evaluate(truth.select(slice(0, 20)), truth).matched
         20
 
     """

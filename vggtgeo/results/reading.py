@@ -44,7 +44,9 @@ def evaluate(
     Args:
         estimate: a trajectory, a result, or a path: a file (TUM, KITTI, EuRoC) or a run's folder.
         truth: a trajectory, a sequence with ground truth, or the path of one.
-        options: `max_dt`, `delta`, `all_pairs` of `vggtgeo.evaluate_trajectory`.
+        options: `max_dt`, the largest difference of two times that match, in seconds; `delta`, the step of the RPE, in
+            matched poses, or by `unit` in "seconds" or "metres" of the true path; `all_pairs`, of every pair that far
+            apart; `vertical`, the direction up in the world of the ground truth.
 
     Raises:
         InputError: a trajectory is missing, or fewer than three poses match in time.
