@@ -13,7 +13,7 @@ import pytest
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.calibration import Refinement, try_camera
-from vggtgeo.slam.camera.camera_of_pairs import CameraPair, _Points, camera_of_pairs
+from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair, _Points, pairwise_intrinsics
 
 HELD = 1e-6
 """Relative standard deviation of a camera that is held, as in the pipeline."""
@@ -86,11 +86,11 @@ def test_a_lens_that_nobody_told_of_is_no_focal_length() -> None:
     curve = lambda pixels: np.asarray(jax.vmap(lambda pixel: bent.project(straight.unproject(pixel)))(pixels))
     seen = window.observations
     seen = replace(seen, point_target=curve(jnp.asarray(seen.point_target)), pixel=curve(jnp.asarray(seen.pixel)))
-    opinion = camera_of_pairs(pairs(replace(window, observations=seen)), window.intrinsics)
-    assert opinion is not None
-    assert opinion.value[3] == pytest.approx(-0.2, abs=0.02)
-    assert abs(opinion.value[0]) < 0.01
-    assert opinion.value[3] < -10 * opinion.sigma[3]
+    estimate = pairwise_intrinsics(pairs(replace(window, observations=seen)), window.intrinsics)
+    assert estimate is not None
+    assert estimate.value[3] == pytest.approx(-0.2, abs=0.02)
+    assert abs(estimate.value[0]) < 0.01
+    assert estimate.value[3] < -10 * estimate.sigma[3]
 
 
 def test_the_derivatives_of_pairs_are_those_of_their_residuals() -> None:

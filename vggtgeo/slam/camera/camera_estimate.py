@@ -9,7 +9,7 @@ import numpy as np
 from vggtgeo.geometry.camera import Camera
 
 MIN_KEYFRAMES_FOR_CAMERA = 3
-"""Keyframes that the estimate of a camera needs; as many as the last adjustment."""
+"""Minimum number of keyframes to estimate the intrinsics; the last adjustment needs as many."""
 KNOWN_SIGMA = 1e-6
 """Standard deviation of known intrinsics, relative to the focal length: small enough that no adjustment changes them.
 A wide prior lets the focal length absorb errors of the poses."""
@@ -20,13 +20,13 @@ GUESSED_CENTRE_SIGMA = 0.02
 """Standard deviation of a guessed principal point, in image widths and heights: the published calibrations of TUM
 RGB-D, EuRoC, KITTI and ICL-NUIM are 0.014 off the middle (root mean square)."""
 GUESSED = 0.1
-"""A prior on the focal length that is wider than this share of it stands for a guess."""
+"""Relative standard deviation of the focal length above which a prior belongs to a guessed camera."""
 
 
 @dataclass(frozen=True)
 class Readout:
-    """How long the camera reads an image out, s: from the first row to the last, or column where columns; negative: the
-    last is read first. shift: by how much that moves matches in this run, pixels, exceeded by one in ten.
+    """The rolling shutter. seconds: readout time from the first row (column if `columns`) to the last; negative if the
+    last is read first. shift: 90th percentile of the displacement of matches that it causes in this run, pixels.
     """
 
     seconds: float
@@ -36,7 +36,7 @@ class Readout:
 
 @dataclass(frozen=True, eq=False)
 class CameraEstimate:
-    """What is known of the camera.
+    """The camera: intrinsics, their prior, lens and rolling shutter.
 
     Fields:
         intrinsics: Current fx, fy, cx, cy, float64 [4], pixels.
@@ -77,9 +77,9 @@ class CameraEstimate:
         return was_given(self.given, self.sigma, self.self_calibrated)
 
     def window_sigma(self, keyframes: int) -> np.ndarray:
-        """Standard deviation of the camera's prior in a window of a map of so many keyframes, float64 [4], pixels.
+        """Return the prior standard deviation of the intrinsics in a window, float64 [4], pixels.
 
-        A self-calibrated camera is held as a given one is, and so is a guess while there are two keyframes: two views
+        A self-calibrated camera is fixed like a given one, and so is a guess while the map has two keyframes: two views
         do not determine a focal length.
         """
         if not self.self_calibrated and (self.calibrated or keyframes >= MIN_KEYFRAMES_FOR_CAMERA):
@@ -88,8 +88,8 @@ class CameraEstimate:
 
 
 def was_given(given: np.ndarray, sigma: np.ndarray, self_calibrated: bool) -> bool:
-    """Whether a prior of the intrinsics, mean and standard deviation in pixels, is that of a camera that was given.
+    """Return whether a prior of the intrinsics, mean and standard deviation in pixels, belongs to a given camera.
 
-    self_calibrated: maybe so far from the guess that its `sigma` is a small share of `given`.
+    self_calibrated: its `sigma` may be a small share of `given`, too, far from the guess.
     """
     return bool(not self_calibrated and sigma[0] < GUESSED * given[0])

@@ -1,4 +1,4 @@
-"""Does another camera explain matches better than chance makes it?"""
+"""Test whether another camera explains the matches significantly better."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.io.kept_program import KeptProgram
 
 CHANCE = 1e-3
-"""Of taking a camera that is no better."""
+"""Significance level of the test."""
 MIN_HOSTS = 3
 
 
@@ -27,12 +27,12 @@ _energies_jit = KeptProgram(_energies, lambda problem, state: problem.points.wei
 def gain(
     before: tuple[Problem, State], after: tuple[Problem, State], chosen: np.ndarray, fitted: int = 0
 ) -> tuple[float, float]:
-    """How much the robust energy of a match falls on average, and how much it has to fall to be no chance.
+    """Return the mean decrease of a match's robust energy, and the decrease that is significant at `CHANCE`.
 
-    Student's t over keyframes, whose matches share a pose; at least the error over matches.
+    Student's t over keyframes, because the matches of one share a pose; at least the standard error over matches.
 
-    before, after: a map adjusted with either camera, its points the same. chosen: bool [e, p], which matches count.
-    fitted: parameters of the camera that were fitted to these very matches; each takes the freedom of a keyframe.
+    before, after: the same map adjusted with either camera. chosen: bool [e, p], the matches to use. fitted: number of
+    camera parameters fitted to these matches; each takes one degree of freedom.
     """
     fall = np.where(chosen, match_energies(*before) - match_energies(*after), 0.0)
     problem = before[0]
@@ -51,5 +51,5 @@ def gain(
 
 
 def match_energies(problem: Problem, state: State) -> np.ndarray:
-    """Robust energy of each match of key points, float64 [e, p]."""
+    """Return the robust energy of each match of key points, float64 [e, p]."""
     return np.asarray(_energies_jit(problem, state), np.float64)

@@ -1,14 +1,12 @@
-"""The lens of a camera that nobody calibrated: found once in the last adjustment, and taken out of the map.
+"""Lens distortion of an uncalibrated camera: estimated once in the last adjustment, then removed from the map.
 
-A guessed camera is a pinhole until the whole map is adjusted: that of the calibration frames (`self_calibration.py`),
-or of the run.
-Where its lens distorts, the focal length takes that up, and comes out wrong: redkitchen, images alone, ends at 539 and
-550 px (COLMAP: 522 and 520, with k1 -0.007 and k2 -0.043). So the map is adjusted once more with the two radial
-coefficients of the lens free (520 px, -0.006, -0.047).
-Where that explains the matches better by more than chance, and moves pixels by more than `MIN_WARP`, images, key
-points and segments of the keyframes are resampled to those of the ideal pinhole, and everything after sees only that.
+A guessed camera is a pinhole until a whole map is adjusted: that of the calibration frames (`self_calibration.py`), or
+of the run. If the lens distorts, the focal length absorbs the distortion and is wrong. So the map is adjusted once more
+with two radial coefficients free (`benchmarks/no_calibration.py`). If that explains the matches significantly better
+and moves pixels by more than `MIN_WARP`, then images, key points and segments of the keyframes are undistorted, and all
+later steps use the ideal pinhole.
 
-What every tracked frame was placed by hangs on keyframes, and moves with them.
+Poses of tracked frames are relative to keyframes, so they follow.
 """
 
 from __future__ import annotations
@@ -34,20 +32,20 @@ from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 from vggtgeo.slam.sparse_map.map import Map
 
 RADIAL = 0.3
-"""Standard deviation of k1 and k2 before anything is seen: lenses of phones and action cameras are within."""
+"""Prior standard deviation of k1 and k2; it covers lenses of phones and action cameras."""
 MIN_WARP = 1.0
-"""Pixels, the most that the lens moves any pixel: below, images would lose more by being resampled."""
+"""Largest displacement by the lens, pixels: below it, resampling costs more than distortion."""
 
 Solve = Callable[[Problem, State], State]
 
 
 @dataclass(frozen=True, eq=False)
 class FoundLens:
-    """A lens as the whole map sees it.
+    """The result of an adjustment with free lens distortion.
 
-    camera: with its distortion. state: the map that was adjusted with it; its camera is the ideal pinhole. gain: how
-    much the mean robust energy of a match falls by it, and needed: how much it has to fall to be no chance. warp: the
-    most that it moves a pixel, pixels; infinite where it folds the image, as no lens does.
+    camera: with its distortion. state: the adjusted map; its camera is the ideal pinhole. gain: mean decrease of a
+    match's robust energy; needed: the decrease that is significant. warp: largest displacement of a pixel, pixels;
+    infinite if the distortion folds the image, as no lens does.
     """
 
     camera: Camera
@@ -58,12 +56,12 @@ class FoundLens:
 
     @property
     def pays(self) -> bool:
-        """Whether it is there, and worth to be taken out."""
+        """Whether the distortion is significant and large enough to remove."""
         return self.gain > self.needed and MIN_WARP < self.warp < float("inf")
 
 
 def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solve) -> FoundLens | None:
-    """The lens, from a map that was adjusted without distortion; None where what comes out is no camera.
+    """Estimate the lens of a map that was adjusted without distortion; return None if the result is invalid.
 
     problem, state: that adjustment, its camera a `SquarePinhole` or a `Pinhole`. size: height and width of the images.
     solve: adjusts any problem.
@@ -79,7 +77,7 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
         return None
     height, width = size
     camera = Camera((fx, fy, cx, cy), width, height, tuple(distortion), known=False)
-    # Both cameras have seen all matches: two numbers for thousands of them are no reason to set some aside.
+    # No matches are held out: two parameters do not overfit thousands of matches.
     present = np.asarray(problem.points.present())
     better, needed = gain((problem, state), (with_lens, found), present, fitted=pinhole + 2)
     ideal = eqx.tree_at(lambda s: s.intrinsics, found, found.intrinsics[:pinhole])
@@ -87,7 +85,7 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
 
 
 def _with_lens(problem: Problem) -> Problem:
-    """The same problem with a camera whose radial distortion is free."""
+    """Return the problem with a camera whose radial distortion is free."""
     prior = problem.intrinsics_prior
     kind = SquareRadialTangential if problem.camera is SquarePinhole else RadialTangential
     names, more = kind.names, len(kind.names) - len(problem.camera.names)
@@ -101,14 +99,14 @@ def _with_lens(problem: Problem) -> Problem:
 
 
 def largest_shift(camera: Camera) -> float:
-    """The most that the lens moves a pixel of its images, pixels; infinite where it folds them before the middle of
-    their farthest side. A fold in the corners costs no more than those: k1 = -0.25 does that to redkitchen.
+    """Return the largest displacement of a pixel by the lens, pixels; infinite if the distortion folds the image before
+    the middle of its farthest side. A fold in the corners only loses the corners.
     """
     fx, fy, cx, cy = camera.intrinsics
     k1, k2, *_ = camera.distortion
     sides = max(cx, camera.width - cx) / fx, max(cy, camera.height - cy) / fy
     side, corner = max(sides), np.hypot(*sides)
-    # Ideal radii up to a corner's, and half as far again: a barrel's corner is farther out than it looks.
+    # Undistorted radii up to 1.5 times a corner's: barrel distortion draws corners inwards.
     radius = np.linspace(0.0, 1.5 * corner, 300)
     drawn = radius * (1 + k1 * radius**2 + k2 * radius**4)
     folds = np.append(np.diff(drawn) <= 0, True)
@@ -119,14 +117,14 @@ def largest_shift(camera: Camera) -> float:
 
 
 def can_undistort(keyframes: Iterable[Keyframe]) -> bool:
-    """Whether descriptors stay true when pixels move; those that hold their image in a form of their own do not."""
+    """Return whether the descriptors stay valid when pixels move; opaque ones that contain the image do not."""
     return all(
         isinstance(keyframe.features.descriptors, PixelDescriptors | np.ndarray | None) for keyframe in keyframes
     )
 
 
 def undistorted_map(known: Map, lens: Camera) -> Map:
-    """The map as the ideal pinhole of `lens` sees it; its poses and depths stay."""
+    """Return the map with undistorted keyframes and matches; poses and depths stay."""
     undistorter = lens.undistorter()
     keyframes = tuple(_keyframe(keyframe, lens, undistorter) for keyframe in known.keyframes)
     return replace(known, keyframes=keyframes, pairs=tuple(_pair(pair, lens) for pair in known.pairs))

@@ -1,9 +1,9 @@
-"""Are the pixels of a camera that nobody calibrated square? Found once in the last adjustment.
+"""The pixel aspect ratio of an uncalibrated camera, estimated once in the last adjustment.
 
-Cameras have square pixels, so a guessed one has one focal length. But recordings are resized to the input of a
-network, widescreen is squeezed into 4:3, tapes have pixels of 0.9: then one focal length fits no more, and a map takes
-that up by depths and motions. So the map is adjusted once more with both focal lengths free. Where that explains the
-matches better by more than chance, and they differ by more than `MIN_STRETCH`, the camera has both from then on.
+Cameras have square pixels, so a guessed camera has one focal length. But images may have been resized to the input of a
+network, or squeezed from widescreen into 4:3. One focal length then does not fit, and depths and motions absorb the
+error. So the map is adjusted once more with both focal lengths free. If that explains the matches significantly better
+and the two differ by more than `MIN_STRETCH`, both are kept.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ Solve = Callable[[Problem, State], State]
 
 @dataclass(frozen=True, eq=False)
 class FoundAspect:
-    """Both focal lengths as the whole map sees them.
+    """The result of an adjustment with both focal lengths free.
 
     problem, state: the adjustment whose camera is a `Pinhole`, and its solution. stretch: logarithm of `f_x / f_y`.
-    gain: how much the mean robust energy of a match falls by it, and needed: how much it has to fall to be no chance.
+    gain: mean decrease of a match's robust energy; needed: the decrease that is significant.
     """
 
     problem: Problem
@@ -43,17 +43,17 @@ class FoundAspect:
 
     @property
     def pays(self) -> bool:
-        """Whether pixels are not square."""
+        """Whether the pixels are significantly not square."""
         return self.gain > self.needed and abs(self.stretch) > MIN_STRETCH
 
 
 def are_square(intrinsics: np.ndarray) -> bool:
-    """Whether fx and fy, pixels, count as one."""
+    """Return whether fx and fy, pixels, are equal to within `MIN_STRETCH`."""
     return bool(abs(np.log(intrinsics[0] / intrinsics[1])) <= MIN_STRETCH)
 
 
 def find_aspect(problem: Problem, state: State, solve: Solve) -> FoundAspect | None:
-    """Both focal lengths, from a map that was adjusted with one; None where what comes out is no camera.
+    """Estimate both focal lengths of a map that was adjusted with one; return None if the result is invalid.
 
     problem, state: that adjustment, its camera a `SquarePinhole`. solve: adjusts any problem.
     """
@@ -67,7 +67,7 @@ def find_aspect(problem: Problem, state: State, solve: Solve) -> FoundAspect | N
 
 
 def _with_both(problem: Problem) -> Problem:
-    """The same problem with a camera of two focal lengths, each as little known as the one."""
+    """Return the problem with two focal lengths, each with the prior of the one."""
     prior = problem.intrinsics_prior
     wider = IntrinsicsPrior(index=jnp.arange(len(Pinhole.names)), mean=_twice(prior.mean), weight=_twice(prior.weight))
     fixed = _twice(problem.fixed_intrinsics)
@@ -75,5 +75,5 @@ def _with_both(problem: Problem) -> Problem:
 
 
 def _twice(parameters: jnp.ndarray) -> jnp.ndarray:
-    """The first of a square camera's parameters twice, and the others."""
+    """Return the parameters of a square camera with the first one, the focal length, repeated."""
     return jnp.concatenate([parameters[:1], parameters])

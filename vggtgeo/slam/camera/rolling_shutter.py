@@ -1,16 +1,15 @@
-"""The rolling shutter of a camera: found in the last adjustment, and taken out of it.
+"""The rolling shutter: estimated in the last adjustment and removed from it.
 
-Cameras of phones and the colour cameras of depth cameras read an image row by row, over 5 to 30 ms, in which the camera
-moves on: a match in row `v` of `H` is where its landmark was `(v / H - 1/2) T` after the middle of the image. The
-motion of each keyframe is known from the frames beside it, so that the map is adjusted once more with every match where
-it would have been at the middle, for the readout time `T` that explains matches best. Sought down the slope of the
-energy, whose derivative at an adjusted map needs no other adjustment (the envelope theorem), by the secant method.
+Cameras of phones and depth cameras read an image row by row, over 5 to 30 ms, while the camera moves: a match in row
+`v` of `H` shows its landmark `(v / H - 1/2) T` after the middle of the image. The velocity of each keyframe is known
+from the neighbouring frames. So matches are moved to where they would be at the middle of the image, and the map is
+adjusted again, for the readout time `T` with the least energy. The secant method finds the zero of the energy's
+derivative, which at an adjusted map needs no other adjustment (envelope theorem).
 
-A phone that is held upright reads columns of what is shown; the direction whose slope is surer is taken.
+A phone held upright reads columns of the displayed image; the direction with the more significant slope is used.
 
-Without measured depth the map bends to explain such images, and fits them: 240 frames of building-walk, whose camera
-takes 10 ms, were 7.5 cm off, and are 5.0. Frames were
-matched and tracked as if each were of one moment, and where they move by 10 px in that time a map may be lost.
+Without measured depth the map deforms to explain a rolling shutter (`benchmarks/rolling_shutter.py`). Matching and
+tracking still treat each image as one moment, and may fail if pixels move by 10 px during the readout.
 """
 
 from __future__ import annotations
@@ -33,27 +32,27 @@ from vggtgeo.slam.camera.camera_gain import MIN_HOSTS, gain, match_energies
 from vggtgeo.slam.threads import map_in_threads
 
 FIRST_SHIFT, SETTLED = 1.0, 0.05
-"""Pixels, median of the matches: the first step of the search, and the one at which it ends."""
+"""Median displacement of matches, pixels: the first step of the search, and the step that ends it."""
 FASTEST = 1e6
-"""Pixels a second: what seems faster is a landmark in the camera."""
+"""Pixels a second: larger velocities come from landmarks at the camera's centre."""
 PROBE = 0.05
-"""Pixels, the same: for derivatives."""
+"""Step of the finite difference, in the same unit."""
 SOLVES = 6
-AT_ONCE = 128
-"""Edges that are looked at together, by a thread: a building's 15,000 would take gigabytes."""
+BATCH = 128
+"""Edges per batch and thread: 15,000 at once would take gigabytes."""
 LONGEST = 2.0
-"""Of a step, in the one before."""
+"""Largest step relative to the previous one."""
 WORTH_A_TRIAL = 0.05
-"""Chance of a slope as sure as this without a rolling shutter (Student's t over keyframes): a search takes seconds."""
+"""Significance level of the slope (Student's t over keyframes) below which no search is made, which takes seconds."""
 USUAL_LARGEST = 90
-"""Percentile of the matches whose shift is told."""
+"""Percentile of the displacements that is reported."""
 
 Solve = Callable[[Problem, State], State]
 
 
 class Shifts(NamedTuple):
-    """Pixels a second of readout time by which pixels are off: of slots [n, s, 2], of points [e, p, 2] in the target,
-    and of lines [e, l, 2] where their sample is seen.
+    """Displacement per second of readout time, pixels a second: of slots [n, s, 2], of points [e, p, 2] in the target,
+    and of lines [e, l, 2] at their projected samples.
     """
 
     slots: np.ndarray
@@ -63,8 +62,8 @@ class Shifts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FoundReadout:
-    """The outcome of a search: the readout, the problem without it, the map adjusted to that; and how much the mean
-    robust energy of a match falls by it, and has to fall to be no chance.
+    """The result of a search: the readout, the corrected problem and its adjusted map, the mean decrease of a match's
+    robust energy, and the decrease that is significant.
     """
 
     readout: Readout
@@ -75,13 +74,13 @@ class FoundReadout:
 
     @property
     def pays(self) -> bool:
-        """Whether it is there."""
+        """Whether the rolling shutter is significant."""
         return self.gain > self.needed
 
 
 def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], columns: bool) -> Shifts:
-    """What a readout of one second would shift. size: height and width of the images; columns: they are read column by
-    column.
+    """Return the displacements by a readout of one second. size: height and width of the images; columns: images are
+    read column by column.
     """
     camera = _pinhole(problem, state)
     poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
@@ -98,7 +97,7 @@ def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[
         lines = shift(seen[:, count:], depth[:, count:], motions[target])
         return points.astype(np.float32), lines.astype(np.float32)
 
-    parts = map_in_threads(of_edges, (slice(first, first + AT_ONCE) for first in range(0, len(edges), AT_ONCE)))
+    parts = map_in_threads(of_edges, (slice(first, first + BATCH) for first in range(0, len(edges), BATCH)))
     points, lines = (np.concatenate(each) for each in zip(*parts, strict=True))
     return Shifts(shift(pixels, inverse, motions), points, lines)
 
@@ -106,7 +105,7 @@ def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[
 def carried(
     pixels: np.ndarray, inverse: np.ndarray, relative: np.ndarray, camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [a, b, 2] and inverse depths [a, b] of landmarks as other cameras see them; relative: [a, 4, 4]."""
+    """Return pixels [a, b, 2] and inverse depths [a, b] of landmarks in other cameras; relative: [a, 4, 4]."""
     rays = _rays(pixels, camera)
     there = np.einsum("aij,abj->abi", relative[:, :3, :3], rays) + relative[:, None, :3, 3] * inverse[..., None]
     with np.errstate(all="ignore"):
@@ -114,12 +113,12 @@ def carried(
 
 
 def _rays(pixels: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """With a depth of one, [..., 3]."""
+    """Return rays with depth one, [..., 3]."""
     return np.concatenate([(pixels - camera[2:]) / camera[:2], np.ones((*pixels.shape[:-1], 1))], -1)
 
 
 def _pinhole(problem: Problem, state: State) -> np.ndarray:
-    """fx, fy, cx, cy of the camera."""
+    """Return fx, fy, cx, cy."""
     parameters = np.asarray(state.intrinsics, np.float64)
     return np.array([parameters[0], *parameters]) if problem.camera is SquarePinhole else parameters[:4]
 
@@ -132,8 +131,8 @@ def image_shift(
     size: tuple[int, int],
     columns: bool,
 ) -> np.ndarray:
-    """Velocity in the image [a, b, 2], of pixels [a, b, 2] at inverse depths [a, b] under motions [a, 6], by the time
-    of their row; zero where they are not in front of the camera.
+    """Return the velocity in the image [a, b, 2] of pixels [a, b, 2] at inverse depths [a, b] under motions [a, 6],
+    times the relative time of their row; zero for points that are not in front of the camera.
     """
     rays = _rays(pixels, camera)
     with np.errstate(all="ignore"):
@@ -146,7 +145,7 @@ def image_shift(
     return np.clip(np.where(known, shift, 0.0), -FASTEST, FASTEST)
 
 
-def at_once(
+def to_global_shutter(
     pixels: np.ndarray,
     inverse: np.ndarray,
     motion: np.ndarray,
@@ -154,13 +153,13 @@ def at_once(
     size: tuple[int, int],
     readout: Readout,
 ) -> np.ndarray:
-    """Pixels [m, 2] of one image, where they would be at the middle of its readout; see `image_shift`."""
+    """Return pixels [m, 2] of one image as at the middle of its readout; see `image_shift`."""
     there = np.asarray(pixels, np.float64)
     shift = image_shift(there[None], inverse[None], motion[None], camera, size, readout.columns)[0]
     return np.asarray(there - readout.seconds * shift)
 
 
-def pair_at_once(
+def pair_to_global_shutter(
     before: np.ndarray,
     after: np.ndarray,
     depth: np.ndarray,
@@ -170,20 +169,20 @@ def pair_at_once(
     size: tuple[int, int],
     readout: Readout,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Matches [m, 2] of two images without the readout of either. depth: [m], in the first; relative: [4, 4], first
+    """Return matches [m, 2] of two images as by global shutters. depth: [m], in the first; relative: [4, 4], first
     camera -> second; motions: [6] of each, see `camera_motions`.
     """
     inverse = 1.0 / depth
     _, there = carried(before[None], inverse[None], relative[None], camera)
     return (
-        at_once(before, inverse, motions[0], camera, size, readout),
-        at_once(after, there[0], motions[1], camera, size, readout),
+        to_global_shutter(before, inverse, motions[0], camera, size, readout),
+        to_global_shutter(after, there[0], motions[1], camera, size, readout),
     )
 
 
-def read_at_once(problem: Problem, shifts: Shifts, seconds: float, most: float) -> Problem:
-    """The problem with every match where it would have been at the middle of its image's readout. most: pixels, of a
-    shift: beyond are landmarks that have run into the camera.
+def global_shutter_problem(problem: Problem, shifts: Shifts, seconds: float, most: float) -> Problem:
+    """Return the problem with each match as at the middle of its image's readout. most: largest displacement, pixels:
+    larger ones come from landmarks at the camera's centre.
     """
     slots, points, lines = (np.clip(seconds * shift, -most, most) for shift in shifts)
     coefficients = np.asarray(problem.lines.coefficients, np.float64)
@@ -203,14 +202,14 @@ def read_at_once(problem: Problem, shifts: Shifts, seconds: float, most: float) 
 def without_readout(
     problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], readout: Readout
 ) -> Problem:
-    """The problem without a readout that is known; state: about where its map is."""
+    """Return the problem corrected for a known readout; state: an estimate of the map."""
     shifts = row_shifts(problem, state, motions, size, readout.columns)
-    return read_at_once(problem, shifts, readout.seconds, max(size) / 2)
+    return global_shutter_problem(problem, shifts, readout.seconds, max(size) / 2)
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """A map, and what a readout does to it."""
+    """A problem and the displacements of its matches per second of readout time."""
 
     problem: Problem
     shifts: Shifts
@@ -218,23 +217,23 @@ class _Search:
 
     @cached_property
     def usual(self) -> float:
-        """Median shift of the matches, pixels a second."""
+        """Median displacement of the matches, pixels a second."""
         return float(np.median(self.sizes)) if len(self.sizes) else 0.0
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """Of every match, in host and target together, pixels a second."""
+        """Displacement of each match, the larger of host and target, pixels a second."""
         source = np.asarray(self.problem.edges.source)
         points = self.shifts.points.shape[1]
         both = np.stack([self.shifts.slots[source][:, :points], self.shifts.points], -2)
         return np.asarray(np.linalg.norm(both, axis=-1).max(-1)[np.asarray(self.problem.points.present())])
 
     def at(self, seconds: float) -> Problem:
-        """The problem without this readout."""
-        return read_at_once(self.problem, self.shifts, seconds, self.most)
+        """Return the problem corrected for this readout time."""
+        return global_shutter_problem(self.problem, self.shifts, seconds, self.most)
 
     def slopes(self, seconds: float, state: State) -> np.ndarray:
-        """Derivative of the energy of each keyframe's matches by the readout time, float64 [n], at an adjusted map."""
+        """Return the derivative of the energy of each keyframe's matches by the readout time, float64 [n]."""
         step = PROBE / self.usual
         later, earlier = (match_energies(self.at(seconds + sign * step), state) for sign in (1, -1))
         each = np.where(np.asarray(self.problem.points.present()), later - earlier, 0.0).sum(1) / (2 * step)
@@ -246,10 +245,10 @@ class _Search:
 def find_readout(
     problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], longest: float, solve: Solve
 ) -> FoundReadout | None:
-    """The readout that explains the matches of a map best; None where none is to be seen.
+    """Estimate the readout time of a map; return None if no rolling shutter is significant.
 
-    problem, state: an adjustment as if each image were of one moment. motions: see `camera_motions`. longest: seconds
-    that it can last, the time from frame to frame. solve: adjusts any problem of its shape.
+    problem, state: an adjustment that assumes global shutters. motions: see `camera_motions`. longest: upper bound of
+    the readout time, s: the time between frames. solve: adjusts any problem of the same shape.
     """
     chosen, surest = None, 0.0
     for columns in (False, True):
@@ -275,7 +274,7 @@ def find_readout(
 
 
 def _descend(search: _Search, state: State, slope: float, longest: float, solve: Solve) -> tuple[float, State]:
-    """The readout at which the energy has no slope, or the longest there can be, and the map adjusted to it."""
+    """Return the readout time with zero slope, or the upper bound, and the map adjusted to it."""
     lower, upper = (0.0, slope), None
     seconds = -np.sign(slope) * min(FIRST_SHIFT / search.usual, longest)
     for _ in range(SOLVES):
@@ -301,6 +300,6 @@ def _descend(search: _Search, state: State, slope: float, longest: float, solve:
 
 
 def _zero(one: tuple[float, float], other: tuple[float, float]) -> float:
-    """Where a line through two slopes is zero; not finite of equal ones."""
+    """Return the zero of the line through two slopes; not finite if they are equal."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.divide(one[0] * other[1] - other[0] * one[1], other[1] - one[1]))

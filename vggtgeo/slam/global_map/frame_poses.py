@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
-from vggtgeo.slam.camera.rolling_shutter import at_once
+from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
@@ -95,7 +95,7 @@ def _sight(
     if slam.camera.readout is not None and motions is not None:
         inverse = 1.0 / (points @ pose[2, :3] + pose[2, 3])
         size = slam.keyframes[record.reference].size
-        pixels = at_once(pixels, inverse, motions[1][row], slam.intrinsics, size, slam.camera.readout)
+        pixels = to_global_shutter(pixels, inverse, motions[1][row], slam.intrinsics, size, slam.camera.readout)
     return points, pixels
 
 
@@ -111,7 +111,7 @@ def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tupl
     known = np.isfinite(inverse) & (inverse > 1 / FARTHEST)
     inverse, pixels = inverse[known], keyframe.points.pixels[slots[known]]
     if motion is not None and slam.camera.readout is not None:
-        pixels = at_once(pixels, inverse, motion, slam.intrinsics, keyframe.size, slam.camera.readout)
+        pixels = to_global_shutter(pixels, inverse, motion, slam.intrinsics, keyframe.size, slam.camera.readout)
     points = rigid.unproject(pixels, inverse, keyframe.pose, slam.intrinsics)
     return points, record.seen.pixels[known].astype(np.float64)
 

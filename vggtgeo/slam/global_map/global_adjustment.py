@@ -13,8 +13,8 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
-from vggtgeo.slam.camera.camera_of_pairs import CameraPair
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
+from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair
 from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
 from vggtgeo.slam.camera.rolling_shutter import find_readout, without_readout
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs

@@ -1,4 +1,4 @@
-"""The camera by pairs of images whose depth is known: focal length, principal point and distortion, poses eliminated.
+"""Intrinsics estimated from pairs of images with known depth: focal length, principal point and distortion.
 
 For pairs of frames, in both directions, pixels `p` with known depth are carried to the other
 frame, `q = distort(pi(T pi^-1(undistort(p), z)))`, and the relative pose `T` of each pair is solved together with four
@@ -8,8 +8,8 @@ a bundle adjustment whose depths are given. Errors of these depths pull the foca
 goes forward and the other way where it goes back; both directions together cancel most of it.
 
 The covariance is the sandwich over `B` blocks of time, `B / (B - 4) S^-1 (sum g_b g_b') S^-1`: it needs no noise model,
-and neighbouring pairs may share their errors. `k1` is always free: a lens that distorts bends a focal length that is
-sought without it (redkitchen: 538 px without, 521 with; COLMAP 522 and 520).
+and neighbouring pairs may share their errors. `k1` is always free: if distortion is left out, the focal length absorbs
+it (`benchmarks/no_calibration.py`).
 """
 
 from __future__ import annotations
@@ -29,25 +29,27 @@ MIN_PAIRS = 8
 PARAMETERS = 4
 MIN_BLOCKS = PARAMETERS + 2
 ITERATIONS, SETTLED = 20, 0.002
-"""At most, and the step, in the longest ones, below which there are no more. Half the focal length is seven of these
-away."""
+"""Iteration limit, and the step, as a share of the longest one, that ends the iteration. Half the focal length is seven
+of the longest steps away."""
 POSE_ITERATIONS = 4
-AT_ONCE = 200
-"""Pairs, of some hundred points: 20 MB."""
+BATCH = 200
+"""Pairs per batch, of some hundred points each: 20 MB."""
 HUBER = 1.0
 FARTHEST = 30.0
-"""Pixels: residuals beyond are none of this camera's."""
+"""Pixels: larger residuals are outliers and have no weight."""
 PRIOR = np.array([0.5, 300.0, 300.0, 1.0])
 """Standard deviations: so weak that they only keep the problem solvable."""
 LONGEST_STEP = np.array([0.1, 30.0, 30.0, 0.1])
 
 
 @dataclass(frozen=True, eq=False)
-class CameraOpinion:
-    """What pairs say of the camera: log factor on the focal lengths, shift of the principal point in pixels (x, y),
-    radial coefficient k1; float64 [4], zero means: as it was taken to be. covariance: float64 [4, 4] of these, from
-    `blocks` independent ones. better: where asked for, share of the pairs that this camera fits better than the one
-    they began with, each pose free; better_half: the same in that half of the time where it is largest.
+class PairwiseIntrinsics:
+    """The estimate: change of the intrinsics against those that it started from.
+
+    value: float64 [4], log factor on the focal lengths, shift of the principal point (x, y, pixels), coefficient k1.
+    covariance: float64 [4, 4], from `blocks` independent blocks of time. better: share of the pairs that the new camera
+    fits better than the initial one, each pose free (1 if not computed); better_half: the largest such share in half of
+    the time.
     """
 
     value: np.ndarray
@@ -62,13 +64,13 @@ class CameraOpinion:
         return np.sqrt(np.diag(self.covariance))
 
     def quantile(self, chance: float) -> float:
-        """Standard deviations that a value exceeds by chance with this probability, either way (Student's t)."""
+        """Return the two-sided quantile of Student's t at this significance level, in standard deviations."""
         return float(student_t.isf(chance / 2, self.blocks - PARAMETERS))
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPair:
-    """What two frames share: pixels before and after float64 [m, 2], depth before [m], pose, block of time."""
+    """Matches of two frames: pixels before and after float64 [m, 2], depth before [m], relative pose, block of time."""
 
     before: np.ndarray
     after: np.ndarray
@@ -77,12 +79,12 @@ class CameraPair:
     block: int
 
 
-def camera_of_pairs(
+def pairwise_intrinsics(
     pairs: Sequence[CameraPair], intrinsics: np.ndarray, compared: bool = False
-) -> CameraOpinion | None:
-    """Solve for the camera, starting at `intrinsics` and the pairs' poses; None where there are too few pairs.
+) -> PairwiseIntrinsics | None:
+    """Estimate the intrinsics, starting at `intrinsics` and the pairs' poses; return None if there are too few pairs.
 
-    compared: say how many pairs it fits better, too, which takes longer than the solve.
+    compared: also compute `better` and `better_half`, which takes longer than the solve.
     """
     kinds, block = np.unique([pair.block for pair in pairs], return_inverse=True)
     count = len(kinds)
@@ -93,16 +95,16 @@ def camera_of_pairs(
     inverse = np.linalg.inv(reduced.normal.sum(0) + np.diag(1 / PRIOR**2))
     blocks = np.zeros((count, PARAMETERS))
     np.add.at(blocks, block, reduced.gradient)
-    # Few blocks fit themselves: the usual correction of the sandwich.
+    # Correct the sandwich for the degrees of freedom that the fit takes from few blocks.
     covariance = count / (count - PARAMETERS) * (inverse @ blocks.T @ blocks @ inverse)
     if not compared:
-        return CameraOpinion(value, covariance, count)
+        return PairwiseIntrinsics(value, covariance, count)
     better = _costs(points, poses, value, intrinsics) < _costs(points, points.given, np.zeros(4), intrinsics)
-    return CameraOpinion(value, covariance, count, float(np.mean(better)), _in_best_half(better, block))
+    return PairwiseIntrinsics(value, covariance, count, float(np.mean(better)), _in_best_half(better, block))
 
 
 def _in_best_half(better: np.ndarray, block: np.ndarray) -> float:
-    """The largest share of `better` bool [n] in half of the blocks of time, in a row; block: int [n], from 0."""
+    """Return the largest share of `better` bool [n] in half of the time, consecutive blocks. block: int [n]."""
     found, pairs = (np.bincount(block, weights) for weights in (better, None))
     half = (len(pairs) + 1) // 2
     inside = lambda values: np.convolve(values, np.ones(half), "valid")
@@ -110,7 +112,7 @@ def _in_best_half(better: np.ndarray, block: np.ndarray) -> float:
 
 
 def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray, _Reduced]:
-    """The camera, the poses, and the last step's equations."""
+    """Return intrinsics, poses, and the normal equations of the last step."""
     value, poses = np.zeros(4), points.given
     reduced = _reduce(points, poses, value, intrinsics)
     for _ in range(ITERATIONS):
@@ -126,8 +128,8 @@ def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """The matches of all pairs in a row. before, after: float64 [n, 2]. depth: [n]. pair: int [n], ascending. given:
-    float64 [pairs, 4, 4], their poses.
+    """The matches of all pairs, concatenated. before, after: float64 [n, 2]. depth: [n]. pair: int [n], ascending.
+    given: float64 [pairs, 4, 4], their poses.
     """
 
     before: np.ndarray
@@ -144,13 +146,13 @@ class _Points:
         return cls(before, after, np.concatenate([pair.depth for pair in pairs]), number, given)
 
     def of_pairs(self, own: slice) -> _Points:
-        """Those of some pairs in a row."""
+        """Return the matches of a range of pairs."""
         start, end = np.searchsorted(self.pair, [own.start, own.stop])
         of = slice(start, end)
         return _Points(self.before[of], self.after[of], self.depth[of], self.pair[of] - own.start, self.given[own])
 
     def residuals(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-        """Predicted minus seen pixels float64 [n, 2]; NaN behind a camera. poses: float64 [pairs, 4, 4]."""
+        """Return predicted minus observed pixels, float64 [n, 2]; NaN behind a camera. poses: float64 [pairs, 4, 4]."""
         return self._carried(poses, value, intrinsics).pixels - self.after
 
     def _carried(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Carried:
@@ -167,14 +169,14 @@ class _Points:
         return _Carried(bent, x, turns, points, z, y, y * _stretch(y, value[3]) * focal + intrinsics[2:] + value[1:3])
 
     def linearized(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-        """Derivatives of the residuals by a left tangent of the pose (translation first) and by the camera, and the
-        residuals, float64 [n, 2, 6 + 4 + 1].
+        """Return derivatives of the residuals by a left tangent of the pose (translation first) and by the camera, and
+        the residuals, float64 [n, 2, 6 + 4 + 1].
         """
         now = self._carried(poses, value, intrinsics)
         focal = intrinsics[:2] * np.exp(value[0])
         k1, doubled = value[3], 2.0 * value[3]
         square = lambda points: np.sum(points**2, 1, keepdims=True)
-        # Before: how the ray moves with log f, cx, cy and k1, through the lens undone.
+        # First frame: derivative of the undistorted ray by log f, cx, cy and k1.
         rays = np.zeros((len(self.depth), 2, PARAMETERS))
         rays[:, :, 0] = -now.bent
         rays[:, 0, 1], rays[:, 1, 2] = -1.0 / focal
@@ -182,7 +184,7 @@ class _Points:
         along = doubled * now.x / (_stretch(now.x, k1) + doubled * square(now.x))  # Sherman and Morrison
         rays -= now.x[:, :, None] * np.einsum("ni,nik->nk", along, rays)[:, None]
         rays /= _stretch(now.x, k1)[:, None]
-        # After: how the pixel moves with the point.
+        # Second frame: derivative of the pixel by the point.
         onto = np.zeros((len(self.depth), 2, 3))
         onto[:, 0, 0] = onto[:, 1, 1] = 1.0
         onto[:, :, 2] = -now.y
@@ -202,8 +204,8 @@ class _Points:
 
 
 class _Carried(NamedTuple):
-    """Pixels on their way to the other frame: on the plane at depth 1, bent by the lens and not [n, 2], turns of the
-    pairs [n, 3, 3], points in the other camera [n, 3], their depth [n], on its plane and in its image [n, 2].
+    """Intermediate values of the projection: normalised points, distorted (`bent`) and not [n, 2], rotations [n, 3, 3],
+    points in the other camera [n, 3], their depth [n], their normalised points and pixels there [n, 2].
     """
 
     bent: np.ndarray
@@ -216,12 +218,12 @@ class _Carried(NamedTuple):
 
 
 def _stretch(points: np.ndarray, k1: float) -> np.ndarray:
-    """The factor of the lens at points [n, 2] of the plane at depth 1, float64 [n, 1]."""
+    """Return the radial distortion factor at points [n, 2] (normalised), float64 [n, 1]."""
     return 1.0 + k1 * np.sum(points**2, 1, keepdims=True)
 
 
 def _costs(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Robust cost of each pair with a camera, its pose brought to rest."""
+    """Return the robust cost of each pair with given intrinsics, after optimising its pose."""
     for _ in range(POSE_ITERATIONS):
         poses = rigid.moved(poses, _reduce(points, poses, value, intrinsics).pose_steps(np.zeros(4)))
     off = np.linalg.norm(points.residuals(poses, value, intrinsics), axis=1)
@@ -232,8 +234,8 @@ def _costs(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np
 
 @dataclass(frozen=True, eq=False)
 class _Reduced:
-    """Of each pair: normal matrix [pairs, 4, 4] and gradient [pairs, 4] over the camera, the pose eliminated; and what
-    brings the pose back.
+    """Schur complement of each pair over the intrinsics, matrix [pairs, 4, 4] and gradient [pairs, 4], and what the
+    back-substitution of its pose needs.
     """
 
     normal: np.ndarray
@@ -243,14 +245,14 @@ class _Reduced:
     own: np.ndarray
 
     def pose_steps(self, step: np.ndarray) -> np.ndarray:
-        """The step of each pose that belongs to a step of the camera, tangents [pairs, 6]."""
+        """Return the step of each pose for a step of the intrinsics, tangents [pairs, 6] (back-substitution)."""
         return -np.einsum("pij,pj->pi", self.inverse, self.own + self.cross @ step)
 
 
 def _reduce(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Reduced:
-    """All pairs, some at a time: what is computed of them stays in the cache of a core."""
+    """Reduce all pairs in batches that fit the cache of a core."""
     part = lambda own: _reduce_part(points.of_pairs(own), poses[own], value, intrinsics)
-    parts = map_in_threads(part, (slice(start, start + AT_ONCE) for start in range(0, len(poses), AT_ONCE)))
+    parts = map_in_threads(part, (slice(start, start + BATCH) for start in range(0, len(poses), BATCH)))
     together = lambda field: np.concatenate([getattr(part, field.name) for part in parts])
     return _Reduced(*(together(field) for field in fields(_Reduced)))
 
