@@ -43,7 +43,7 @@ CENTRE = 0.002
 images hardly tell from it."""
 SHARE = 0.5
 """Largest variance of a direction by the pairs, relative to the prior's, for which the direction is changed."""
-SET_ASIDE = 0.2
+HELD_OUT = 0.2
 """Share of the matches that is held out."""
 MIN_SEEN = 2
 """Minimum number of matches that each key point keeps."""
@@ -100,14 +100,14 @@ def try_camera(pairs: list[CameraPair], problem: Problem, state: State, solve: S
     distortion = float(estimate.value[3]), float(estimate.sigma[3])
     if not reason:
         return Refinement(given, given, distortion)
-    aside = _set_aside(problem)
-    weight = jnp.asarray(np.where(aside, 0.0, problem.points.weight))
+    held_out = _held_out(problem)
+    weight = jnp.asarray(np.where(held_out, 0.0, problem.points.weight))
     training = without_surfaces(problem.with_term(problem.points.reweighted(weight)))
     held = solve(training, state)
     start = eqx.tree_at(lambda s: s.intrinsics, held, jnp.asarray(wanted))
     moved = solve(camera_held_at(training, wanted), start)
     # Weights of the whole problem: in training the held-out matches have weight zero.
-    found, needed = gain((problem, held), (problem, moved), aside)
+    found, needed = gain((problem, held), (problem, moved), held_out)
     return Refinement(given, wanted, distortion, moved, found, needed)
 
 
@@ -163,11 +163,11 @@ def _averaged(estimate: PairwiseIntrinsics, given: np.ndarray) -> tuple[np.ndarr
     return wanted, bool(kept.any()) and sure > float(chi_square.isf(CHANCE, np.count_nonzero(kept)))
 
 
-def _set_aside(problem: Problem) -> np.ndarray:
+def _held_out(problem: Problem) -> np.ndarray:
     """Return the held-out matches, bool [e, p]: a random share of those whose key point keeps `MIN_SEEN` others."""
     present = np.asarray(problem.points.present())
     source = np.asarray(problem.edges.source)
-    chosen = present & (np.random.default_rng(SEED).random(present.shape) < SET_ASIDE)
+    chosen = present & (np.random.default_rng(SEED).random(present.shape) < HELD_OUT)
     left = np.zeros((problem.num_keyframes, present.shape[1]), int)
     np.add.at(left, source, (present & ~chosen).astype(int))
     return np.asarray(chosen & (left[source] >= MIN_SEEN))
