@@ -1,4 +1,4 @@
-"""From keyframes and their matches to a bundle-adjustment problem, and back."""
+"""Build bundle-adjustment problems from keyframes and matches, and write the results back."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ from vggtgeo.slam.window.line_support import sample_shares, supported
 from vggtgeo.slam.window.selection import Selection
 
 MIN_INVERSE_DEPTH = 1e-3
-"""1/m; a landmark starts no farther than a kilometre away."""
+"""Smallest initial inverse depth, 1/m."""
 LINE_GATE = 12.0
-"""Largest distance of a line sample from its matched segment by the poses before an adjustment, pixels; outliers within
-it are left to the robust kernel."""
+"""Largest distance of a line sample from its matched segment before an adjustment, pixels; the robust kernel handles
+outliers within it."""
 STEP_PIXELS = 2.0
-"""Standard deviation, pixels, with which a motion as long as those that a point was seen over must project it, if the
-point is to place frames: that of a match, see `PIXEL_SIGMA` in `tracking/track.py`. It leaves out what lies in the
-direction of the motion."""
+"""Largest standard deviation of a point's projection after a motion of the same length as its baseline, pixels, for use
+in tracking: that of a match (`PIXEL_SIGMA` in `tracking/track.py`). It excludes points in the direction of motion."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """What is known of the camera before an adjustment. mean, sigma: float64 [4] of fx, fy, cx, cy, pixels. kind: its
-    model, a pinhole; that of a guessed camera has square pixels.
+    """Prior of the intrinsics. mean, sigma: float64 [4] of fx, fy, cx, cy, pixels. kind: camera model; a guessed camera
+    has square pixels.
     """
 
     mean: np.ndarray
@@ -44,13 +43,13 @@ class CameraPrior:
     kind: type[Pinhole | SquarePinhole] = Pinhole
 
     def parameters(self, intrinsics: np.ndarray) -> np.ndarray:
-        """Those of the model, of fx, fy, cx, cy (or their deviations)."""
+        """Return the parameters of the model from fx, fy, cx, cy (or from their standard deviations)."""
         return np.array([np.mean(intrinsics[:2]), *intrinsics[2:]]) if self.kind is SquarePinhole else intrinsics
 
 
 @dataclass(frozen=True, eq=False)
 class Adjustment:
-    """A packed problem and the way back: local host and slot number of each landmark (points, then line samples)."""
+    """A packed problem, with host row and slot of each landmark (points, then line samples) to write results back."""
 
     keyframes: tuple[int, ...]
     """Numbers of the keyframes, in the order of the problem's."""
@@ -61,7 +60,7 @@ class Adjustment:
     slot: np.ndarray
     is_line: np.ndarray
     informed: np.ndarray
-    """Whether measurements determine the landmark's depth well enough to be used elsewhere, `[D]`."""
+    """Whether the landmark's depth is constrained well enough to be used elsewhere, `[D]`."""
     deviation: np.ndarray
     """Standard deviation of its inverse depth by views of other keyframes, `[D]`, NaN where it has another source."""
 
@@ -79,11 +78,11 @@ def build(
 ) -> Adjustment:
     """Pack `keyframes` (at most `size.keyframes`) and the directed edges between them.
 
-    terms: what else is known, of poses and pairs, by the position of a keyframe in `keyframes`. camera: where its prior
-    holds it; it starts from `intrinsics`, fx, fy, cx, cy.
+    terms: further terms on poses and pairs, by the position of a keyframe in `keyframes`. camera: prior of the
+    intrinsics; they start from `intrinsics`, fx, fy, cx, cy.
 
-    Of each host at most `point_slots` key points (those with the most observations) and `line_slots` line samples
-    (of the segments with the most) take part.
+    At most `point_slots` key points (those with the most observations) and `line_slots` line samples of each host are
+    used.
     """
     local = {keyframe.number: i for i, keyframe in enumerate(keyframes)}
     points = Selection.points(keyframes, edges, local, settings)
@@ -124,8 +123,8 @@ def _observed(
     intrinsics: np.ndarray,
     settings: SlamSettings,
 ) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray]:
-    """Matches and depth priors of the selected points and line samples, where their inverse depths start, for which of
-    them anything tells it, and how well views do.
+    """Return the observations of the selected points and line samples, their initial inverse depths, whether these are
+    constrained, and the standard deviations by views.
     """
     points, lines = selected
     depths, informed, deviation = _initial_depths(keyframes, edges, local, points, intrinsics)
@@ -155,7 +154,7 @@ def _observed(
 def write_back(
     keyframes: Sequence[Keyframe], adjustment: Adjustment, state: State
 ) -> tuple[tuple[Keyframe, ...], np.ndarray]:
-    """The keyframes with adjusted poses and inverse depths, and the adjusted intrinsics."""
+    """Return the keyframes with adjusted poses and inverse depths, and the adjusted intrinsics."""
     poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
     depths = adjustment.index.gather(state.inverse_depth)
     updated = []
@@ -177,7 +176,7 @@ def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.
 
 
 def _segments(keyframes: Sequence[Keyframe], points: Selection, lines: Selection) -> np.ndarray:
-    """Segment of each landmark, numbered over all keyframes; -1 for points."""
+    """Return the segment of each landmark, numbered over all keyframes; -1 for points."""
     first = np.cumsum([0, *(len(keyframe.lines) for keyframe in keyframes)])
     own = [first[h] + keyframes[h].sample_segment[s] for h, s in zip(lines.host, lines.slot, strict=True)]
     return np.concatenate([np.full(len(points.host), -1), np.array(own, int)])
@@ -196,7 +195,7 @@ def _point_rows(
         host = local[edge.host]
         landmark = points.table[host][edge.slots]
         chosen = landmark >= 0
-        # A slot is matched once on an edge; a matcher that gives two targets keeps the last.
+        # A slot has one match on an edge; of two targets the last is kept.
         edge_ids.append(np.full(np.count_nonzero(chosen), number))
         landmarks.append(landmark[chosen])
         targets.append(edge.pixels[chosen])
@@ -274,11 +273,11 @@ def _initial_depths(
     points: Selection,
     intrinsics: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Inverse depth of each point landmark: its estimate, else triangulated; whether views determine it; and its
-    standard deviation by these.
+    """Return the inverse depth of each point (estimated, else triangulated), whether views constrain it, and its
+    standard deviation by views.
 
-    A point whose rays are parallel to within their noise is far away, and starts there. From a typical depth it would
-    pull the cameras together until no parallax is left, and change the scale of a map whose lengths nothing measures.
+    Points with parallel rays start far away. From a typical depth they would pull the cameras together until no
+    parallax is left, and change the scale of a map without metric depth.
     """
     slots = [keyframe.points for keyframe in keyframes]
     current, before = points.read(slots, "inverse_depth"), points.read(slots, "deviation")
@@ -286,7 +285,7 @@ def _initial_depths(
     seen = information > 0
     deviation = np.where(seen, 1.0 / np.sqrt(np.maximum(information, 1e-12)), np.nan)
     determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (deviation < LARGEST_ERROR * triangulated)
-    # What a depth camera leaves out may be glass or a mirror, which no view should give a depth.
+    # Where a depth camera measures nothing there may be glass or a mirror: do not triangulate there.
     free = seen & ~np.array([np.isfinite(own.prior).any() for own in slots])[points.host]
     steady = free & (deviation * longest * intrinsics[0] < STEP_PIXELS) & ~(deviation > before)
     known = np.isfinite(current)
@@ -303,7 +302,7 @@ def _triangulated(
     points: Selection,
     intrinsics: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Inverse depth of each point landmark by the mean of its views, its information, and its longest baseline."""
+    """Return the mean triangulated inverse depth of each point, its information, and its longest baseline."""
     weighted, information, longest = np.zeros((3, len(points.host)))
     for edge in edges:
         host, target = keyframes[local[edge.host]], keyframes[local[edge.target]]

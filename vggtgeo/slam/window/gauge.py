@@ -1,8 +1,8 @@
-"""One gauge for each connected piece of a problem: what nothing holds is held where it is, and the user is told.
+"""Gauge fixing: exactly one fixed pose in each connected component of a problem.
 
-Poses are known up to one rigid motion of each connected piece. A piece that nothing holds drifts along that motion with
-the damping of the solver, and drags the camera with it (a clip ended 36 km away so). A piece with two held poses keeps
-the error between them. So each piece is held at exactly one place.
+Poses are known up to one rigid motion of each connected component. A component without a fixed pose drifts along that
+motion, and the intrinsics with it. A component with two fixed poses keeps the error between them. So each component
+gets exactly one fixed pose, and the user is warned.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.geometry import lie, rigid
 
 DEGREES_OF_FREEDOM = 6
-"""Equations that tie two pieces: as many as a relative pose has unknowns."""
+"""Equations that connect two components: as many as a relative pose has unknowns."""
 NULL = 1e-10
-"""Share of the largest eigenvalue of a balanced information matrix below which a direction is not known. What
-marginalisation cuts off as rounding error is 1e-12 of it."""
+"""Share of the largest eigenvalue of a balanced information matrix below which a direction is unconstrained. The
+rounding errors that marginalisation cuts off are 1e-12 of it."""
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """What holds a problem.
+    """The gauge of a problem.
 
-    pieces: rows of the keyframes of each connected piece. free: the pieces that nothing held, and that are now held at
-    their first keyframe. loose: the pieces whose unit nothing told, and whose size is now held by a second keyframe.
+    pieces: rows of the keyframes of each connected component. free: components that had no fixed pose; their first
+    keyframe is fixed now. loose: components without a known scale; a second keyframe is fixed now.
     """
 
     pieces: tuple[tuple[int, ...], ...]
@@ -42,10 +42,10 @@ class Gauge:
 
 
 def with_one_gauge(problem: Problem, state: State, keyframes: int, metric: bool) -> tuple[Problem, Gauge]:
-    """The problem with each connected piece of its first `keyframes` poses held at exactly one place.
+    """Return the problem with exactly one fixed pose in each connected component of its first `keyframes` poses.
 
-    Where lengths are metres, one pose of a piece is held, the first of those that were. Without, several held poses of
-    a piece keep its unit, and stay. A marginal prior that knows where a keyframe is holds its piece.
+    With metric depth, the first fixed pose of a component stays fixed. Without, several fixed poses of a component
+    define its scale, and stay fixed. A marginal prior on absolute poses fixes its component, too.
     """
     known = _PriorKnowledge.of(problem, state, keyframes)
     label = _labels(problem, keyframes, known)
@@ -67,23 +67,27 @@ def with_one_gauge(problem: Problem, state: State, keyframes: int, metric: bool)
             fixed[_farthest(state, piece, fixed)] = True
             loose.append(rows)
     held_problem = replace(problem, fixed_pose=jnp.asarray(fixed))
-    # What is too weak to tie two pieces, each held at a place that is a guess, would only bend them.
+    # Links too weak to connect two components would only bend them, since their relative pose is a guess.
     whole = held_problem if len(pieces) < 2 else _without_links(held_problem, label)
     return whole, Gauge(tuple(pieces), tuple(free), tuple(loose))
 
 
 def gauge_notes(gauge: Gauge, numbers: tuple[int, ...], problem_name: str) -> tuple[str, ...]:
-    """What the user should know; `numbers` are those of the keyframes by row."""
+    """Return warnings for the user; `numbers` are those of the keyframes by row."""
     name = lambda piece: ", ".join(str(numbers[row]) for row in piece)
-    # A first keyframe is a piece by itself that nothing holds, and nothing needs to.
+    # A single keyframe is a component by itself and needs no fixed pose.
     alone = len(numbers) == 1
-    free = () if alone else (f"{problem_name}: nothing ties keyframes {name(p)} to the map; held" for p in gauge.free)
-    loose = (f"{problem_name}: nothing tells the size of what keyframes {name(p)} see; it is held" for p in gauge.loose)
+    free = (
+        ()
+        if alone
+        else (f"{problem_name}: keyframes {name(p)} are not connected to the map; fixed" for p in gauge.free)
+    )
+    loose = (f"{problem_name}: the scale of keyframes {name(p)} is not observable; fixed" for p in gauge.loose)
     return (*free, *loose)
 
 
 def _without_links(problem: Problem, label: np.ndarray) -> Problem:
-    """The problem without observations between keyframes of different pieces."""
+    """Return the problem without observations between keyframes of different components."""
     piece = np.full(problem.num_keyframes, -1)
     piece[: len(label)] = label
     source, target = (np.asarray(end) for end in problem.edges.ends)
@@ -99,11 +103,11 @@ def _without_links(problem: Problem, label: np.ndarray) -> Problem:
 
 
 def _labels(problem: Problem, keyframes: int, known: _PriorKnowledge) -> np.ndarray:
-    """Number of the connected piece of each keyframe, int [n], in the order of their first members."""
+    """Return the connected component of each keyframe, int [n], numbered by their first members."""
     ends, equations = _links(problem, keyframes)
     label = np.arange(keyframes)
     while True:
-        # Two pieces with enough equations between them are one, wherever in the pieces the ends are.
+        # Enough equations between two components connect them, whatever keyframes they are between.
         between = label[ends]
         total = coo_array((equations, tuple(between.T)), (keyframes, keyframes)).tocsr()
         total = total + total.T
@@ -118,7 +122,7 @@ def _labels(problem: Problem, keyframes: int, known: _PriorKnowledge) -> np.ndar
 
 
 def _permuted(tied: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Pairs of keyframes as pairs of their labels."""
+    """Return pairs of keyframes as pairs of their labels."""
     result = np.zeros_like(tied, int)
     first, second = np.nonzero(tied)
     result[label[first], label[second]] = 1
@@ -126,9 +130,9 @@ def _permuted(tied: np.ndarray, label: np.ndarray) -> np.ndarray:
 
 
 def _links(problem: Problem, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Ends int [m, 2] and number of equations [m] of everything between two keyframes.
+    """Return both keyframes, int [m, 2], and the number of equations [m] of each edge and pair factor.
 
-    An edge has the rows of its observations less one for each landmark on it whose depth nothing else tells.
+    An edge has the rows of its observations, less one for each landmark whose depth nothing else constrains.
     """
     slots = problem.pixels.shape[1]
     known = np.zeros((problem.num_keyframes, slots), bool)
@@ -152,7 +156,7 @@ def _links(problem: Problem, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rank(pair: PairTerm) -> np.ndarray:
-    """Equations of each observation: directions that its information determines, 1 where it has no such matrix."""
+    """Return the equations of each observation: the rank of its information, 1 if it has no such matrix."""
     root = getattr(pair, "root", None)
     if root is None:
         return np.ones(len(np.asarray(pair.weight)))
@@ -162,14 +166,14 @@ def _rank(pair: PairTerm) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _PriorKnowledge:
-    """What a marginal prior determines. tied: bool [n, n], relative poses. placed: bool [n], poses in the world."""
+    """What a marginal prior constrains. tied: bool [n, n], relative poses. placed: bool [n], absolute poses."""
 
     tied: np.ndarray
     placed: np.ndarray
 
     @classmethod
     def of(cls, problem: Problem, state: State, keyframes: int) -> _PriorKnowledge:
-        """By the null space of its information: a pose, or a relative pose, that no null direction moves is known."""
+        """Find the poses and relative poses that no direction of the information's null space changes."""
         nothing = cls(np.zeros((keyframes, keyframes), bool), np.zeros(keyframes, bool))
         prior = next((term for term in problem.dense_terms if isinstance(term, MarginalPrior)), None)
         if prior is None or not np.any(np.asarray(prior.root)):
@@ -187,7 +191,7 @@ class _PriorKnowledge:
         null /= np.maximum(np.linalg.norm(null, axis=0), 1e-300)
         moved = null.reshape(keyframes, lie.TANGENT, -1)
         world = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64)[:keyframes])
-        # A left tangent as seen in the world, so that a rigid motion of both is the same for both.
+        # Left tangents in world coordinates, where a common rigid motion is the same for all.
         common = np.stack([rigid.adjoint(rigid.invert(pose)) @ own for pose, own in zip(world, moved, strict=True)])
         apart = np.linalg.norm(common[:, None] - common[None], axis=2).max(2, initial=0.0)
         still: np.ndarray = np.linalg.norm(moved, axis=1).max(1, initial=0.0) < 1e-6
@@ -196,20 +200,20 @@ class _PriorKnowledge:
 
 
 def _sized(problem: Problem, keyframes: int, known: _PriorKnowledge, label: np.ndarray) -> np.ndarray:
-    """Whether anything tells the unit of each piece: a depth, a length, a prior, or two poses that are held."""
-    told = np.zeros(keyframes, bool)
+    """Return whether the scale of each component is constrained: by a depth, a length, or a prior."""
+    constrained = np.zeros(keyframes, bool)
     for slot_term in problem.slot_terms:
-        told |= np.asarray(slot_term.present())[:keyframes].any(1)
+        constrained |= np.asarray(slot_term.present())[:keyframes].any(1)
     for pair in problem.node_terms:
         if isinstance(pair, PairTerm):
             first = np.asarray(pair.first)[np.asarray(pair.present())]
-            told[first[first < keyframes]] = True
-    told |= known.tied.any(1)
-    return np.array([told[label == number].any() for number in range(label.max(initial=-1) + 1)])
+            constrained[first[first < keyframes]] = True
+    constrained |= known.tied.any(1)
+    return np.array([constrained[label == number].any() for number in range(label.max(initial=-1) + 1)])
 
 
 def _farthest(state: State, piece: np.ndarray, fixed: np.ndarray) -> int:
-    """Of a piece the keyframe that is farthest from the one that is held."""
+    """Return the keyframe of a component that is farthest from the fixed one."""
     centres = np.array([rigid.centre(pose) for pose in rigid.to_matrix(np.asarray(state.poses.wxyz_xyz)[piece])])
     held = fixed[piece]
     start = centres[np.argmax(held)]

@@ -1,4 +1,4 @@
-"""Which samples of a segment take part, and which of them its match in another view says something about."""
+"""Selection of the samples of a segment, and of those that its match in another view constrains."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from vggtgeo.geometry import rigid
 def supported(
     points: np.ndarray, pose: np.ndarray, endpoints: np.ndarray, intrinsics: np.ndarray, *, reach: float, gate: float
 ) -> np.ndarray:
-    """Whether each world point falls beside the segment it is matched to, bool [m].
+    """Return whether each world point projects next to its matched segment, bool [m].
 
-    A segment speaks for its own length: beyond its ends the error of its direction grows with the distance, and what
-    lies behind the camera (the near end of a long edge, in a turn) projects anywhere at all.
+    A segment constrains points along its own length: beyond its ends the error of its direction grows with the
+    distance, and points behind the camera have no valid projection.
 
     points: float64 [m, 3], metres, by the current estimate. pose: world -> camera of the view. endpoints: float64
-    [m, 2, 2], the segment of each point, pixels. reach: how far beyond an end still counts, gate: farthest from the
-    line, pixels.
+    [m, 2, 2], the segment of each point, pixels. reach: largest distance beyond an end, pixels; gate: largest
+    distance from the line, pixels.
     """
     pixels = rigid.project(points, pose, intrinsics)
     along = endpoints[:, 1] - endpoints[:, 0]
@@ -31,7 +31,7 @@ def supported(
 
 
 def spread_samples(segment: np.ndarray, most: int) -> np.ndarray:
-    """Whether each sample is one of at most `most` of its segment, evenly spread from its first to its last, bool [m].
+    """Select at most `most` samples of each segment, evenly spread from its first to its last, bool [m].
 
     segment: int [m], segment of each sample; those of one segment stand together.
     """
@@ -43,13 +43,13 @@ def spread_samples(segment: np.ndarray, most: int) -> np.ndarray:
 
 
 def sample_shares(segment: np.ndarray, most: int) -> np.ndarray:
-    """How many samples of its segment each of the `spread_samples` stands for, float64 [m]."""
+    """Return how many samples of its segment each of `spread_samples` represents, float64 [m]."""
     _, count = _ranks(segment)
     return count / np.maximum(np.minimum(count, most), 1)
 
 
 def _ranks(segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position of each sample on its segment, and the number of samples there."""
+    """Return the index of each sample on its segment, and the number of samples of that segment."""
     count = np.bincount(segment, minlength=1)
     first = np.cumsum(count) - count
     return np.arange(len(segment)) - first[segment], count[segment]

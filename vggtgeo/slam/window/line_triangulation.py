@@ -1,12 +1,12 @@
-"""Depth of segments by the map: where nothing measured it, two and more other views of a segment tell it.
+"""Triangulation of segments without measured depth, from two or more other views.
 
 The segment matched in another view, with line `l`, spans a plane through that camera, of normal `m = K^T l`. A ray `r`
 of an end in the host, carried there by `q = R r`, meets it at the inverse depth
 
     d = -(m . q) / (m . t)      with weight    (m . t)^2 / (z^2 sigma^2),   z = (q + d t)_z
 
-(the plane form of line triangulation, Hartley and Zisserman 2004, section 14.2). One view explains any end exactly, so
-two at least must agree (chi-square). Lines along the motion meet their planes nowhere: their weight is small, and their
+(the plane form of line triangulation, Hartley and Zisserman 2004, section 14.2). One view fits any depth exactly, so at
+least two must agree (chi-square). Lines along the motion are parallel to these planes: their weight is small, and their
 depth stays unknown.
 """
 
@@ -24,9 +24,9 @@ from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 PIXELS = 1.0
-"""Standard deviation of an end from its line in another view: the ends of both segments, in pixels."""
+"""Standard deviation of the distance of an endpoint from its line in another view, pixels."""
 LARGEST_SIGMA = 0.05
-"""Relative standard deviation of a depth beyond which it is not known."""
+"""Largest relative standard deviation of a depth that counts as known."""
 MIN_VIEWS = 2
 CHANCE = 0.99
 
@@ -34,7 +34,7 @@ CHANCE = 0.99
 def with_segment_depths(
     keyframes: Mapping[int, Keyframe], edges: Sequence[Directed], intrinsics: np.ndarray
 ) -> dict[int, Keyframe]:
-    """The keyframes with the depths of segments that had none and that their edges tell, by the current poses."""
+    """Return the keyframes with triangulated depths of segments that had none, by the current poses."""
     updated = dict(keyframes)
     for number, keyframe in keyframes.items():
         blank = np.isnan(keyframe.line_depths).any(1)
@@ -44,20 +44,20 @@ def with_segment_depths(
         inverse, sigma = _triangulated(keyframe, own, keyframes, intrinsics)
         new = blank & np.isfinite(inverse).all(1)
         if new.any():
-            updated[number] = _taken(keyframe, new, inverse, sigma)
+            updated[number] = _with_depths(keyframe, new, inverse, sigma)
     return updated
 
 
 def _triangulated(
     host: Keyframe, edges: Sequence[Directed], keyframes: Mapping[int, Keyframe], intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse depth of the ends of each segment and its standard deviation, [l, 2], NaN where the views do not tell."""
+    """Return inverse depths of the endpoints of each segment and their standard deviations, [l, 2], NaN if unknown."""
     count = len(host.lines)
     rays = pinhole.rays(host.lines.segments.endpoints, intrinsics)
     total, first, second, views = (np.zeros((count, 2)) for _ in range(4))
     for edge in edges:
         target = keyframes[edge.target]
-        value, weight = _meeting(rays[edge.line_slots], edge, host, target, intrinsics)
+        value, weight = _intersected(rays[edge.line_slots], edge, host, target, intrinsics)
         total[edge.line_slots] += weight
         first[edge.line_slots] += weight * value
         second[edge.line_slots] += weight * value**2
@@ -71,10 +71,10 @@ def _triangulated(
     return np.where(both, mean, np.nan), np.where(both, sigma, np.nan)
 
 
-def _meeting(
+def _intersected(
     rays: np.ndarray, edge: Directed, host: Keyframe, target: Keyframe, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the rays `[m, 2, 3]` of segments meet the planes of their matches: inverse depths and weights, [m, 2]."""
+    """Intersect rays `[m, 2, 3]` with the planes of matched segments; return inverse depths and weights, [m, 2]."""
     relative = target.pose @ rigid.invert(host.pose)
     turned = rays @ relative[:3, :3].T
     lines = line_coefficients(target.lines.segments.endpoints[edge.line_targets])
@@ -87,8 +87,8 @@ def _meeting(
     return value, weight
 
 
-def _taken(keyframe: Keyframe, new: np.ndarray, inverse: np.ndarray, sigma: np.ndarray) -> Keyframe:
-    """The keyframe with the depths of the segments `new` at their ends and, in between, at their samples."""
+def _with_depths(keyframe: Keyframe, new: np.ndarray, inverse: np.ndarray, sigma: np.ndarray) -> Keyframe:
+    """Return the keyframe with new depths of the segments `new`, at their endpoints and samples."""
     depths = np.where(new[:, None], 1.0 / inverse, keyframe.line_depths)
     ends, samples, segment = keyframe.lines.segments.endpoints, keyframe.samples, keyframe.sample_segment
     along = ends[:, 1] - ends[:, 0]

@@ -1,4 +1,4 @@
-"""Which key points and line samples of each keyframe take part in an adjustment: those that most edges have matched."""
+"""Selection of the key points and line samples of each keyframe for an adjustment: those with the most matches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Selection:
     table: tuple[np.ndarray, ...]
 
     def read(self, slots: Sequence[Slots], name: str) -> np.ndarray:
-        """One field of the chosen slots, float64 [m, ...]; `slots` are those of each host."""
+        """Return a field of the chosen slots, float64 [m, ...]; `slots` are those of each host."""
         ends = np.cumsum(np.bincount(self.host, minlength=len(slots)))
         own = np.split(self.slot, ends[:-1])
         return np.concatenate([getattr(of_host, name)[chosen] for of_host, chosen in zip(slots, own, strict=True)])
@@ -43,7 +43,7 @@ class Selection:
     def points(
         cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], local: dict[int, int], settings: SlamSettings
     ) -> Selection:
-        """Of each keyframe at most `point_slots` key points."""
+        """Select at most `point_slots` key points of each keyframe."""
         counts = [np.zeros(len(keyframe.features)) for keyframe in keyframes]
         for edge in edges:
             counts[local[edge.host]][edge.slots] += 1 + 0.1 * edge.confidence
@@ -57,7 +57,7 @@ class Selection:
     def lines(
         cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], local: dict[int, int], settings: SlamSettings
     ) -> Selection:
-        """Of each keyframe at most `line_slots` samples, of whole segments."""
+        """Select at most `line_slots` samples of each keyframe, of whole segments."""
         counts = [np.zeros(len(keyframe.lines)) for keyframe in keyframes]
         for edge in edges:
             counts[local[edge.host]][edge.line_slots] += 1 + 0.1 * edge.line_confidence

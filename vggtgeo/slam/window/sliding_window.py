@@ -1,4 +1,4 @@
-"""The sliding window: adjust its keyframes together, and keep what those that leave have said."""
+"""Sliding-window bundle adjustment with marginalisation of the oldest keyframe."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ solve_jit = KeptProgram(_solve, functools.partial(solution_like, diagnosis=False
 
 
 def window_size(settings: SlamSettings) -> PaddedSize:
-    """The one padded shape that all windows of a run share."""
+    """Return the padded shape that all windows of a run share."""
     return PaddedSize(
         settings.window.size,
         settings.window.point_slots,
@@ -55,9 +55,9 @@ def window_size(settings: SlamSettings) -> PaddedSize:
 
 
 def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State]:
-    """Compile what every window needs, on a problem of the right shape that holds one observation.
+    """Compile adjustment and marginalisation of a window, in two threads, on a problem with one observation.
 
-    Both programs at once, on two cores. Returns that problem and where it starts, for whoever has more to compile.
+    Returns that problem and its initial state.
     """
     problem, initial = _smallest_window(settings, metric)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
@@ -86,7 +86,7 @@ def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, Sta
 def smallest_problem(
     size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm], camera: type[AbstractCamera] = Pinhole
 ) -> tuple[Problem, State]:
-    """A problem of the given shape that holds one observation, and where it starts: to compile for that shape."""
+    """Return a problem of the given shape with one observation, and its initial state, for compilation."""
     one = Observations(
         edges=np.array([[0, 1]]),
         host=np.zeros(1, int),
@@ -105,7 +105,7 @@ def smallest_problem(
 
 
 def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
-    """The solver of every window: a tracker's start is near, and the next window goes on from here."""
+    """Return the solver of all windows. A loose tolerance suffices: the next window continues from the result."""
     return SchurLevenbergMarquardt(
         max_iterations=settings.window.window_iterations, rtol=1e-5, record_iterations=settings.window.record_iterations
     )
@@ -113,7 +113,7 @@ def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedWindow:
-    """The result of an adjustment; notes: what the user should know."""
+    """The result of an adjustment; notes: warnings for the user."""
 
     map: Map
     window: Window
@@ -122,9 +122,9 @@ class AdjustedWindow:
 
 
 def make_room(window: Window, settings: SlamSettings, needed: int | None = None) -> Window:
-    """Marginalise the oldest keyframe of a full window, by the last window that was solved with it.
+    """Marginalise the oldest keyframe of a full window, in the last problem that contained it.
 
-    needed: a keyframe that stays, because the next one is tied to it.
+    needed: a keyframe that must stay, because the next one was tracked against it.
     """
     if len(window.members) < settings.window.size:
         return window
@@ -163,7 +163,7 @@ def enter(
 def adjust(
     known: Map, window: Window, intrinsics: np.ndarray, camera: CameraPrior, settings: SlamSettings
 ) -> AdjustedWindow:
-    """Bundle-adjust the window; the keyframes, their depths and the intrinsics take the result."""
+    """Bundle-adjust the window; return updated keyframes and intrinsics."""
     known = known if known.metric else _with_line_depths(known, window, intrinsics)
     members = [known.keyframes[number] for number in window.members]
     adjustment, gauge = window_problem(known, window, intrinsics, camera, settings)
@@ -187,9 +187,9 @@ def adjust(
 
 
 def _with_line_depths(known: Map, window: Window, intrinsics: np.ndarray) -> Map:
-    """The map with the depths of segments that the window's views tell.
+    """Return the map with segments triangulated from the window's views.
 
-    Not beside measured depth: what that leaves out is glass, mirrors and what is far away.
+    Not for maps with measured depth: what a depth camera leaves out is glass, mirrors or far away.
     """
     inside = {number: known.keyframes[number] for number in window.members}
     keyframes = list(known.keyframes)
@@ -201,7 +201,7 @@ def _with_line_depths(known: Map, window: Window, intrinsics: np.ndarray) -> Map
 def window_problem(
     known: Map, window: Window, intrinsics: np.ndarray, camera: CameraPrior, settings: SlamSettings
 ) -> tuple[Adjustment, Gauge]:
-    """The problem of the current window, each of its connected pieces held."""
+    """Return the problem of the current window with fixed gauge."""
     numbers, size = window.members, settings.window.size
     places = {number: row for row, number in enumerate(numbers)}
     prior = no_prior(size) if window.prior is None else window.prior.aligned(numbers, size)
@@ -220,7 +220,7 @@ def window_problem(
 
 
 def _held(window: Window, roots: tuple[int, ...]) -> np.ndarray:
-    """Which members hold the window: those that it hangs on, where the camera came back to an old part of the map, else
+    """Return the members with fixed poses: those of an old part of the map that the camera returned to, if any, else
     the roots of submaps.
     """
     hung = np.isin(window.members, window.held)
@@ -228,14 +228,14 @@ def _held(window: Window, roots: tuple[int, ...]) -> np.ndarray:
 
 
 def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
-    """How many factors of each kind a window holds: one static shape for all windows of a run."""
+    """Return the capacity for each kind of factor: one static shape for all windows of a run."""
     room: dict[type, int] = {MeasuredRelativePose: 2 * settings.window.size}
     room |= {} if metric else {MeasuredBaseline: 1}
     return room | ({MeasuredRotation: settings.window.size} if settings.line.manhattan else {})
 
 
 def window_edges(known: Map, members: Iterable[int]) -> list[Directed]:
-    """Both directions of every pair inside the window."""
+    """Return both directions of each pair inside the window."""
     inside = set(members)
     pairs = [pair for pair in known.pairs if pair.first in inside and pair.second in inside]
     by_number = {number: known.keyframes[number] for number in inside}
@@ -243,7 +243,7 @@ def window_edges(known: Map, members: Iterable[int]) -> list[Directed]:
 
 
 def scale_anchor(known: Map, members: Sequence[int]) -> MeasuredBaseline:
-    """What holds the distance between the first two keyframes: the scale of a map without metric depth."""
+    """Return a factor that fixes the distance of the first two keyframes: the scale of a map without metric depth."""
     first, second = members[:2]
     centres = [rigid.centre(known.keyframes[number].pose) for number in (first, second)]
     return MeasuredBaseline(first, second, float(np.linalg.norm(centres[1] - centres[0])), 1e-3)

@@ -1,4 +1,4 @@
-"""The window: the newest keyframes, which are adjusted together while the run goes on."""
+"""The sliding window: the newest keyframes, which are adjusted together during the run."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Window:
 
     Fields:
         members: Their numbers, oldest first.
-        prior: The marginal prior that keyframes left when they were marginalised.
-        held: Numbers of keyframes that the adjustment keeps where they are, besides roots of submaps.
+        prior: The prior from marginalised keyframes.
+        held: Numbers of keyframes whose poses are fixed, besides roots of submaps.
         solved: The last problem of the window and its solution.
         energies: `1/2 sum rho` of that problem at the start and after each iteration.
-        iterations: Record of the solver's iterations, where the settings ask for it.
+        iterations: Record of the solver's iterations, with the setting `window.record_iterations`.
 
     """
 

@@ -1,4 +1,4 @@
-"""The prior that marginalisation left, and which keyframes it speaks of."""
+"""The marginal prior of the window, keyed by keyframe."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from vggtgeo.bundle.terms.marginal import MarginalPrior
 
 @dataclass(frozen=True, eq=False)
 class WindowPrior:
-    """A prior over poses, keyed by keyframe: a window that failed or was begun anew cannot take another's numbers.
+    """A prior over poses, keyed by keyframe, so that rows cannot be mixed up after a failed or new window.
 
-    keyframes: number of each of the prior's places, those that have left included; a place beyond them is padding.
+    keyframes: keyframe number of each row of the prior, marginalised ones included; further rows are padding.
     """
 
     keyframes: tuple[int, ...]
     prior: MarginalPrior
 
     def aligned(self, numbers: Sequence[int], size: int) -> MarginalPrior:
-        """The prior for a problem of `size` places whose first hold the keyframes `numbers`."""
+        """Return the prior for a problem of `size` keyframes, the first of which are `numbers`."""
         places = {number: row for row, number in enumerate(self.keyframes)}
         order = np.full(size, -1)
         order[: len(numbers)] = [places.get(number, -1) for number in numbers]
