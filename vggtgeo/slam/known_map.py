@@ -27,14 +27,14 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 
 MAP = Format("map", VERSION, by_name(STATE_CLASSES))
-LEAST_KNOWN = 0.2
-"""Share of a keyframe's key points that its own picture, described once more as it is kept, must match: 0.71 and more
-of SIFT's, 0.92 of ORB's (13 keyframes of redkitchen and building-walk); descriptors of another kind hardly any."""
+MIN_REDESCRIBED = 0.2
+"""Minimum share of a keyframe's key points that its stored image, described again, must match. The same descriptors
+give 0.7 or more, others nearly none."""
 FEW = 20
-"""Key points of which nothing is asked."""
+"""Number of key points below which this is not checked."""
 SAME_CAMERA = 0.02
-"""Relative difference of focal lengths and principal point up to which a calibration is that of a map's camera: two
-calibrations of one camera differ by up to 1.6 % (redkitchen: 525 px as given, 534 as adjusted)."""
+"""Largest relative difference of focal lengths and principal point between calibrations of one camera: twice the
+standard deviation of a calibration (`PRIOR` in `camera/calibration.py`)."""
 
 
 def as_map(slam: Slam) -> Slam:
@@ -138,7 +138,7 @@ def _check_matcher(known: Slam, points: PointMatcher) -> None:
     alike = type(ours) is type(theirs)
     if isinstance(ours, PixelDescriptors) and isinstance(theirs, PixelDescriptors):
         alike = ours.vectors.shape[1] == theirs.vectors.shape[1]
-    if not alike or len(points.match(before, again)) < LEAST_KNOWN * min(len(before), len(again)):
+    if not alike or len(points.match(before, again)) < MIN_REDESCRIBED * min(len(before), len(again)):
         raise InputError(
             "`known_map` has key points of another matcher than this run's, which does not find a picture of the map "
             "in the map: use it with the points (`--points`, `--preset`) that it was made with, or begin a new map"

@@ -1,7 +1,8 @@
-"""A window's adjustment beside tracking: begun with its newest keyframe, taken up a fixed number of frames later.
+"""Window adjustment in a thread beside tracking: it starts with a new keyframe and is merged a fixed number of frames
+later.
 
-A fixed number, and not as soon as it is done: so a run is repeatable, however fast the machine. Where the next keyframe
-comes before, or the camera is lost, the state takes it up at once.
+The fixed number makes a run repeatable, whatever the speed of the machine. A new keyframe or a lost camera before that
+merges it at once.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import PendingWindow, Slam
 
 LAG = 6
-"""Frames that are tracked meanwhile, at most: a keyframe's matching and adjustment take as long as five, on two cores
-(on redkitchen 0.28 s, a frame beside them 0.06 s)."""
+"""Largest number of frames tracked meanwhile: matching and adjustment take as long as about five frames on two cores
+(`benchmarks/stage_times.py`)."""
 
 
 def begin_window(slam: Slam, adjusted: Callable[[], Slam]) -> Slam:
-    """The state while `adjusted` is computed in a thread of its own.
+    """Return the state while `adjusted` is computed in a thread.
 
-    slam: has the newest keyframe as it was tracked, and is tracked in meanwhile. adjusted: the state with its matches
-    and the adjusted window; a pure function.
+    slam: state with the new keyframe as tracked; tracking continues in it. adjusted: pure function that returns the
+    state with the keyframe's matches and the adjusted window.
     """
     pool = ThreadPoolExecutor(1, thread_name_prefix="window")
     result = pool.submit(in_double_precision(adjusted))

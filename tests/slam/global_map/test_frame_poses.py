@@ -15,12 +15,12 @@ from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.camera.rolling_shutter import image_shift
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_motions import frame_motions
-from vggtgeo.slam.global_map.frame_poses import LEAST_POINTS, frame_poses
+from vggtgeo.slam.global_map.frame_poses import MIN_POINTS, frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.following import MOST_KEPT, Located
+from vggtgeo.slam.tracking.following import MAX_KEPT, Located
 from vggtgeo.slam.tracking.tracker import FramePose, SeenPoints, Tracker
 
 POINTS = 60
@@ -110,11 +110,11 @@ def test_without_enough_points_a_pose_stays() -> None:
     """One point too few, points whose depth is gone, or that came to lie behind the camera, a frame without a pose, a
     map that is not finished: as it was carried, to the bit.
     """
-    slam, _ = walked(np.random.default_rng(2), LEAST_POINTS)
+    slam, _ = walked(np.random.default_rng(2), MIN_POINTS)
     few = slam.frames[1].seen
     assert few is not None
     first = slam.keyframes[0]
-    gone = replace(first, points=replace(first.points, inverse_depth=np.full(LEAST_POINTS, np.nan)))
+    gone = replace(first, points=replace(first.points, inverse_depth=np.full(MIN_POINTS, np.nan)))
     for wrong in (
         with_second(slam, seen=SeenPoints(few.slots[1:], few.pixels[1:])),
         replace(slam, map=replace(slam.map, keyframes=(gone,))),
@@ -161,13 +161,13 @@ def test_a_rolling_shutter_is_taken_out_of_what_a_frame_shows(columns: bool) -> 
 
 
 def test_a_frame_keeps_some_of_its_matches() -> None:
-    """At most `MOST_KEPT`, of those that agree with its pose; oracle: the inliers."""
+    """At most `MAX_KEPT`, of those that agree with its pose; oracle: the inliers."""
     inliers = np.random.default_rng(5).random(500) < 0.6
     slots, pixels = np.arange(500) + 7, np.random.default_rng(6).uniform(0, 100, (500, 2))
     guess = PoseGuess(np.eye(4), inliers, 0.3, GeometryResult.SUCCESS)
     seen = Located(guess, 500, np.zeros((500, 3)), 2.0, slots, pixels).seen
     assert seen is not None
-    assert len(seen.slots) == len(set(seen.slots.tolist())) == MOST_KEPT
+    assert len(seen.slots) == len(set(seen.slots.tolist())) == MAX_KEPT
     assert inliers[seen.slots - 7].all()
     np.testing.assert_allclose(seen.pixels, pixels[seen.slots - 7], atol=1e-4)
     few = Located(replace(guess, inliers=np.zeros(500, bool)), 500, np.zeros((500, 3)), 2.0, slots, pixels).seen

@@ -1,4 +1,4 @@
-"""The pose of every frame, carried along with the keyframe that it hangs on."""
+"""Poses of all frames, moved with the keyframes that they were tracked against."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
 from vggtgeo.slam.tracking.tracker import FramePose
 
 GROSS = SHARED_ERRORS * AGREEMENT_GATE
-"""Of the squared Mahalanobis distance between a keyframe's pose as it was tracked and as it was adjusted: above, that
-frame alone was tracked wrongly, and its error is none of those before it. Healthy keyframes of the clips have 121 and
-less; one of building-walk 670 to 790, 21 cm, of which the frame before it took half."""
+"""Squared Mahalanobis distance between the tracked and the adjusted pose of a keyframe above which its tracking was an
+outlier: its correction is then not distributed over the frames before it."""
 
 
 def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
-    """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known.
+    """Return times [n], s, and poses [n, 4, 4], world -> camera, of all frames; for a lost frame the last known pose.
 
     A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and the
     next is shared out over the frames in between, in proportion to time, so that the path has no steps, unless it is

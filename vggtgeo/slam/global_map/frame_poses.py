@@ -1,12 +1,10 @@
-"""The pose of every frame, by the keyframe that it hangs on and, where points alone placed it, by the finished map.
+"""Final poses of all frames: relative to their keyframes and, without measured depth, resected in the final map.
 
-Without measured depth a frame is tracked against depths that two or three keyframes know, and the map goes on changing
-under it: carried along with its keyframe, its path is jagged, with a step wherever the next keyframe takes over. So a
-frame keeps some of the points that it was tracked by (`SeenPoints`), and its pose is the one that explains them best
-where adjustments have left them, keyframes and camera as they are (resection), with what tracking knew of it as a
-prior: `benchmarks/between_keyframes.py`. That knew the depths of its moment, whose errors all matches share, so it
-counts as little as the uncertainty says (`SHARED_ERRORS`): taken at its word, it draws the 84 frames of icl-office that
-waited for the start to the unit of a map of two views (0.41 cm in place of 0.33).
+Without measured depth a frame is tracked against depths from two or three keyframes, and later adjustments change the
+map. Poses relative to keyframes would then have a step at each new keyframe. So a frame keeps some of its tracked
+points (`SeenPoints`), and its pose is estimated from them in the final map (resection), with the tracked pose as a
+prior (`benchmarks/between_keyframes.py`). The matches of that prior share the errors of their depths, so its
+information is divided by `SHARED_ERRORS`.
 """
 
 from __future__ import annotations
@@ -24,19 +22,18 @@ from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.frame_refinement import tracked_information
 from vggtgeo.slam.tracking.tracker import FramePose
 
-LEAST_POINTS = 20
-"""Fewer leave a pose as it was."""
+MIN_POINTS = 20
+"""With fewer points the pose stays as tracked."""
 WIDTH, WIDEST = 1.0, 8.0
-"""Of the kernel of Geman and McClure, pixels, in the end and at first, halved in each step: matches agreed with the
-tracked pose to some pixels, a few are off by as much. On icl-office and a simulated office 0.5 to 2 do alike; with
-Huber's kernel, which lets those pull, steps from frame to frame are 0.43 cm off in place of 0.25."""
+"""Width of the Geman-McClure kernel, pixels: final and initial, halved in each step. A redescending kernel, because
+matches may be off by as much as the gate of tracking, some pixels (`benchmarks/between_keyframes.py`)."""
 STEPS, SETTLED = 15, 1e-5
 NEAREST, FARTHEST = 0.1, 1e6
-"""Depths that take part, in the unit of the map."""
+"""Range of the depths that are used, in map units."""
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
-    """Times [n] in s and poses [n, 4, 4], world -> camera, of all frames; of one without a pose the last known.
+    """Return times [n], s, and poses [n, 4, 4], world -> camera, of all frames; for a lost frame the last known pose.
 
     While the run goes on, before the last adjustment, all are carried along: it moves the map once more.
     """
@@ -69,7 +66,7 @@ def off_landmarks(slam: Slam, poses: np.ndarray) -> dict[int, np.ndarray]:
     found, motions = {}, _motions(slam)
     for row in _placed_by_points(slam):
         points, pixels = _sight(slam, row, poses[row], motions)
-        if len(points) >= LEAST_POINTS:
+        if len(points) >= MIN_POINTS:
             off = np.linalg.norm(rigid.project(points, poses[row], slam.intrinsics) - pixels, axis=1)
             found[row] = np.where(points @ poses[row][2, :3] + poses[row][2, 3] > NEAREST, off, np.inf)
     return found
@@ -122,14 +119,14 @@ def _resected(
     """The pose [4, 4] near `pose`, known to `known` [6, 6], at which points [m, 3] are seen at pixels [m, 2], robustly;
     `pose` where they are few, or explained no better.
     """
-    if len(points) < LEAST_POINTS:
+    if len(points) < MIN_POINTS:
         return pose
     current, before = pose, _energy(points, pixels, pose, intrinsics)
     for number in range(STEPS):
         width = max(WIDEST / 2**number, WIDTH)
         local = points @ current[:3, :3].T + current[:3, 3]
         front = local[:, 2] > NEAREST
-        if np.count_nonzero(front) < LEAST_POINTS:
+        if np.count_nonzero(front) < MIN_POINTS:
             return pose
         off = pinhole.project(local[front], intrinsics) - pixels[front]
         weight = 1.0 / (1.0 + (off**2).sum(1) / width**2) ** 2

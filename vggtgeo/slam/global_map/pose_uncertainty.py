@@ -30,36 +30,32 @@ from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DEPTH_SCALE = 0.01
-"""Standard deviation of a depth camera's constant factor, which nothing in a run can see: on four clips with truth the
-lengths were 0.2 to 1.8 % off (redkitchen, corridor-office, building-walk, icl-office), 1.1 % in the mean of squares."""
+"""Standard deviation of a depth camera's scale factor, which a run cannot observe: root mean square 1.1 % on clips with
+ground truth (`benchmarks/honest.py`)."""
 
 MOMENT = 0.01
-"""Seconds, standard deviation: a pose is that of a moment, and an image is none. Shutters of phones and depth cameras
-roll over it for up to 1/30 s (uniform: 0.0096 s), and on TUM's freiburg1 the times of images and truth are 0.013 s
-apart. Nothing in a run can see that, and no residual shows what every pose has taken up."""
+"""Standard deviation of the moment of an image, seconds: rolling shutters of phones and depth cameras last up to 1/30 s
+(uniform: 0.0096 s), and published image times are off by as much. A run cannot observe it: the poses absorb it."""
 CALIBRATION = 0.01
-"""Of the angle that the camera has turned since the first pose: standard deviation of the focal length, relative, by
-which every turn that is seen is too large or too small. Makers and calibration tools reach it
-(`slam/camera/calibration.py`); two runs with one camera refined it to 482.6 and 488.4 px."""
+"""Relative standard deviation of the focal length, and so of each rotation since the first pose: that of manufacturers
+and calibration tools (`slam/camera/calibration.py`)."""
 CENTRE = 0.014
-"""Of the images' width and height: root mean square of how far published principal points are from the middle.
-Where a calibration puts it there to the pixel it was not measured, and it turns every camera by one unknown angle."""
+"""Standard deviation of an unmeasured principal point, in image widths and heights: root mean square of published ones.
+A principal point at the exact middle was not measured; its error rotates all cameras by one unknown angle."""
 MIDDLE = 0.5
-"""Pixels, within which a principal point is the middle, by whichever of the two ways to count pixels."""
+"""Pixels within which a principal point is at the middle, in either of the two pixel conventions."""
 SHARED_ERRORS = 6.0
-"""Matches that count as one in a map without measured depth: each is in the adjustment from either side, those of a
-point share the error of its host, and all share what the camera's model leaves. With every match for itself, the
-squared errors of places were 14 (icl-office), 6 (corridor-office) and 2.8 (building-walk) times what was stated.
-Surfaces have the like: `RgbdAlignment.surface_spread`."""
+"""Number of matches with the information of one, in a map without measured depth: each match is used in both
+directions, matches of a point share the error of its host, and all share errors of the camera model. Measured as the
+ratio of squared errors to variances (`benchmarks/honest.py --whole --rgb-only`)."""
 FREE_SCALE = 0.02
-"""Of the distance, standard deviation: a unit that is handed on from part to part is not the same everywhere. After the
-best similarity, places were 1.5 to 2.9 % of their distance from the first one off (redkitchen against COLMAP,
-corridor-office, building-walk, medians)."""
+"""Standard deviation of positions from scale drift, relative to the distance from the first pose
+(`benchmarks/honest.py --whole --rgb-only`)."""
 SPREAD = 64
-"""Keyframes, evenly spread, that stand for the others where no band serves: six solves with a sparse factor each."""
+"""Number of keyframes, evenly spaced, that represent the others on graphs without a band: six sparse solves each."""
 
 FLOOR = 1e-12
-"""Of an information whose diagonal is one: above its rounding errors, far below what a map determines."""
+"""Regulariser of an information matrix with unit diagonal: above rounding errors, far below what a map constrains."""
 
 
 class PoseUncertainty(NamedTuple):

@@ -30,21 +30,21 @@ from vggtgeo.slam.perception.rgbd_view import LEVELS, Points, RgbdView
 from vggtgeo.slam.precision import in_double_precision
 
 FARTHEST = 0.15
-"""Metres between a point and the surface it may belong to."""
+"""Largest distance of a point from its surface, metres."""
 NEAREST = 0.1
-"""Metres from the camera, where sensors of depth begin."""
-LEAST_COSINE = 0.7
-LEAST_SAMPLES = 60
+"""Smallest depth, metres: where depth sensors begin."""
+MIN_COSINE = 0.7
+MIN_SAMPLES = 60
 SETTLED = 1e-4
-"""Metres and radians: a smaller step ends the finest level, ten times it a coarser one. A pose is known to a millimetre
-at best; with a tenth of this, poses of redkitchen and corridor-office differ by 0.1 mm, for twice the iterations."""
+"""Convergence: step in metres and radians that ends the finest level; ten times that for coarser levels. A pose is
+known to a millimetre at best; a tenth of this takes twice the iterations (`benchmarks/alignment.py`)."""
 COARSE_SPREAD = 2.0
-"""Times the spread of the surface, on coarse levels: what slides along a wall is led by the picture. With 1, motions of
-redkitchen are off by 5.3 mm against COLMAP, not 5.1; of icl-office by 1.05 both times (`benchmarks/alignment.py`)."""
+"""Factor on the spread of surface residuals on coarse levels, so that brightness leads where a surface slides along
+itself (`benchmarks/alignment.py`)."""
 TUKEY = 4.685
 """Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
 BITS = 20
-"""Of a median's binary digits, sign and exponent counted in: to 0.05 %."""
+"""Binary digits of a median, including sign and exponent: precise to 0.05 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +279,7 @@ def _planes(surface: _Samples, target: _Target, motion: jax.Array) -> _Term:
     residual = jnp.sum((x - cell[:3]) * cell[3:6], 0)
     cosine = jnp.sum(cell[3:6] * (motion[:3, :3].astype(jnp.float32) @ normals), 0)
     # A cell without a surface has no normal: the cosine of zero is below any level.
-    seen = inside & (jnp.abs(residual) < FARTHEST) & (cosine > LEAST_COSINE)
+    seen = inside & (jnp.abs(residual) < FARTHEST) & (cosine > MIN_COSINE)
     noise = jnp.where(seen, jnp.hypot(sigma, cell[6]), 1)
     return _Term(_by_motion(x, cell[3:6] / noise), residual / noise, seen)
 
@@ -292,7 +292,7 @@ def _by_motion(points: jax.Array, by_point: jax.Array) -> jax.Array:
 
 def _judged(term: _Term, gate: jax.Array) -> _Agreement:
     count = jnp.sum(term.seen, dtype=jnp.int32)
-    enough = count >= LEAST_SAMPLES
+    enough = count >= MIN_SAMPLES
     agreeing = jnp.sum(term.seen & (jnp.abs(term.residual) < gate), dtype=jnp.int32)
     return _Agreement(count, enough, jnp.where(enough, agreeing / count.astype(jnp.float32), jnp.nan))
 

@@ -1,15 +1,12 @@
-"""Parts of the picture that stay in their place while the rest moves: bars above and below, a watermark, a time code,
-specks on the lens, a hand that holds the camera.
+"""Static overlay mask: parts of the images that do not move with the scene (black bars, a watermark, a time code,
+specks on the lens, a hand that holds the camera).
 
-Their corners and edges are the best of the picture to follow, sharp and always there, and all of them say that the
-camera stands still. Forty frames of building-walk, images alone, with black bars of 13 % are 34 cm off and called good
-where the bars' edges are looked at, with three lines of text 42 cm; 1.3 cm without either
-(`benchmarks/still_parts.py`). So some frames are looked at before the first is tracked.
+Their corners and edges are sharp and always visible, so tracking would follow them and find no motion
+(`benchmarks/still_parts.py`). So a sample of frames is searched before tracking.
 
-What stays in its place has the same gradient in every picture: the sum of a pixel's gradients over the pictures is as
-long as the sum of their lengths (the mean resultant length of directional statistics). Where the camera moves, what
-passes through a pixel has gradients of all directions, which cancel. So do those of letters that are brighter than what
-passes behind them at one time, and darker at another; but these keep their brightness.
+A static pixel has the same gradient in every image: the sum of its gradients is as long as the sum of their lengths
+(the mean resultant length of directional statistics). Elsewhere, while the camera moves, gradients of all directions
+cancel. Gradients of letters on a changing background cancel, too, but their brightness is constant.
 """
 
 from __future__ import annotations
@@ -25,37 +22,33 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features, Segments
 
 WIDTH = 480
-"""Pixels of the longer side of the pictures that are compared."""
+"""Longer side of the reduced images that are compared, pixels."""
 LEAST_GRADIENT = 4.0
 """Grey levels a pixel, after a blur by one pixel: twice that of white noise of 10 grey levels."""
 COHERENCE = 0.95
-"""Length of the sum of a pixel's gradients over the sum of their lengths. On four clips, over forty frames and over all
-of them, no more than 0.0001 of the picture is above 0.9 while the camera moves; horizontal joints of bricks were, in
-nine pictures of a camera that turns to the side."""
+"""Mean resultant length above which a pixel is static. While the camera moves, at most 0.0001 of the pixels of a scene
+are above 0.9 (`benchmarks/still_parts.py`)."""
 KEPT = 12.0
-"""Grey levels by which a pixel of a display differs from its median in nine of ten pictures at most: what a stroke does
-that fills three quarters of the pixel, the rest being what passes. In seven pieces of four clips, of 40 to 240 frames,
-no more than 0.00001 of the picture keeps its brightness so well and has a gradient in `LEAST_SEEN` of the pictures."""
+"""Largest deviation of a static pixel from its median brightness in nine of ten images, grey levels: that of a letter
+that covers three quarters of the pixel."""
 LEAST_SEEN = 0.8
-"""Share of the pictures in which a pixel has a gradient."""
+"""Minimum share of the images in which a pixel has a gradient."""
 LEAST_AREA, SURE_AREA, MOST_AREA = 5e-4, 0.35, 0.7
-"""Share of the picture that is still, and with gaps and margins: less are a few pixels; more than `SURE_AREA` is left
-out, and told, because a camera that stands before a train that passes sees the same; beyond `MOST_AREA` too little is
-left to follow."""
+"""Share of static pixels, with gaps and margins. Below the first there is no overlay. Above the second the mask is used
+with a warning, because a fixed camera in front of a passing train looks the same. Above the third too little is
+left."""
 LEAST_TOLD = 0.1
-"""Share of the picture that is still and cannot be left out, from which it is told: 0.17 to 0.35 with text over half of
-a bare room; slow pieces of icl-office have up to 0.024."""
+"""Share of static pixels that cannot be masked above which a warning is given."""
 CELL, LEAST_OF_CELL = 24, 0.03
-"""Pixels a side of a cell, and the share of its pixels that must have a gradient for it to say something. Each part of
-the picture has one voice, so that a busy poster that passes does not speak for a room that stays."""
+"""Side of a cell, pixels, and the minimum share of its pixels with a gradient for it to count. Each cell counts once,
+so that a detailed moving object does not outweigh a plain static room."""
 STANDS, MOST_STANDING = 0.6, 0.24
-"""Mean coherence of a cell's other pixels, and the share of cells that may have more. Where the camera stands or hardly
-moves most of the picture stays in its place: 0.6 to 0.8 of the cells, 0.3 where something large passes before it. Where
-it moves 0 to 0.03, in slow forty frames of redkitchen 0.1 to 0.2."""
+"""Mean coherence above which a cell is static, and the largest share of such cells for which the camera is moving: 0 to
+0.2 if it moves, 0.3 to 0.8 if it stands (`benchmarks/still_parts.py`)."""
 LEAST_CHANGED, CHANGED = 0.91, 0.5
-"""Share of these pixels whose gradient differs by more than `CHANGED` of itself between two pictures half of all apart,
-the median of such pairs: 0.93 to 0.99 where the camera moves. Where somebody walks before a camera that stands, the
-room comes back behind him, 0.6 to 0.9: else it would be left out, and he would be the world."""
+"""Minimum share of the other pixels whose gradient changes by more than `CHANGED`, relatively, between images half a
+sequence apart (median over pairs): 0.93 to 0.99 if the camera moves, 0.6 to 0.9 if a person walks in front of a fixed
+camera. Without this test the room would be masked."""
 LEAST_PICTURES = 12
 PICTURES, APART = 20, 12
 """At most so many pictures, so many frames apart: eight seconds."""

@@ -2,8 +2,8 @@
 
 Between two keyframes the picture changes little, and the motion so far says where each point must be. That is quick,
 and it fails where the motion jumps, the picture darkens, or something comes between. So it has to show that it did not:
-enough points arrive (`LEAST_ARRIVED`), they agree on one pose (`LEAST_SHARE`), and they are more than the number below
-which a frame becomes a keyframe (`LEAST_INLIERS`). Else the frame is described and matched.
+enough points arrive (`MIN_FOLLOWED`), they agree on one pose (`MIN_INLIER_SHARE`), and they are more than the number
+below which a frame becomes a keyframe (`MIN_INLIERS`). Else the frame is described and matched.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches, 
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.tracker import SeenPoints
 
-MOST_POINTS = 300
-"""Key points that are followed, the best of each part of the image; a pose needs no more."""
-TRUSTED, LEAST_TRUST = 0.5, 0.1
-"""Confidence of a key point's depth: below the first, points are followed only where there are no others; no point
-counts less than the second, so that a map without depth of its own can be tracked, too."""
-LEAST_ARRIVED = 0.4
-"""Share of those in view. On redkitchen and building-walk, 5 and 1 frames apart, 0.4 to 0.9 arrive from a bad guess."""
-LEAST_SHARE = 0.7
-"""Of those that arrived, in one pose: far above what wrong poses ever had (0.5, see `evidence.py`)."""
-LEAST_INLIERS = 60
-MOST_KEPT = 128
-"""Matches that a frame keeps for the end, 1.5 kB: with a pixel of noise they place it to a tenth of one."""
+MAX_POINTS = 300
+"""Largest number of key points to follow, the best of each part of the image; more do not improve a pose."""
+TRUSTED, MIN_TRUST = 0.5, 0.1
+"""Confidence of a key point's depth: points below the first are used only if there are no others. The second is the
+smallest weight, so that maps without measured depth can be tracked."""
+MIN_FOLLOWED = 0.4
+"""Minimum share of the points in view that optical flow must follow; from a bad guess it still follows 0.4 or more."""
+MIN_INLIER_SHARE = 0.7
+"""Minimum inlier share of the followed points; wrong poses have at most 0.5, see `evidence.py`."""
+MIN_INLIERS = 60
+MAX_KEPT = 128
+"""Largest number of matches that a frame keeps for the final resection, 1.5 kB: with a pixel of noise they place it to
+a tenth of one."""
 FLOW_SIGMA = 4.0
-"""Standard deviation of a match, pixels: a tenth of that is the flow's own, the rest the depth of the keyframe at its
-points, whose errors are the same in all frames that follow. ATE of icl-office (exact truth): 0.13 cm with 4, 8 and 1000
-px, 0.22 with descriptors; with points at jumps of depth among the others, and 2 px, 0.34."""
+"""Standard deviation of a match, pixels: a tenth of it is the flow's own, the rest comes from depth errors of the
+keyframe, which are the same in all following frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Located:
         if self.slots is None or self.pixels is None:
             return None
         agree = np.flatnonzero(self.guess.inliers)
-        some = agree[np.unique(np.linspace(0, len(agree) - 1, min(MOST_KEPT, len(agree))).astype(int))]
+        some = agree[np.unique(np.linspace(0, len(agree) - 1, min(MAX_KEPT, len(agree))).astype(int))]
         return SeenPoints(self.slots[some].astype(np.int32), self.pixels[some].astype(np.float32))
 
 
@@ -81,23 +81,21 @@ def located_by_flow(
     seen = np.flatnonzero(inside)
     # Key points stand best first, in turn over the image; those whose depth is at a jump come last.
     doubtful = keyframe.points.prior_confidence[known[seen]] < TRUSTED
-    seen = seen[np.argsort(doubtful, kind="stable")][:MOST_POINTS]
-    if len(seen) < LEAST_INLIERS:
+    seen = seen[np.argsort(doubtful, kind="stable")][:MAX_POINTS]
+    if len(seen) < MIN_INLIERS:
         return None
     asked, points = known[seen], points[seen]
     pixels = keyframe.points.pixels[asked]
     moved, alike = flow.follow(keyframe.image, image, pixels, expected[seen])
     arrived = np.flatnonzero(np.isfinite(alike))
-    if len(arrived) < max(LEAST_ARRIVED * len(seen), LEAST_INLIERS):
+    if len(arrived) < max(MIN_FOLLOWED * len(seen), MIN_INLIERS):
         return None
     nowhere = np.full(len(arrived), -1)
-    trust = np.clip(alike[arrived], 0.0, 1.0) * np.maximum(
-        keyframe.points.prior_confidence[asked[arrived]], LEAST_TRUST
-    )
+    trust = np.clip(alike[arrived], 0.0, 1.0) * np.maximum(keyframe.points.prior_confidence[asked[arrived]], MIN_TRUST)
     matches = PointMatches(asked[arrived], nowhere, pixels[arrived], moved[arrived], trust)
     points = points[arrived]
     guess = geometry.locate(PoseQuery(image, intrinsics, points, matches.pixels_j, matches.confidence, predicted))
-    agree = guess.inlier_count >= max(LEAST_SHARE * len(arrived), LEAST_INLIERS)
+    agree = guess.inlier_count >= max(MIN_INLIER_SHARE * len(arrived), MIN_INLIERS)
     if guess.result is not GeometryResult.SUCCESS or not agree:
         return None
     return Located(guess, len(matches), points, FLOW_SIGMA, matches.index_i, matches.pixels_j)

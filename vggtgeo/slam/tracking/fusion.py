@@ -19,15 +19,13 @@ from vggtgeo.slam.tracking.evidence import Evidence, tangent
 from vggtgeo.slam.tracking.line_alignment import align_lines
 
 SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
-"""What no number of samples removes (calibration, rolling shutter, clocks): metres, radians, share of the motion.
-Measured on pairs of frames, the dense alignment against the truth by the squared Mahalanobis distance, whose median
-should be 5.3: where the truth is exact (icl-office) the samples' own information is right (3.7 to 5.4, 1 to 8 frames
-apart). On the HoloLens clips, whose truth and camera are off by a pixel, it is 30 to 80 times that; with this floor 4.1
-to 5.7 (1 and 3 frames apart)."""
+"""Standard deviation of errors that samples share (calibration, rolling shutter, clocks): metres, radians, share of the
+motion. Set so that the squared Mahalanobis distance of dense alignments from the ground truth has the median of
+chi-square with 6 degrees of freedom, 5.3 (`benchmarks/alignment.py`)."""
 AGREEMENT_GATE = float(chi_square.ppf(0.9999, 6))
-"""Of the squared Mahalanobis distance between the poses by points and by the picture, below which they are averaged."""
+"""Squared Mahalanobis distance between the poses by points and by dense alignment below which they are fused."""
 LARGEST_DISAGREEMENT = 0.15
-"""Metres between them, beyond which many points are believed rather than the picture."""
+"""Distance between them, metres, above which many points are preferred to dense alignment."""
 
 
 @dataclass(frozen=True, eq=False)
