@@ -1,4 +1,4 @@
-"""The five perception roles: their protocols and result types.
+"""The perception roles: their protocols and result types.
 
 Every role is a small `Protocol`, numpy in and numpy out. Classical code, a stub and a network behind ONNX are
 interchangeable: an implementation is chosen by constructing an object. Results are frozen dataclasses that check their

@@ -181,7 +181,7 @@ def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: So
     adjustment = replace(adjustment, problem=found.problem)
     slam = _taken(slam, adjustment, found.state)
     fx, fy = slam.intrinsics[:2]
-    note = f"nobody gave the camera, and its pixels are not square: fx, fy = {fx:.1f}, {fy:.1f} px"
+    note = f"the unknown camera was estimated with pixels that are not square: fx, fy = {fx:.1f}, {fy:.1f} px"
     return replace(slam, notes=(*slam.notes, note)), adjustment, found.state
 
 
@@ -240,8 +240,8 @@ def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> 
     adjusted = undistorted(_taken(slam, adjustment, found.state), found.camera)
     k1, k2, *_ = found.camera.distortion
     note = (
-        f"nobody gave the camera, and its lens distorts: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "
-        f"{found.camera.intrinsics[0]:.1f} px, {found.warp:.0f} px at most; the images were undistorted by that"
+        f"the unknown camera was estimated with lens distortion: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "
+        f"{found.camera.intrinsics[0]:.1f} px, {found.warp:.0f} px at most; the images were undistorted"
     )
     return replace(adjusted, notes=(*adjusted.notes, note))
 
