@@ -27,7 +27,8 @@ from vggtgeo.datasets import (
     with_rate,
     without_depth,
 )
-from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth, read_image_file
+from vggtgeo.datasets.depth_files import MILLIMETRES, read_codes, read_depth
+from vggtgeo.datasets.image_files import read_image_file
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 

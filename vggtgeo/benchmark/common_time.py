@@ -15,7 +15,7 @@ from vggtgeo.benchmark.cells import COMPARED, finished, is_covered
 from vggtgeo.benchmark.statistics import LESS_BASELINE
 from vggtgeo.benchmark.suite import Suite
 from vggtgeo.benchmark.table import Row
-from vggtgeo.datasets.trajectory_files import load_trajectory
+from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import evaluate_trajectory, followed
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError

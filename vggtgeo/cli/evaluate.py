@@ -120,7 +120,7 @@ def evaluate(
 
 def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
     """Load the trajectory of a file, or `trajectory.txt` of a folder. truth: gives the times of poses without times."""
-    from vggtgeo.datasets.trajectory_files import load_trajectory
+    from vggtgeo.datasets.pose_files import load_trajectory
     from vggtgeo.results.summary_file import warn_if_truncated
     from vggtgeo.results.unfinished import unfinished_message
 
@@ -153,7 +153,7 @@ def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
     metres (None if unknown).
     """
     from vggtgeo.datasets import open_sequence
-    from vggtgeo.datasets.trajectory_files import load_trajectory
+    from vggtgeo.datasets.pose_files import load_trajectory
 
     if not path.is_dir():
         return load_trajectory(path), _in_metres(path)

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.datasets.depth_files import MAX_DEPTH, MIN_DEPTH
 from vggtgeo.datasets.frame import Frame, check_depth, check_selection, described
-from vggtgeo.datasets.image_checks import MAX_PIXELS
-from vggtgeo.datasets.image_files import MAX_DEPTH, MIN_DEPTH
+from vggtgeo.datasets.image_files import MAX_PIXELS
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_whole

@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.folder import FolderSequence, enlarged
+from vggtgeo.datasets.depth_files import MILLIMETRES, read_codes, read_depth
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.images import files_like
 from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_matrix, trajectory_of
@@ -62,12 +62,9 @@ class StrayScanner:
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Open the video; images are reduced to at most 960 pixels, by an integer factor."""
-        absent = [folder / name for name in _LISTS if not (folder / name).is_file()]
-        if absent:
-            raise InputError(
-                f"`{absent[0]}` is missing, which Stray Scanner writes beside `rgb.mp4`: copy the whole recording, or "
-                "give `rgb.mp4` alone, as a video"
-            )
+        for file in (folder / name for name in _LISTS):
+            if not file.is_file():
+                raise InputError(f"`{file}` is missing: copy the whole recording, or give `rgb.mp4` alone, as a video")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)  # the video has no intrinsics, but the folder has
             video = VideoFile.open(folder / "rgb.mp4", depth=False)
@@ -88,12 +85,6 @@ class StrayScanner:
                 stacklevel=3,
             )
         has_depth = bool(files_like(folder / "depth", "*.png"))
-        if has_depth and not (folder / _CONFIDENCE).is_dir():
-            warnings.warn(
-                f"`{folder}` has no folder `{_CONFIDENCE}`: all depth is used",
-                InputWarning,
-                stacklevel=3,
-            )
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
 
     def __len__(self) -> int:
@@ -122,14 +113,15 @@ class StrayScanner:
         try:
             depth = read_depth(file, MILLIMETRES)
             if (self.folder / _CONFIDENCE).is_dir():
-                leave_out_doubtful(depth, self.folder / _CONFIDENCE / file.name)
-            return enlarged(depth, (self.camera.width, self.camera.height), file)
+                remove_doubtful(depth, self.folder / _CONFIDENCE / file.name)
+            depth = cv2.resize(depth, (self.camera.width, self.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
+            return np.asarray(depth, np.float32)
         except InputError as error:
             warnings.warn(f"{error}; the frame is used without depth", InputWarning, stacklevel=3)
             return np.full(shape, np.nan, np.float32)
 
 
-def leave_out_doubtful(depth: np.ndarray, file: Path) -> None:
+def remove_doubtful(depth: np.ndarray, file: Path) -> None:
     """Replace depth of low confidence by NaN; warn if the confidence cannot be read, and keep all depth."""
     try:
         trust = read_codes(file)
@@ -145,6 +137,8 @@ def leave_out_doubtful(depth: np.ndarray, file: Path) -> None:
 class ArkitScenes(FolderSequence):
     """A folder of ARKitScenes, low-resolution images. Truth: ARKit's own poses."""
 
+    depth_of_fewer_pixels = True
+
     @classmethod
     def matches(cls, folder: Path) -> bool:
         """Return whether `folder` has `lowres_wide`."""
@@ -158,11 +152,7 @@ class ArkitScenes(FolderSequence):
             raise InputError(f"`{folder}/lowres_wide` has no images named `..._SECONDS.png`")
         depths = _timed(folder / "lowres_depth") if (folder / "lowres_depth").is_dir() else []
         frames = [(time, image, _nearest(time, depths)) for time, image in images]
-        return cls.listed(folder, frames, lambda *size: _pincam(folder, *size), as_images=False)
-
-    def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth, enlarged to the images."""
-        return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
+        return cls.listed(folder, frames, lambda *size: _pincam(folder, *size))
 
     def ground_truth(self) -> Trajectory | None:
         """Return ARKit's poses; the file has world -> camera as rotation vectors and translations."""

@@ -11,8 +11,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from vggtgeo.datasets.depth_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.intrinsics import MOST_ASPECT, camera_from_folder, guess_with_warning
 from vggtgeo.datasets.video_stream import (
     DepthStream,

@@ -1,11 +1,10 @@
 """Views of a sequence: with other intrinsics, without depth, or without ground truth."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from vggtgeo.datasets.bags import RosBag
-from vggtgeo.datasets.folder import FolderSequence, depth_is_usable
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
 from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.in_memory import copied
@@ -16,7 +15,7 @@ from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real
+from vggtgeo.io.given import check_positive
 
 LEAST_UNITS, MOST_UNITS = 1e-3, 1e6
 """Units a metre of depth files."""
@@ -69,9 +68,7 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
         InputError: `rate` is not positive, or the sequence has times of its own.
 
     """
-    check_real("rate", rate, "a positive number of frames a second")
-    if not (math.isfinite(rate) and rate > 0):
-        raise InputError(f"`rate` is {rate:g}; it must be a positive number of frames a second")
+    check_positive("rate", rate, "frames a second")
     if isinstance(sequence, VideoFile):
         return replace(sequence, given_rate=rate)
     if isinstance(sequence, ImageFolder | Nerfstudio | RgbdFolders):
@@ -86,24 +83,19 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
         InputError: the scale is not positive, implausible, or the sequence has no such depth files.
 
     """
-    check_real("units_per_metre", units_per_metre, "a positive number of units a metre")
-    if not 0 < units_per_metre < math.inf:
-        raise InputError(f"the depth's scale is {units_per_metre:g}; it must be a positive number of units a metre")
+    check_positive("units_per_metre", units_per_metre, "units a metre")
     if not LEAST_UNITS <= units_per_metre <= MOST_UNITS:
         raise InputError(
             f"the depth's scale is {float(units_per_metre):g} units a metre, and depth files have {LEAST_UNITS:g} "
             f"(kilometres) to {MOST_UNITS:g} (micrometres): 1000 is millimetres, 5000 TUM's"
         )
     plain = isinstance(sequence, FolderSequence) and type(sequence).load_depth is FolderSequence.load_depth
-    files = sequence.files if isinstance(sequence, FolderSequence) and plain else ()
-    if not any(file.depth is not None for file in files):
+    if not (plain and isinstance(sequence, FolderSequence) and any(file.depth for file in sequence.files)):
         raise InputError(f"`{sequence.name}` has no depth files with a selectable unit")
-    assert isinstance(sequence, FolderSequence)
     coding = replace(sequence.depth_format, units_per_metre=units_per_metre, floats_per_metre=units_per_metre)
+    scaled = replace(sequence, depth_format=coding)
     # Floats in millimetres, read as metres, are out of range.
-    size, fewer = (sequence.camera.width, sequence.camera.height), sequence.depth_of_fewer_pixels
-    usable = sequence.has_depth or depth_is_usable(sequence.name, files, coding, *size, fewer)
-    return replace(sequence, depth_format=coding, has_depth=usable)
+    return replace(scaled, has_depth=sequence.has_depth or scaled.depth_is_usable())
 
 
 def without_depth(sequence: Sequence) -> Sequence:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.datasets.image_checks import image_header
+from vggtgeo.datasets.image_files import image_header
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.image_files import read_codes
+from vggtgeo.datasets.depth_files import read_codes
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.export.contents import cloud_of, copy_pictures, picture_mask, scene_of
 from vggtgeo.geometry import rigid

@@ -6,7 +6,7 @@ import os
 from typing import Any
 
 from vggtgeo.datasets import Sequence, open_sequence
-from vggtgeo.datasets.trajectory_files import load_trajectory
+from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
