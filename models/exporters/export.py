@@ -27,9 +27,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from vggtgeo.models.exporters.packages import check_all, load
 from vggtgeo.models.exporters.recipes import Recipe
-from vggtgeo.models.exporters.request import ExportError, Graph, Request
+from vggtgeo.models.exporters.request import ExportError, Graph, Request, check_all, load
 from vggtgeo.models.exporters.weights import identity, read_checkpoint
 from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, METADATA_WEIGHTS, PARITY_SUFFIX
 

@@ -22,9 +22,9 @@ from vggtgeo.models.onnx.file_checks import (
     Signatures,
     check_looks_like_onnx,
     check_signature,
+    external_files,
     wrong_sizes,
 )
-from vggtgeo.models.onnx.graph_bytes import external_files
 from vggtgeo.models.onnx.patience import Call, watched
 from vggtgeo.models.onnx.providers import (
     CUDA_OPTIONS,

@@ -71,7 +71,6 @@ DEPTH = rows(
         ("`.npy` of floats", depths(".npy", bytes_of.npy(METRES))),
         ("floats in millimetres", depths(".tiff", 1e3 * METRES)),
         ("half a PFM", depths(".pfm", pfm(-1.0)[:1000])),
-        ("a folder `inverse_depth`", inverse),
         ("half of them all zero", bad.rgbd(without_half)),
         ("of Replica, one that is not there", recorded(layouts.replica, one_gone("results/depth*"))),
         ("of ScanNet, one that is not there", recorded(layouts.scannet, one_gone("depth/*"))),

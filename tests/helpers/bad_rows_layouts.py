@@ -45,7 +45,6 @@ TIMES = rows(
 CAMERAS = rows(
     "Calibration",
     [
-        ("KITTI's `calib.txt` without `P2`", recorded(layouts.kitti, bad.write("calib.txt", CALIB))),
         (
             "a focal length of 0 in `transforms.json`",
             recorded(layouts.nerfstudio, other_numbers("transforms.json", fl_y=0)),

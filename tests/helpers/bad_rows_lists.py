@@ -76,10 +76,6 @@ CALIBRATION = rows(
     "Calibration",
     [
         ("Replica's, of other images", recorded(layouts.replica, other_numbers("cam_params.json", w=1200, h=680))),
-        (
-            "Replica's, a scale of 400 digits",
-            recorded(layouts.replica, other_numbers("cam_params.json", scale=10**400)),
-        ),
     ],
     call=read_frames,
 )

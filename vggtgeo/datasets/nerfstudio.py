@@ -124,7 +124,8 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
     """Return the camera of the file, or the median of those of its frames, for images of this size."""
 
     def number(key: str, default: float = 0.0) -> float:
-        stated = [float(one[key]) for one in ((content,) if content.get(key) is not None else frames) if one.get(key)]
+        places = (content,) if content.get(key) is not None else frames
+        stated = [float(one[key]) for one in places if one.get(key) is not None]
         if key == "fl_x" and stated:
             warn_of_zoom(file, stated)
         return statistics.median(stated) if stated else default

@@ -16,8 +16,7 @@ import tiny_networks as tiny
 from onnx import TensorProto, helper
 from reported import raises
 from vggtgeo.models.onnx import contracts, patience, providers
-from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
-from vggtgeo.models.onnx.graph_bytes import external_files
+from vggtgeo.models.onnx.file_checks import NetworkFileError, external_files, recognise
 from vggtgeo.models.onnx.providers import choose_provider
 from vggtgeo.models.onnx.session import NetworkRunError, digest_of, open_session, read_signature
 
