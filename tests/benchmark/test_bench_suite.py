@@ -10,11 +10,10 @@ import tiny_suites as tiny
 
 from vggtgeo.benchmark.inputs import find_sequences
 from vggtgeo.benchmark.jobs import jobs_of
-from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.provenance import input_hash, source_digest
 from vggtgeo.benchmark.published import published
 from vggtgeo.benchmark.store import Store
-from vggtgeo.benchmark.suite import load_suite, read_suite, restrict, shipped
+from vggtgeo.benchmark.suite import PROTOCOLS, load_suite, read_suite, restrict, shipped
 from vggtgeo.io.errors import InputError, InputWarning
 
 WANTED = {"paper", "tum", "7scenes", "euroc", "replica", "tanks", "simulated", "stress", "quick", "clips"}

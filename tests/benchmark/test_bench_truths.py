@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.benchmark.inputs import Input, open_input
 from vggtgeo.benchmark.jobs import jobs_of
-from vggtgeo.benchmark.map_errors import pooled_depth_errors, thinned
-from vggtgeo.benchmark.measure import measure
+from vggtgeo.benchmark.measure import measure, pooled_depth_errors, thinned
 from vggtgeo.evaluation import Similarity, pose_consistency
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud

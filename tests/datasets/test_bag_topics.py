@@ -65,7 +65,7 @@ def packed(kind: str, data: bytes = b"") -> Any:
 )
 def test_the_best_topics_are_chosen(topics: dict[str, str], colour: str, depth: str) -> None:
     # Proves colour before grey, infrared last, and never as depth, and registered depth before any other.
-    chosen = chosen_topics({name: raw(encoding) for name, encoding in topics.items()})
+    chosen = chosen_topics(PLACE, {name: raw(encoding) for name, encoding in topics.items()})
     assert (chosen.colour, chosen.depth) == (colour, depth)
     assert set(chosen.others) == set(topics) - {colour, depth}
 
@@ -74,15 +74,15 @@ def test_compressed_topics() -> None:
     # Proves that depth is known by its format, or by the name of its topic.
     colour = packed("bgr8; jpeg compressed bgr8")
     for name, kind in (("/d/image_raw/compressedDepth", COMPRESSED), ("/d/compressed", "16UC1; png compressed ")):
-        assert chosen_topics({name: packed(kind), "/c/compressed": colour}) == Chosen("/c/compressed", name, ())
+        assert chosen_topics(PLACE, {name: packed(kind), "/c/compressed": colour}) == Chosen("/c/compressed", name, ())
 
 
 def test_what_cannot_be_read_is_named() -> None:
     # Proves that the sentence has the topics with what they hold, since one encoding is all that is wrong.
     with raises("/a", "/d"):
-        chosen_topics({"/a": raw("64FC1"), "/d": raw("16UC1")})
-    with pytest.raises(InputError, match=r"its topics of images: none"):
-        chosen_topics({})
+        chosen_topics(PLACE, {"/a": raw("64FC1"), "/d": raw("16UC1")})
+    with pytest.raises(InputError, match=r"a\.bag.*none"):
+        chosen_topics(PLACE, {})
 
 
 def test_what_was_chosen_is_told() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from bad_row import nothing, rows
 
-from vggtgeo.cli.address_space import check_address_space
+from vggtgeo.cli.environment import check_address_space
 from vggtgeo.io.jax_environment import cache_folder
 
 

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import picture_bytes as bytes_of
 import tiny_layouts as layouts
-import tiny_sequences as tiny
 from bad_files import beside
 from bad_row import Row, read_frames, rows
 
@@ -48,11 +47,6 @@ def two_in_one(folder: Path) -> Path:
     for name in ("left", "right"):
         bad.frames(folder / "download" / "stereo" / name)
     return folder / "download"
-
-
-def named_images(*names: str) -> Callable[[Path], Path]:
-    """Images in the order of these names."""
-    return lambda folder: tiny.images(folder / "frames", names)
 
 
 def in_order(folder: Path) -> None:

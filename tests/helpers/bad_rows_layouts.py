@@ -18,8 +18,6 @@ from bad_rows_lists import other_numbers
 from vggtgeo.datasets import open_sequence
 from vggtgeo.geometry.point_cloud import PointCloud
 
-CALIB = "P0: 55 0 20 0 0 55 15 0 0 0 1 0\n"
-
 
 def piped_suite(folder: Path) -> Path:
     """Nobody writes into it."""

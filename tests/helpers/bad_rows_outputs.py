@@ -50,15 +50,6 @@ def locked(folder: Path) -> None:
         pass
 
 
-def laid_in(folder: Path) -> None:
-    """A run in whose `unfinished` somebody lays a file; it is still there behind it."""
-    with open_run_folder(folder / "out") as run:
-        (run.stage / "trajectory.txt").write_text("")
-        (run.stage / "mine.txt").write_text("of the user")
-        run.publish()
-    assert (folder / "out/mine.txt").read_text() == "of the user"
-
-
 def linked_to_itself(name: str) -> Any:
     """Good images, and beside them a link to itself."""
 
@@ -79,7 +70,6 @@ OUTPUT = rows(
         ("a folder whose `.lock` is somebody's file", None, output(somebodys(".lock"), "things")),
         ("a folder with a state of a killed run that is none", good, {"argv": into_garbage}),
         ("a folder with a file that is called `unfinished`", None, output(somebodys("unfinished"), "things")),
-        ("somebody's file in `unfinished`, laid there while a run goes on", nothing, {"call": laid_in}),
         ("the root of the file system", good, {"argv": lambda made: ["run", made, "-o", "/"]}),
     ],
 )

@@ -74,6 +74,5 @@ SETTINGS = rows(
         ("an unknown key", None, settings("strid = 2")),
         ("text for a number", None, settings("stride = 'two'")),
         ("a number out of range", None, settings("stride = 0")),
-        ("empty text for the output folder", None, settings("output = ''")),
     ],
 )

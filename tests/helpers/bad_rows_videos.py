@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import av
 import bad_files as bad
 import cv2
 from bad_row import read_frames, rows
@@ -31,18 +30,6 @@ def calibrated(path: Path) -> Path:
     return path
 
 
-def interlaced_video(path: Path) -> Path:
-    """A video whose rows are of two times."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
-        stream.width, stream.height, stream.pix_fmt = bad.WIDTH, bad.HEIGHT, "yuv420p"
-        for number in range(6):
-            frame = av.VideoFrame.from_ndarray(bad.picture(number), format="bgr24").reformat(format="yuv420p")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return calibrated(path)
-
-
 def jpegs(path: Path) -> Path:
     """A stream that tells nothing of its times."""
     path.write_bytes(b"".join(bad.encoded(".jpg", bad.picture(number)) for number in range(12)))
@@ -62,7 +49,6 @@ VIDEOS = rows(
     [
         ("a name that is no UTF-8", named(b"clip\xff.mp4", lambda path: calibrated(bad.video(path)))),
         ("no frame", named("c.mp4", lambda path: bad.video(path, 0))),
-        ("interlaced frames", lambda folder: interlaced_video(folder / "clip.mkv")),
         ("JPEGs one behind the other, without a container", lambda folder: jpegs(folder / "clip.mjpg")),
         ("pictures of other proportions in its second half", lambda folder: resized_jpegs(folder / "c.mjpg", (48, 48))),
     ],

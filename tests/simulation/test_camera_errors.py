@@ -18,7 +18,7 @@ from vggtgeo.simulation.camera_errors import (
     vignetted,
 )
 from vggtgeo.simulation.degradations import Recording, without_depth
-from vggtgeo.simulation.rolling_rows import camera_velocities
+from vggtgeo.simulation.noise import camera_velocities
 
 RATE = 25.0
 INNER = (slice(8, -8), slice(8, -8))

@@ -13,8 +13,8 @@ from vggtgeo.cli.simulate import simulate as simulate_command
 from vggtgeo.datasets import open_sequence
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
+from vggtgeo.simulation.raster import encode
 from vggtgeo.simulation.room import build_room
-from vggtgeo.simulation.shade import encode
 from vggtgeo.simulation.textures import paint_texture
 from vggtgeo.simulation.trajectories import HandheldMotion
 from vggtgeo.simulation.tum_folder import write_tum_folder

@@ -51,7 +51,7 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         import pyarrow.parquet
     except ImportError:
         raise InputError(f"a Parquet table needs PyArrow; {install_hint('bench')}") from None
-    values = {name: [_printable(row.get(name)) for row in rows] for name in columns(rows)}
+    values = {name: [row.get(name) for row in rows] for name in columns(rows)}
     table = pyarrow.table({name: pyarrow.array(_same_type(column)) for name, column in values.items()})
     with atomic_path(path) as temporary, temporary.open("wb") as stream:  # PyArrow accepts UTF-8 paths only
         pyarrow.parquet.write_table(table, stream)
@@ -61,11 +61,6 @@ def number(row: Row, column: str) -> float:
     """Return a value as a number; NaN if missing."""
     value = row.get(column)
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else math.nan
-
-
-def _printable(value: Any) -> Any:
-    """A text as valid UTF-8, as Parquet requires: file names need not be."""
-    return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace") if isinstance(value, str) else value
 
 
 def _same_type(column: list[Any]) -> list[Any]:

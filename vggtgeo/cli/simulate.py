@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.option_groups import with_option_groups
-from vggtgeo.cli.options import JsonOption, QuietOption
+from vggtgeo.cli.options import JsonOption, QuietOption, with_option_groups
 from vggtgeo.io.errors import InputError
 
 

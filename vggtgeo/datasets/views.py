@@ -1,13 +1,20 @@
 """Views of a sequence: with other intrinsics, without depth, or without ground truth."""
 
+from __future__ import annotations
+
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import overload
+
+import cv2
+import numpy as np
 
 from vggtgeo.datasets.bags import RosBag
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.frame import Frame, Sequence
+from vggtgeo.datasets.frame import Frame, Sequence, check_frame
 from vggtgeo.datasets.images import ImageFolder
-from vggtgeo.datasets.in_memory import copied
+from vggtgeo.datasets.in_memory import FrameStream, copied
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.rgbd_folders import RgbdFolders
@@ -103,3 +110,71 @@ def without_depth(sequence: Sequence) -> Sequence:
     known = isinstance(sequence, FolderSequence | RosBag | VideoFile)
     source = replace(sequence, has_depth=False) if known else sequence  # type: ignore[type-var]
     return SequenceView(source, sequence.camera, has_depth=False)
+
+
+@dataclass(frozen=True)
+class ReducedSequence:
+    """`source` with smaller images and depth; `camera` is that of the reduced images."""
+
+    source: Sequence
+    camera: Camera
+
+    @property
+    def name(self) -> str:
+        """Return the name of the source."""
+        return self.source.name
+
+    @property
+    def has_depth(self) -> bool:
+        """Return whether the source has depth."""
+        return self.source.has_depth
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """See `Sequence.frames`."""
+        return _reduced_frames(self.source.frames(start, end, stride), self.source.camera, self.camera)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return the truth of the source."""
+        return self.source.ground_truth()
+
+
+@overload
+def reduced(source: Sequence, max_pixels: int) -> Sequence: ...
+
+
+@overload
+def reduced(source: FrameStream, max_pixels: int) -> FrameStream: ...
+
+
+def reduced(source: Sequence | FrameStream, max_pixels: int) -> Sequence | FrameStream:
+    """Return the frames and camera reduced to about `max_pixels` pixels; the source itself if its images are smaller,
+    or if `max_pixels` is 0.
+    """
+    camera = reduced_camera(source.camera, max_pixels)
+    if camera == source.camera:
+        return source
+    if isinstance(source, FrameStream):
+        return replace(source, camera=camera, source=_reduced_frames(source.source, source.camera, camera))
+    return ReducedSequence(source, camera)
+
+
+def reduced_camera(camera: Camera, max_pixels: int) -> Camera:
+    """Return the camera of images reduced to about `max_pixels` pixels; 0: unchanged."""
+    factor = math.sqrt(max_pixels / (camera.width * camera.height))
+    if factor >= 1 or not max_pixels:
+        return camera
+    return camera.resized(max(round(factor * camera.width), 1), max(round(factor * camera.height), 1))
+
+
+def _reduced_frames(frames: Iterator[Frame], camera: Camera, smaller: Camera) -> Iterator[Frame]:
+    size = smaller.width, smaller.height
+    for frame in frames:
+        check_frame(frame, camera)
+        image = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        depth = frame.depth
+        if depth is not None:  # a mean over an edge would be on no surface
+            depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+        yield replace(frame, image=image, depth=depth)

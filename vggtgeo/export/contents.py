@@ -15,7 +15,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import MASK, Scene
-from vggtgeo.results.summary_file import POSES
+from vggtgeo.results.summary import POSES
 
 
 class EmptyRunError(InputError):

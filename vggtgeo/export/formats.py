@@ -23,7 +23,7 @@ from vggtgeo.io.files import whole_path, write_text
 from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import LockedError, locked, not_written
 from vggtgeo.io.text_files import whole_text
-from vggtgeo.results.summary_file import load_poses, read_summary
+from vggtgeo.results.summary import load_poses, read_summary
 from vggtgeo.results.unfinished import check_is_run
 
 

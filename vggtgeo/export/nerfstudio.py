@@ -17,8 +17,7 @@ from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.export.contents import cloud_of, copy_pictures, picture_mask, scene_of
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import atomic_path, write_json
-from vggtgeo.io.pictures import write_picture
+from vggtgeo.io.files import atomic_path, write_json, write_picture
 from vggtgeo.results.files import DEPTH_UNIT
 
 MILLI = 1000.0

@@ -12,7 +12,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, path_of
 from vggtgeo.results.result import Result
-from vggtgeo.results.summary_file import warn_if_truncated
+from vggtgeo.results.summary import warn_if_truncated
 
 
 def read(path: str | os.PathLike[str]) -> Result | Sequence:

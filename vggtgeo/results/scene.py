@@ -17,8 +17,8 @@ import numpy as np
 from vggtgeo.datasets import Sequence as Frames
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_picture
 from vggtgeo.io.persistence import Format, by_name
-from vggtgeo.io.pictures import write_picture
 from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.results.reread_frames import reread_frames
 from vggtgeo.slam.global_map.frame_poses import frame_poses

@@ -18,7 +18,7 @@ from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.degradations import Recording, with_images
-from vggtgeo.simulation.rolling_rows import camera_velocities
+from vggtgeo.simulation.noise import camera_velocities
 
 INSTANTS = 5
 """Moments of an exposure whose mean is the image."""

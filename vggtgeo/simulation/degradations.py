@@ -11,7 +11,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
+from vggtgeo.simulation.noise import camera_velocities, rolled
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_real, check_whole, real_numbers
-from vggtgeo.simulation.shade import encode
+from vggtgeo.simulation.raster import encode
 
 MOST_SAMPLES = 1000
 """Renderings for one image."""

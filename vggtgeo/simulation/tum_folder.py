@@ -14,8 +14,7 @@ import numpy as np
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import write_text
-from vggtgeo.io.pictures import write_picture
+from vggtgeo.io.files import write_picture, write_text
 from vggtgeo.simulation.sequence import SyntheticSequence
 
 _DEPTH_UNITS = 5000.0

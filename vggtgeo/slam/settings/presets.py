@@ -19,8 +19,7 @@ from typing import Any, get_args
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_positive, path_of
-from vggtgeo.io.network_errors import as_input_errors
-from vggtgeo.io.network_files import networks_folder
+from vggtgeo.io.network_files import as_input_errors, networks_folder
 from vggtgeo.models.classical import ConstantVelocity, OrbMatcher
 from vggtgeo.models.onnx.bounds import (
     BoundedConfidence,
