@@ -12,7 +12,8 @@ from zipfile import ZipFile
 
 import pytest
 from conftest import ROOT
-from vggtgeo.models.extras import install_hint
+
+from vggtgeo.io.errors import install_hint
 
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "vggtgeo", "solvers", "models")
 

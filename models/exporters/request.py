@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from vggtgeo.models.extras import install_hint
+
+from vggtgeo.io.errors import install_hint
 
 
 class ExportError(ValueError):

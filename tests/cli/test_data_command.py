@@ -14,9 +14,9 @@ from reported import pattern
 from typer.testing import CliRunner
 
 from vggtgeo.benchmark.suite import shipped
+from vggtgeo.cli.data import catalogue
 from vggtgeo.cli.main import make_app
 from vggtgeo.datasets import KINDS
-from vggtgeo.datasets.catalogue import catalogue
 from vggtgeo.datasets.check import inspect
 
 

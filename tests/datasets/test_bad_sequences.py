@@ -10,7 +10,7 @@ import tiny_sequences as tiny
 from reported import raises, warns
 
 from vggtgeo.datasets import Frame, Sequence, open_sequence
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputWarning
 
 
 def _read(sequence: Sequence) -> tuple[list[Frame], list[str]]:
@@ -40,7 +40,7 @@ def test_a_single_image_and_a_wrong_kind_are_errors(tmp_path: Path) -> None:
         open_sequence(tmp_path, "video")
     with raises("rgb.txt"):
         open_sequence(tmp_path, "tum")
-    with pytest.raises(InputError, match="has no `frame-XXXXXX"):
+    with raises(tmp_path.name):
         open_sequence(tmp_path, "7scenes")
 
 

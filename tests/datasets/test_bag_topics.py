@@ -15,7 +15,6 @@ from vggtgeo.datasets.bag_cameras import camera_of
 from vggtgeo.datasets.bag_images import image_of, metres_of
 from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, told
 from vggtgeo.datasets.check import inspect
-from vggtgeo.io.errors import InputError
 
 PLACE = Path("a.bag, /c, 0")
 
@@ -81,7 +80,7 @@ def test_what_cannot_be_read_is_named() -> None:
     # Proves that the sentence has the topics with what they hold, since one encoding is all that is wrong.
     with raises("/a", "/d"):
         chosen_topics(PLACE, {"/a": raw("64FC1"), "/d": raw("16UC1")})
-    with pytest.raises(InputError, match=r"a\.bag.*none"):
+    with raises("a.bag"):
         chosen_topics(PLACE, {})
 
 

@@ -18,7 +18,7 @@ from reported import raises, warns
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import end_on_signals, interruption
 from vggtgeo.io.locks import LockedError, locked
@@ -189,7 +189,7 @@ def test_a_second_signal_ends_at_once_and_the_old_run_stays(
     assert {name: after[name] for name in before} == before
     assert "unfinished/trajectory.txt" in after
     assert not (out / ".lock").exists()
-    with pytest.warns(InputWarning, match="unfinished"), pytest.raises(InputError):
+    with warns("unfinished"), pytest.raises(InputError):
         Result.load(out)
 
 

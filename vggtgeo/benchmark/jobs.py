@@ -57,6 +57,9 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
     found = []
     for sequence in suite.sequence:
         place = next(iter(places[sequence.name]), None)
+        if len(places[sequence.name]) > 1:
+            text = f"`{sequence.path}` exists {len(places[sequence.name])} times below `data`; `{place}` is taken"
+            warnings.warn(text, InputWarning, stacklevel=2)
         absent = _absent(sequence.path, roots) if place is None else ""
         digest = "" if place is None else input_hash(place)
         settings = [table for table in suite.setting if not table.sequences or sequence.name in table.sequences]

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from vggtgeo.benchmark.exact_frames import ExactFrames, exact_cloud
-from vggtgeo.benchmark.inputs import Input
+from vggtgeo.benchmark.inputs import ExactFrames, Input, exact_cloud
 from vggtgeo.evaluation import (
     CloudError,
     Similarity,

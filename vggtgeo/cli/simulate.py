@@ -45,7 +45,7 @@ def simulate(
     from rich.progress import track
 
     from vggtgeo import simulation
-    from vggtgeo.simulation.tum_folder import check_new, write_tum_folder
+    from vggtgeo.simulation.sequence import check_new, write_tum_folder
 
     check_new(output)  # before a world is built
     sensor = simulation.Sensor(

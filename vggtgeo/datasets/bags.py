@@ -28,8 +28,7 @@ from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
-from vggtgeo.models.extras import install_hint
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning, install_hint
 
 _DELAY = 0.02
 """Seconds between an image and its depth."""

@@ -11,8 +11,7 @@ from jaxtyping import Float, UInt16
 
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MAX_PIXELS, decoded, file_content
 from vggtgeo.io.archives import UNREADABLE, array_header
-from vggtgeo.io.errors import InputError
-from vggtgeo.models.extras import install_hint
+from vggtgeo.io.errors import InputError, install_hint
 
 DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
 _EXR_DEPTH = re.compile(r"(.*[.])?(z|depth|depth[.]v|y|v|r)", re.IGNORECASE)

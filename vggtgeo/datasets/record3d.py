@@ -35,9 +35,8 @@ from vggtgeo.datasets.pose_files import json_in, parsing, poses_of, same_size, t
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, install_hint
 from vggtgeo.io.text_files import MAX_BYTES as MOST_TEXT
-from vggtgeo.models.extras import install_hint
 
 SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"

@@ -1,4 +1,8 @@
-"""Decoded frames of one stream of a video file, by PyAV."""
+"""Streams of a video file, decoded by PyAV: which are the images, which their depth.
+
+Action cameras write a small preview beside the recording; k4arecorder writes COLOR, DEPTH and IR into one Matroska
+file.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exception and warnings about invalid input."""
+"""Exceptions, warnings and messages about invalid input."""
 
 from __future__ import annotations
 
@@ -111,3 +111,14 @@ def collected_warnings() -> Iterator[list[Warning | str]]:
             showing.lists[:] = [other for other in showing.lists if other is not collected]
             if not showing.lists and warnings.showwarning is showing:
                 warnings.showwarning = showing.as_before
+
+
+def install_hint(extra: str) -> str:
+    """What to do to have the packages of an extra of `pyproject.toml`, in a clone and with a released package."""
+    clone, release = f"pip install -e '.[{extra}]'", f"pip install 'vggtgeo[{extra}]'"
+    return f"install the extra `{extra}`: `{clone}` in a clone, `{release}` elsewhere"
+
+
+def put_back_hint(package: str, version: str) -> str:
+    """Return how to restore a package whose files another package has overwritten."""
+    return f"`pip install --force-reinstall --no-deps {package}=={version}` puts them back"

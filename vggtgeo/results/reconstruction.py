@@ -23,10 +23,9 @@ from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, load_checkpoint, run_identity
 from vggtgeo.results.result import Result, RunRecord
-from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source, open_source, reduction_summary
 from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
-from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
+from vggtgeo.results.tracking_loop import RunCallbacks, Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead

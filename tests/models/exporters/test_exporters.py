@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from invoked import invoke
+from reported import raises
 from vggtgeo.models.exporters import request
 from vggtgeo.models.exporters.attention import angle_tables, grid
 from vggtgeo.models.exporters.checkout import Checkout, import_from, stand_in
@@ -65,7 +66,7 @@ def test_a_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.M
     assert result.exit_code == 2
     assert "`torch`" in result.output
     assert "pip install -e '.[export]'" in result.output
-    with pytest.raises(ExportError, match="no_such_package"):
+    with raises("no_such_package", error=ExportError):
         request.load("no_such_package")
 
 
