@@ -14,7 +14,7 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 FRAMES_PER_SECOND = 30.0
 _UNITS = (
-    (re.compile(r"-?\d+\.\d{2,}"), 1.0),
+    (re.compile(r"-?\d+\.\d+"), 1.0),
     (re.compile(r"\d{18,19}"), 1e-9),
     (re.compile(r"1\d{15}"), 1e-6),
     (re.compile(r"1\d{12}"), 1e-3),
