@@ -32,7 +32,8 @@ from vggtgeo.models.roles import (
     WindowGuess,
 )
 
-_Role, _Answer = TypeVar("_Role"), TypeVar("_Answer")
+_Role = TypeVar("_Role")
+_Answer = TypeVar("_Answer")
 NEAREST, FARTHEST = 0.05, 100.0
 """Minimum and maximum depth of an indoor world, a sports hall included, metres."""
 AVERAGE = 0.5

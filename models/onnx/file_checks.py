@@ -41,7 +41,7 @@ _STRANGERS = (
 )
 
 
-_MOST_BYTES = 2**31
+_MAX_BYTES = 2**31
 """What a protocol buffer may have; larger weights are in a file beside it."""
 
 
@@ -53,8 +53,8 @@ def check_looks_like_onnx(path: Path) -> None:
     with path.open("rb") as file:
         start = file.read(32)
     size = path.stat().st_size
-    if size > _MOST_BYTES:
-        raise NetworkFileError(f"`{path}` has {size} bytes; an ONNX file has at most {_MOST_BYTES}")
+    if size > _MAX_BYTES:
+        raise NetworkFileError(f"`{path}` has {size} bytes; an ONNX file has at most {_MAX_BYTES}")
     if not start:
         raise NetworkFileError(f"`{path}` is empty, expected an ONNX file; export or fetch it again")
     for mark, what in _STRANGERS:

@@ -13,7 +13,7 @@ from reported import raises
 
 from vggtgeo.datasets.bag_cameras import camera_of
 from vggtgeo.datasets.bag_images import image_of, metres_of
-from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, told
+from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, described_choice
 from vggtgeo.datasets.check import inspect
 
 PLACE = Path("a.bag, /c, 0")
@@ -87,11 +87,11 @@ def test_what_cannot_be_read_is_named() -> None:
 def test_what_was_chosen_is_told() -> None:
     # Proves a sentence where there was a choice, and none where there was none.
     chosen = Chosen("/rgb", "/depth_registered", ("/depth", "/ir"))
-    assert told(chosen, "/gt") == (
+    assert described_choice(chosen, "/gt") == (
         "images of `/rgb`, depth of `/depth_registered`, truth of `/gt`; not read: `/depth`, `/ir`"
     )
-    assert told(Chosen("/rgb", "", ("/ir",)), "") == "images of `/rgb`, no depth; not read: `/ir`"
-    assert not told(Chosen("/rgb", "/depth", ()), "")
+    assert described_choice(Chosen("/rgb", "", ("/ir",)), "") == "images of `/rgb`, no depth; not read: `/ir`"
+    assert not described_choice(Chosen("/rgb", "/depth", ()), "")
 
 
 @pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])

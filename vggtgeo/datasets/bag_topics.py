@@ -84,7 +84,7 @@ def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:
     return int(bool(_INFRARED.search(name))), int("depth" in name.lower()), int(encoding in GREY)
 
 
-def told(chosen: Chosen, poses: str) -> str:
+def described_choice(chosen: Chosen, poses: str) -> str:
     """What was chosen, as a sentence; empty where there was no choice. poses: the topic of the truth, "" for none."""
     if not chosen.others:
         return ""

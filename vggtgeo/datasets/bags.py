@@ -19,7 +19,7 @@ import numpy as np
 from vggtgeo.datasets.bag_cameras import CAMERA_INFO, camera_of
 from vggtgeo.datasets.bag_depth import DepthCamera, depth_camera_of
 from vggtgeo.datasets.bag_images import Unread, image_of, metres_of
-from vggtgeo.datasets.bag_topics import IMAGES, Chosen, chosen_topics, told, truth_topic
+from vggtgeo.datasets.bag_topics import IMAGES, Chosen, chosen_topics, described_choice, truth_topic
 from vggtgeo.datasets.bag_transforms import TRANSFORMS, frame_name
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import orientation_message
@@ -94,7 +94,7 @@ class RosBag:
             first = {name: _first(reader, name) for name in topics if topics[name] in IMAGES}
             chosen = chosen_topics(path, first)
             poses = truth_topic(topics)
-            if text := told(chosen, poses):
+            if text := described_choice(chosen, poses):
                 _warn(f"`{path}`: {text}", NoteWarning)
             times, (width, height) = _times_and_size(reader, path, chosen.colour)
             infos = _infos(reader, topics)
@@ -105,7 +105,7 @@ class RosBag:
             size = (other.camera.width, other.camera.height) if other else (width, height)
             has_depth = depth and bool(chosen.depth) and _depth_is_usable(reader, path, chosen.depth, times, size)
             if has_depth and other:
-                _warn(f"`{path}`: {_told_registered(chosen, other)}", NoteWarning)
+                _warn(f"`{path}`: {_registration_note(chosen, other)}", NoteWarning)
         return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, times, has_depth, other)
 
     def __len__(self) -> int:
@@ -286,7 +286,7 @@ def _whole(reader: Any, connections: list[Any]) -> Iterator[Any]:
             yield reader.deserialize(raw, connection.msgtype)
 
 
-def _told_registered(chosen: Chosen, other: DepthCamera) -> str:
+def _registration_note(chosen: Chosen, other: DepthCamera) -> str:
     distance = 1e3 * float(np.linalg.norm(other.motion[:3, 3]))
     return (
         f"the depth of `{chosen.depth}` is of a camera of its own (f = {other.camera.intrinsics[0]:.1f}, "

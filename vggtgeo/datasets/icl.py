@@ -26,7 +26,7 @@ from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of, read_matrices, read_text, trajectory_of
-from vggtgeo.datasets.tum import MOST_LETTERS, read_pairs
+from vggtgeo.datasets.tum import MAX_LETTERS, read_pairs
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -54,7 +54,7 @@ class IclNuim(FolderSequence):
         if not file.is_file():
             return truth and bool(_numbered(folder))
         with file.open(encoding="utf-8-sig", errors="replace") as lines:
-            head = (line[:MOST_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
+            head = (line[:MAX_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
             words = next(filter(None, head), [])
         counted = len(words) == 4 and words[0].isdecimal() and "depth" in words[1]
         return counted or truth

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import simplejpeg
 from jaxtyping import UInt8
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from vggtgeo.io.errors import InputError
 
@@ -124,7 +124,7 @@ def image_header(content: bytes, path: Path) -> ImageHeader:
         raise
     except Image.DecompressionBombError as error:
         raise InputError(f"`{path}` has too many pixels: {error}") from None
-    except Image.UnidentifiedImageError:
+    except UnidentifiedImageError:
         raise InputError(
             f"`{path}` begins with {content[:16]!r}; it must be a PNG, JPEG, TIFF, WebP, BMP or PNM: convert it, or "
             "copy it again if it is damaged"

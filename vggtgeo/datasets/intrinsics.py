@@ -18,9 +18,9 @@ NARROWEST, WIDEST = 1.0, 170.0
 """Minimum and maximum field of view of a pinhole camera, degrees."""
 FARTHEST_CENTRE = 10.0
 """Maximum coordinate of a principal point, in image sizes: a cropped image may have it outside."""
-LEAST_VALID = 0.5
+MIN_VALID = 0.5
 """Minimum share of the undistorted image that is inside the original; lenses of benchmarks keep more than 0.8."""
-MOST_ASPECT = 4.0
+MAX_ASPECT = 4.0
 """Maximum ratio of the focal lengths, either way; 1 for square pixels, up to 2 for interlaced and anamorphic ones."""
 _OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
 _FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
@@ -147,16 +147,16 @@ def check_plausible(where: str, camera: Camera) -> None:
         raise InputError(
             f"{where}: fx {fx:g} and fy {fy:g} make a field of view of {angle:.3g} deg {size}; they must be in pixels"
         )
-    if max(fx, fy) > MOST_ASPECT * min(fx, fy):
+    if max(fx, fy) > MAX_ASPECT * min(fx, fy):
         raise InputError(
-            f"{where}: fx {fx:g} and fy {fy:g} differ by more than a factor of {MOST_ASPECT:g}; give pixels"
+            f"{where}: fx {fx:g} and fy {fy:g} differ by more than a factor of {MAX_ASPECT:g}; give pixels"
         )
     if abs(cx) > FARTHEST_CENTRE * width or abs(cy) > FARTHEST_CENTRE * height:
         raise InputError(f"{where}: the principal point ({cx:g}, {cy:g}) is far outside {size}; give pixels")
     if any(camera.distortion):
         valid = camera.undistorter().valid
         share = 1.0 if valid is None else float(valid.mean())
-        if share < LEAST_VALID:
+        if share < MIN_VALID:
             raise InputError(
                 f"{where}: the distortion {camera.distortion} leaves {100 * share:.0f} % of the image; it must be "
                 "k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order"

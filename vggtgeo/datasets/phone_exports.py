@@ -114,8 +114,9 @@ class Scanner3d(PhoneExport):
     def views(cls, folder: Path) -> Iterable[tuple[Path, Path, Path, Path]]:
         for image in files_like(folder, "frame_*"):
             if match := _FRAME.fullmatch(image.name):
-                names = (f"frame_{match[1]}.json", f"depth_{match[1]}.png", f"conf_{match[1]}.png")
-                yield (image, *(folder / name for name in names))
+                number = match[1]
+                depth, confidence = folder / f"depth_{number}.png", folder / f"conf_{number}.png"
+                yield image, folder / f"frame_{number}.json", depth, confidence
 
     @classmethod
     def stated(cls, file: Path) -> tuple[float, tuple[float, float, float, float], tuple | None, np.ndarray]:

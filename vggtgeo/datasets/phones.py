@@ -35,12 +35,12 @@ from vggtgeo.io.text_files import whole_text
 
 LARGEST = 960
 """Maximum pixels of the longer side: the depth has 256, and images of 1920 cost four times as much."""
-_LEAST_CONFIDENCE = 1
+_MIN_CONFIDENCE = 1
 """Minimum of 0 (low), 1 and 2; Polycam writes 0, 127 and 255."""
 _CONFIDENCE = "confidence"
 _LISTS = "odometry.csv", "camera_matrix.csv"
 """Files of Stray Scanner beside the video."""
-_MOST_DELAY = 0.02
+_MAX_DELAY = 0.02
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def remove_doubtful(depth: np.ndarray, file: Path) -> None:
     except InputError as error:
         warnings.warn(f"{error}; all depth of the frame is used", InputWarning, stacklevel=4)
     else:
-        depth[trust < _LEAST_CONFIDENCE] = np.nan
+        depth[trust < _MIN_CONFIDENCE] = np.nan
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
     if not depths:
         return None
     other, path = min(depths, key=lambda entry: abs(entry[0] - time))
-    return path if abs(other - time) <= _MOST_DELAY else None
+    return path if abs(other - time) <= _MAX_DELAY else None
 
 
 def _pincam(folder: Path, width: int, height: int) -> Camera:

@@ -25,7 +25,7 @@ _ROUNDING = 1e-5
 """Rounding of printed rotations, which stay unchanged so that errors equal those of other programs."""
 _NANOSECONDS = 1e17
 """Times above it: seconds since 1970 are below 1e10, nanoseconds above 1e18."""
-_MOST_STRETCH = 0.1
+_MAX_STRETCH = 0.1
 """Maximum error of the lengths of a pose's axes; smaller ones (few digits, a scale of 1 %) are corrected."""
 
 
@@ -199,10 +199,10 @@ def check_size(file: Path, stated: Sequence[object], size: tuple[int, int]) -> N
 
 def have_rotations(poses: np.ndarray) -> np.ndarray:
     """Return whether the axes of each pose have nearly unit length and are right-handed, with last row 0 0 0 1."""
-    last = (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) < _MOST_STRETCH).all(axis=1)
+    last = (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) < _MAX_STRETCH).all(axis=1)
     with np.errstate(over="ignore", invalid="ignore"):  # what is no rotation may be of any size
         lengths = np.linalg.norm(poses[:, :3, :3], axis=1)
-        near = (np.abs(lengths - 1.0) < _MOST_STRETCH).all(axis=1)
+        near = (np.abs(lengths - 1.0) < _MAX_STRETCH).all(axis=1)
         return np.asarray(last & near & (np.linalg.det(poses[:, :3, :3]) > 0.0), bool)
 
 

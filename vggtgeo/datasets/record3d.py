@@ -36,12 +36,12 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError, InputWarning, install_hint
-from vggtgeo.io.text_files import MAX_BYTES as MOST_TEXT
+from vggtgeo.io.text_files import MAX_BYTES as MAX_TEXT
 
 SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"
 _IMAGE = re.compile(r"rgbd?/(\d{1,9})\.(jpe?g|png)")
-_LEAST_CONFIDENCE = 1
+_MIN_CONFIDENCE = 1
 """Minimum of 0 (low), 1 and 2."""
 
 
@@ -105,7 +105,7 @@ class Record3d(FolderSequence):
     def metadata(self) -> Mapping[str, Any]:
         """Return the metadata; raise InputError unless they are a JSON object."""
         where = self.file
-        content = json_in(self._content(where, MOST_TEXT), where)
+        content = json_in(self._content(where, MAX_TEXT), where)
         if not isinstance(content, dict):
             raise InputError(f"`{where}` must be a JSON object with `K`, `fps` and `poses`")
         return content
@@ -130,7 +130,7 @@ class Record3d(FolderSequence):
         trusted = path.with_suffix(".conf")
         if self.holds(trusted):
             trust = _shaped(self._unpacked(trusted, 1), np.uint8, trusted, depth.shape, shape)
-            depth[trust < _LEAST_CONFIDENCE] = np.nan
+            depth[trust < _MIN_CONFIDENCE] = np.nan
         return self.enlarged(depth)
 
     def ground_truth(self) -> Trajectory | None:

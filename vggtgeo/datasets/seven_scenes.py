@@ -84,8 +84,8 @@ class SevenScenes(FolderSequence):
         """Return the true poses; warn of pose files with NaN or infinity (lost tracking), which are left out."""
         if (self.folder / COLOUR_TRUTH).exists():
             return Trajectory.load_tum(self.folder / COLOUR_TRUTH)
-        poses = {file.timestamp: _beside(file.image, "pose.txt") for file in self.files}
-        poses = {time: read_matrix(file, (4, 4)) for time, file in poses.items() if file.is_file()}
+        places = {file.timestamp: _beside(file.image, "pose.txt") for file in self.files}
+        poses = {time: read_matrix(place, (4, 4)) for time, place in places.items() if place.is_file()}
         if not poses:
             return None
         to_camera = np.linalg.inv(_TO_COLOUR) if self.as_published else np.eye(4)

@@ -22,7 +22,7 @@ _LOG = "_COLMAP_SfM.log"
 _LINES = 5
 """Lines of a pose in the log: numbers, and four rows of a matrix camera -> world."""
 _AXES = ["X", "Y", "Z"]
-_LEAST_CORNERS = 3
+_MIN_CORNERS = 3
 """Minimum corners of a polygon."""
 
 
@@ -121,7 +121,7 @@ def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray
         axis = _AXES.index(str(crop["orthogonal_axis"]).upper())
         low, high = float(crop["axis_min"]), float(crop["axis_max"])
         polygon = np.array(crop["bounding_polygon"], np.float64).reshape(-1, 3)
-        if not low < high or len(polygon) < _LEAST_CORNERS or not np.isfinite([low, high, *polygon.ravel()]).all():
+        if not low < high or len(polygon) < _MIN_CORNERS or not np.isfinite([low, high, *polygon.ravel()]).all():
             raise ValueError(f"axis_min is {low:g}, axis_max {high:g}, and the polygon {polygon.tolist()}")
     across = [number for number in range(3) if number != axis]
     between = (points[:, axis] >= low) & (points[:, axis] <= high)

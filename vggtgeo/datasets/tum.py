@@ -25,9 +25,9 @@ from vggtgeo.io.text_files import whole_text
 
 MAX_DEPTH_DELAY = 0.02
 """Maximum seconds between an image and its depth."""
-MOST_LETTERS = 200
+MAX_LETTERS = 200
 _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")
-MOST_FRAMES = 1e6
+MAX_FRAMES = 1e6
 """Integers up to this one are numbers of frames, not times."""
 _Entry = tuple[float, Path]
 _Frame = tuple[float, Path, Path | None]
@@ -78,7 +78,7 @@ def _recording(folder: Path) -> str:
     if not file.is_file():
         return ""
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        head = [line[:MOST_LETTERS] for line in itertools.islice(lines, 5)]
+        head = [line[:MAX_LETTERS] for line in itertools.islice(lines, 5)]
     return " ".join(line.partition("file:")[2] for line in head if line.startswith("#"))
 
 
@@ -97,7 +97,7 @@ def _of_lists(folder: Path) -> list[_Frame]:
 def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
     """Return the frames, and the unit of their depth: millimetres if the list counts frames, as no benchmark does."""
     pairs = read_pairs(file, "TIME")
-    counted = all(time.is_integer() and abs(time) < MOST_FRAMES for time, *_ in pairs)
+    counted = all(time.is_integer() and abs(time) < MAX_FRAMES for time, *_ in pairs)
     if counted:
         rate = f"{FRAMES_PER_SECOND:g} a second"
         _warn(f"`{file}`: its first column counts frames; {rate} are assumed, and depth in millimetres")
@@ -142,7 +142,7 @@ def _rows(file: Path, columns: int, expected: str) -> list[list[str]]:
         except ValueError:
             valid = False
         if not valid:
-            text = f"found {line[:MOST_LETTERS]!r}; expected `{expected}`, times in seconds"
+            text = f"found {line[:MAX_LETTERS]!r}; expected `{expected}`, times in seconds"
             raise InputError(f"`{file}`, line {number}: {text}")
         rows.append([word.strip() for word in words])
     if not rows:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vggtgeo.datasets.depth_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.intrinsics import MOST_ASPECT, camera_from_folder, guess_with_warning
+from vggtgeo.datasets.intrinsics import MAX_ASPECT, camera_from_folder, guess_with_warning
 from vggtgeo.datasets.video_stream import (
     ChosenTracks,
     DepthStream,
@@ -195,7 +195,7 @@ class _Selection:
 def _pixel_aspect(stream: VideoStream, frame: Any) -> float:
     """Return width of a shown pixel over its height (1440 x 1080 are shown as 16:9); 1 if not stated, or impossible."""
     aspect = stream.pixel_aspect
-    if not 1 / MOST_ASPECT <= aspect <= MOST_ASPECT:
+    if not 1 / MAX_ASPECT <= aspect <= MAX_ASPECT:
         return 1.0
     return 1 / aspect if shown_size(frame) != (frame.width, frame.height) else aspect
 

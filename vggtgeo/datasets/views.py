@@ -30,7 +30,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_positive
 
-LEAST_UNITS, MOST_UNITS = 1e-3, 1e6
+MIN_UNITS, MAX_UNITS = 1e-3, 1e6
 """Units a metre of depth files."""
 
 
@@ -97,10 +97,10 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
 
     """
     check_positive("units_per_metre", units_per_metre, "units a metre")
-    if not LEAST_UNITS <= units_per_metre <= MOST_UNITS:
+    if not MIN_UNITS <= units_per_metre <= MAX_UNITS:
         raise InputError(
-            f"the depth's scale is {float(units_per_metre):g} units a metre, and depth files have {LEAST_UNITS:g} "
-            f"(kilometres) to {MOST_UNITS:g} (micrometres): 1000 is millimetres, 5000 TUM's"
+            f"the depth's scale is {float(units_per_metre):g} units a metre, and depth files have {MIN_UNITS:g} "
+            f"(kilometres) to {MAX_UNITS:g} (micrometres): 1000 is millimetres, 5000 TUM's"
         )
     plain = isinstance(sequence, FolderSequence) and type(sequence).load_depth is FolderSequence.load_depth
     if not (plain and isinstance(sequence, FolderSequence) and any(file.depth for file in sequence.files)):

@@ -148,7 +148,7 @@ def simulate(
     return SyntheticSequence(build(seed), motion, camera_of(size), sensor or Sensor(), frames, rate, seed)
 
 
-MOST_FRAMES, MOST_SIDE = 1_000_000, 8192
+MAX_FRAMES, MAX_SIDE = 1_000_000, 8192
 """More would take all memory before the first frame."""
 
 
@@ -161,7 +161,7 @@ def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, spee
         raise InputError(f"`size` has {len(size)} numbers; expected (width, height), in pixels")
     for name, count in (("frames", frames), ("size", min(size)), ("size", max(size))):
         check_whole(name, count, 1)
-    for name, count, most in (("frames", frames, MOST_FRAMES), ("size", max(size), MOST_SIDE)):
+    for name, count, most in (("frames", frames, MAX_FRAMES), ("size", max(size), MAX_SIDE)):
         if count > most:
             raise InputError(f"`{name}` is {count}; it must be at most {most}")
     for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
