@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from vggtgeo.benchmark.inputs import find_sequences
 from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.suite import PROTOCOLS, SequenceTable, SettingTable, Suite
 from vggtgeo.datasets.opening import is_readable
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import Tables, changed, updated
 
