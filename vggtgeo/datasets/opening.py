@@ -157,7 +157,7 @@ def _open_folder(place: Path, kind: str | None) -> Sequence:
     other = next((name for name in names if Path(name).suffix.lower() in OTHER_PICTURES | ARCHIVES), None)
     raise InputError(
         no_whole_bag(place)
-        or (other and f"`{place}` holds `{other}`: {_NOT_READ}")
+        or (other and f"`{place}` holds `{other}`: {_NOT_READ}{_hint(place)}")
         or f"`{place}` holds {', '.join(f'`{name}`' for name in names[:4])}; expected a 7-Scenes folder "
         "(`frame-XXXXXX.color.png`), a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of "
         f"`vggtgeo data list`, or a folder of images{_hint(place)}{'; ' if dead else ''}{dead}"
