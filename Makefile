@@ -18,7 +18,7 @@ export PYTHONDONTWRITEBYTECODE :=
 CORE    := tests/bundle/test_packing.py tests/bundle/test_solve.py tests/bundle/test_properties.py tests/evaluation/test_report.py tests/geometry/test_point_cloud.py \
 	tests/figures/test_plots.py tests/cli/test_settings_file.py
 
-.PHONY: help venv demo test test-long test-slow test-lowest test-newest test-more fuzz fuzz-parsers fuzz-decoders docs audit sbom release lint types format lock clean
+.PHONY: help venv demo test test-long test-slow test-lowest test-newest test-more fuzz docs audit sbom release lint types format lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -44,16 +44,9 @@ test-long: $(READY)  ## run the tests that compile for long: derivatives, whole 
 test-slow: $(READY)  ## run the slow tests: real clips, long sequences
 	$(BIN)/python -m pytest -m slow $(ARGS)
 
-fuzz: $(READY)  ## try COUNT=2000 random problems, geometries and damaged files of each kind, others than the tests do
+fuzz: $(READY)  ## try COUNT=2000 random problems and geometries, others than the tests do
 	VGGTGEO_FUZZ=$(COUNT) $(BIN)/python -m pytest -m "not slow" $(or $(ARGS),tests/bundle/test_properties.py \
-		tests/geometry/test_geometry_properties.py tests/test_mutated_files.py)
-
-fuzz-parsers: $(READY)  ## fuzz each parser for TIME=60 seconds, guided by coverage (Linux); ARGS='"EuRoC camera" problem' for some
-	$(BIN)/python -m pip install --quiet "atheris>=3"
-	$(BIN)/python tests/fuzz_parsers.py --seconds $(TIME) $(ARGS)
-
-fuzz-decoders: $(READY)  ## damage images, videos, bags and networks for TIME=60 seconds each (Linux); ARGS='TIFF bag' for some
-	$(BIN)/python tests/fuzz_decoders.py --seconds $(TIME) $(ARGS)
+		tests/geometry/test_geometry_properties.py)
 
 # Newer packages below ours warn of what older ones of ours do: those warnings are not what is asked here.
 test-lowest: $(READY)  ## test the core with the lowest versions that pyproject.toml allows, in an environment of its own

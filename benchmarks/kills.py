@@ -22,7 +22,7 @@ from pathlib import Path
 
 from vggtgeo.results.checkpoints import CHECKPOINT
 from vggtgeo.simulation import simulate
-from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.simulation.sequence import write_tum_folder
 
 PROGRAM = "from vggtgeo.cli import main; main()"
 SMALL = ("window.size=4", "window.point_slots=96", "window.line_slots=48", "window.window_iterations=8")

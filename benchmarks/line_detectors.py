@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from vggtgeo.models.classical import LsdDetector
 from vggtgeo.models.onnx.contracts import MLSD
-from vggtgeo.models.onnx.mlsd import MlsdDetector
+from vggtgeo.models.onnx.line_detectors import MlsdDetector
 from vggtgeo.models.onnx.session import open_session
 from vggtgeo.models.roles import LineDetector, Segments
 

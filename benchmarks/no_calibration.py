@@ -26,8 +26,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import vggtgeo as vg
-from vggtgeo.datasets.reduced import ReducedSequence
-from vggtgeo.datasets.views import SequenceView
+from vggtgeo.datasets.views import ReducedSequence, SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 

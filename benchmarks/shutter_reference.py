@@ -28,7 +28,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.mapping.tracks import Tracks
 from vggtgeo.results.scene import Scene
-from vggtgeo.simulation.rolling_rows import camera_velocities
+from vggtgeo.simulation.degradations import camera_velocities
 from vggtgeo.slam.camera.rolling_shutter import image_shift
 
 SOFT = 2.0

@@ -21,9 +21,9 @@ def denied(*arguments, **options):
 
 socket.socket.connect = socket.socket.connect_ex = socket.socket.bind = denied
 socket.create_connection = socket.getaddrinfo = denied
-import vggtgeo.results.run_callbacks, vggtgeo.slam.window_recorder
+import vggtgeo.results.tracking_loop, vggtgeo.slam.window_recorder
 import vggtgeo.slam.callback, vggtgeo.viewing.callback
-vggtgeo.results.run_callbacks.warm_up = lambda settings, metric: ()
+vggtgeo.results.tracking_loop.warm_up = lambda settings, metric: ()
 vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up = lambda self: None
 vggtgeo.slam.callback.Callback.on_warm_up = lambda self: None
 vggtgeo.viewing.callback.RerunCallback.on_warm_up = lambda self: None

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from vggtgeo.simulation import simulate
-from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.simulation.sequence import write_tum_folder
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 LONGEST_CELL = 25

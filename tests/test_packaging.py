@@ -12,7 +12,8 @@ from zipfile import ZipFile
 
 import pytest
 from conftest import ROOT
-from vggtgeo.models.extras import install_hint
+
+from vggtgeo.io.errors import install_hint
 
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "vggtgeo", "solvers", "models")
 
@@ -46,7 +47,7 @@ def test_every_hint_to_install_names_an_extra_that_is_there() -> None:
     assert asked == {"bags", "bench", "cluster", "export", "fetch", "gpu", "maps", "phones", "viewer"}
     known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     assert asked <= set(known)
-    assert [name for name, text in texts.items() if "pip install" in text] == ["extras.py"]
+    assert [name for name, text in texts.items() if "pip install" in text] == ["errors.py"]
     assert "`pip install -e '.[gpu]'` in a clone" in install_hint("gpu")
     assert any(package.startswith("jupyterlab") for package in known["notebooks"])
 

@@ -3,17 +3,13 @@
 from vggtgeo.models.classical.depth import NoDepth, SensorDepth
 from vggtgeo.models.classical.flow import PatchFlow
 from vggtgeo.models.classical.guided_search import can_search, search_around, search_near, search_tree
-from vggtgeo.models.classical.line_detector import LsdDetector
 from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
-from vggtgeo.models.classical.line_matcher import BandLineMatcher
+from vggtgeo.models.classical.lines import BandLineMatcher, LsdDetector
 from vggtgeo.models.classical.manhattan import ManhattanEstimator, ManhattanView, nearest_frame
-from vggtgeo.models.classical.orb import OrbMatcher
-from vggtgeo.models.classical.pixel_matcher import match_pixels
+from vggtgeo.models.classical.pixel_matcher import OrbMatcher, SiftMatcher, match_pixels
 from vggtgeo.models.classical.place import place_vector
-from vggtgeo.models.classical.pnp import ConstantVelocity, PnpGeometry
-from vggtgeo.models.classical.pose_refinement import pose_information
+from vggtgeo.models.classical.pnp import ConstantVelocity, PnpGeometry, pose_information
 from vggtgeo.models.classical.sample_order import SampleOrder, in_order
-from vggtgeo.models.classical.sift import SiftMatcher
 from vggtgeo.models.classical.structure_tensor import StructureTensor
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.two_view import TwoViewStart

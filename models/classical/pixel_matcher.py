@@ -1,11 +1,17 @@
-"""Match key points by unit descriptors: shared by SIFT, ORB, ALIKE and XFeat."""
+"""Point matches by unit descriptors of key points.
+
+SIFT (Lowe 2004; RootSIFT distances, Arandjelovic and Zisserman 2012), ORB (Rublee et al. 2011), an order of magnitude
+faster and less exact, and networks (ALIKE, XFeat).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
+import cv2
 import numpy as np
-from vggtgeo.models.checks import check_array, check_fields
+from vggtgeo.models.checks import check_array, check_fields, check_image
 from vggtgeo.models.classical.nearest import exclude_far, mutual_nearest
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
@@ -77,3 +83,105 @@ def confidence_of(clarity: np.ndarray) -> np.ndarray:
     the share of wrong matches from 12 % to below 1 %.
     """
     return np.clip(1.0 - clarity**2, 0.02 ** (2 / 3), 1.0) ** 1.5
+
+
+def spread(pixels: np.ndarray, scores: np.ndarray, count: int, size: tuple[int, int], cells: int = 10) -> np.ndarray:
+    """Return indices (int [<= count], best first) of key points that are strong and cover the image.
+
+    The image has a grid of square cells, `cells` columns. Points are taken in rounds: the strongest of every cell, then
+    the second strongest of every cell, and so on. So a poor region keeps its points, and a rich one loses its weakest.
+    Cost: one sort.
+
+    pixels: float [M, 2]. scores: float [M]. size: (width, height) of the image.
+    """
+    if not len(pixels):
+        return np.zeros(0, dtype=np.int64)
+    cell = max(size[0] / cells, 1.0)
+    columns, rows = (pixels // cell).astype(np.int64).T
+    bucket = rows * (cells + 1) + columns
+    order = np.lexsort((-scores, bucket))
+    starts = np.flatnonzero(np.diff(bucket[order], prepend=bucket[order[0]] - 1))
+    lengths = np.diff(starts, append=len(order))
+    rank = np.arange(len(order)) - np.repeat(starts, lengths)
+    return order[np.lexsort((-scores[order], rank))][:count]
+
+
+@dataclass(frozen=True)
+class OrbMatcher(PixelMatcher):
+    """ORB key points spread over the image, mutual Hamming matches, verified epipolar geometry.
+
+    ratio: maximum ratio of the square roots of the best and the second-best Hamming distance. Other fields:
+    `PixelMatcher`.
+    """
+
+    @cached_property
+    def _orb(self) -> cv2.ORB:
+        # Twice the points, so that `spread` has a choice.
+        return cv2.ORB_create(nfeatures=2 * self.count, fastThreshold=10)
+
+    def describe(self, image: np.ndarray) -> Features:
+        """Return key points and binary vectors of `image` (uint8 [H, W, 3]); none on a blank image."""
+        check_image("image", image)
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        points, bits = self._orb.detectAndCompute(gray, None)
+        pixels = np.array([p.pt for p in points], dtype=np.float64).reshape(-1, 2)
+        scores = np.array([p.response for p in points], dtype=np.float64)
+        keep = spread(pixels, scores, self.count, gray.shape[::-1])
+        bits = np.zeros((0, 32), np.uint8) if bits is None else bits[keep]
+        return Features(pixels[keep], scores[keep], PixelDescriptors(_signs(bits), gray))
+
+
+def _signs(bits: np.ndarray) -> np.ndarray:
+    """256 bits as a unit vector of signs, so that an inner product s is a Hamming distance: 128 (1 - s)."""
+    return (np.unpackbits(bits, axis=1).astype(np.float32) * 2.0 - 1.0) / 16.0
+
+
+@dataclass(frozen=True)
+class SiftMatcher(PixelMatcher):
+    """SIFT key points spread over the image, mutual RootSIFT matches, verified epipolar geometry.
+
+    contrast: detection threshold; a smaller one finds more and fainter points. area: maximum number of pixels for
+    detection; larger images are reduced, and the refinement at full resolution makes up for it (640 x 480: half the
+    time for the same trajectory error). Other fields: `PixelMatcher`.
+    """
+
+    ratio: float = 0.85
+    contrast: float = 0.005
+    area: int = 172_800
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_fields(self, area="[10000, inf)")
+
+    @cached_property
+    def _sift(self) -> cv2.SIFT:
+        # The precise upscale removes the quarter-pixel shift that the doubled first octave brings in.
+        return cv2.SIFT_create(contrastThreshold=self.contrast, enable_precise_upscale=True)
+
+    def describe(self, image: np.ndarray) -> Features:
+        """Return key points and RootSIFT vectors of `image` (uint8 [H, W, 3]); none on a blank image."""
+        check_image("image", image)
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        small, ratio = _shrunk(gray, self.area)
+        points, vectors = self._sift.detectAndCompute(small, None)
+        # Pixel centres, not corners, are integers: hence the halves.
+        pixels = (np.array([p.pt for p in points], dtype=np.float64).reshape(-1, 2) + 0.5) * ratio - 0.5
+        scores = np.array([p.response for p in points], dtype=np.float64)
+        keep = spread(pixels, scores, self.count, gray.shape[::-1])
+        vectors = np.zeros((0, 128), np.float32) if vectors is None else vectors[keep]
+        return Features(pixels[keep], scores[keep], PixelDescriptors(_root(vectors), gray))
+
+
+def _root(vectors: np.ndarray) -> np.ndarray:
+    """RootSIFT: the square root of L1-normalised histograms has unit length and compares by Hellinger's kernel."""
+    total = np.maximum(vectors.sum(axis=1, keepdims=True), 1e-7)
+    return np.sqrt(vectors / total)
+
+
+def _shrunk(gray: np.ndarray, area: int) -> tuple[np.ndarray, np.ndarray]:
+    """`gray` with at most about `area` pixels, and how many of its own pixels a new one spans, float [2] (x, y)."""
+    scale = np.sqrt(area / gray.size)
+    if scale >= 1.0:
+        return gray, np.ones(2)
+    size = tuple(max(round(side * scale), 1) for side in gray.shape[::-1])
+    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.array(gray.shape[::-1]) / size

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from vggtgeo.models.exporters.attention import as_module
 from vggtgeo.models.exporters.checkout import Checkout, import_from, stand_in
-from vggtgeo.models.exporters.module import as_module
-from vggtgeo.models.exporters.packages import load
-from vggtgeo.models.exporters.request import Graph, Request
+from vggtgeo.models.exporters.request import Graph, Request, load
 from vggtgeo.models.exporters.weights import fill, seed
 
 CHECKOUT = Checkout("Shiaoming/ALIKE", "alnet.py", ("alnet",))

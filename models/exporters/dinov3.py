@@ -14,12 +14,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from vggtgeo.models.exporters.attention import attention_replaced
+from vggtgeo.models.exporters.attention import as_module, attention_replaced, halve_blocks
 from vggtgeo.models.exporters.checkout import Checkout, import_from
-from vggtgeo.models.exporters.half import halve_blocks
-from vggtgeo.models.exporters.module import as_module
-from vggtgeo.models.exporters.packages import load
-from vggtgeo.models.exporters.request import Graph, Request
+from vggtgeo.models.exporters.request import Graph, Request, load
 from vggtgeo.models.exporters.weights import fill, seed
 
 CHECKOUT = Checkout("facebookresearch/dinov3", "dinov3/hub/backbones.py", ("dinov3",))

@@ -17,7 +17,6 @@ import io
 import logging
 import os
 import shutil
-import sys
 import tempfile
 import time
 import warnings
@@ -27,11 +26,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from vggtgeo.models.exporters.packages import check_all, load
 from vggtgeo.models.exporters.recipes import Recipe
-from vggtgeo.models.exporters.request import ExportError, Graph, Request
+from vggtgeo.models.exporters.request import ExportError, Graph, Request, check_all, load
 from vggtgeo.models.exporters.weights import identity, read_checkpoint
 from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, METADATA_WEIGHTS, PARITY_SUFFIX
+
+from vggtgeo.io.peak_memory import peak_memory_gb
 
 OPSET = 20
 TOLERANCE = 1e-3
@@ -99,17 +99,8 @@ def export(
         megabytes = sum(file.stat().st_size for file in folder.glob(f"{output.name}*") if file.suffix != ".npz") / 1e6
         _move(folder, output)
     seconds = time.perf_counter() - started
-    memory = _peak_memory_gb()
+    memory = peak_memory_gb()
     return Report(output, recipe.network, weights, parameters, rewrite, parity, megabytes, seconds, latency, memory)
-
-
-def _peak_memory_gb() -> float:
-    """GiB; NaN on Windows, which has no `resource`. macOS counts bytes, others KiB."""
-    if sys.platform == "win32":
-        return float("nan")
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from vggtgeo.models.exporters.attention import as_module, fix_positions, grid, halve_blocks
 from vggtgeo.models.exporters.checkout import Checkout, import_from
-from vggtgeo.models.exporters.half import halve_blocks
-from vggtgeo.models.exporters.module import as_module
-from vggtgeo.models.exporters.packages import load
-from vggtgeo.models.exporters.request import Graph, Request
-from vggtgeo.models.exporters.rotary import fix_positions, grid
+from vggtgeo.models.exporters.request import Graph, Request, load
 from vggtgeo.models.exporters.weights import fill, require_random, seed
 
 CHECKOUT = Checkout(

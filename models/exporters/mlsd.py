@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from vggtgeo.models.exporters.attention import as_module
 from vggtgeo.models.exporters.checkout import Checkout, import_from
-from vggtgeo.models.exporters.module import as_module
-from vggtgeo.models.exporters.packages import load
-from vggtgeo.models.exporters.request import Graph, Request
+from vggtgeo.models.exporters.request import Graph, Request, load
 from vggtgeo.models.exporters.weights import fill, seed
 
 CHECKOUT = Checkout("lhwcv/mlsd_pytorch", "models/mbv2_mlsd_tiny.py", ("models",))

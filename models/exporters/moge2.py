@@ -18,11 +18,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from vggtgeo.models.exporters.attention import as_module, halve_blocks
 from vggtgeo.models.exporters.checkout import Checkout, import_from, stand_in
-from vggtgeo.models.exporters.half import halve_blocks
-from vggtgeo.models.exporters.module import as_module
-from vggtgeo.models.exporters.packages import load
-from vggtgeo.models.exporters.request import ExportError, Graph, Request
+from vggtgeo.models.exporters.request import ExportError, Graph, Request, load
 from vggtgeo.models.exporters.weights import fill, read_checkpoint, seed
 
 CHECKOUT = Checkout("microsoft/MoGe", "moge/model/v2.py", ("moge",))

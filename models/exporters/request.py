@@ -1,13 +1,16 @@
-"""What is asked of an exporter, and what one that builds a network gives back."""
+"""The request and the result of an exporter, and the optional packages that it needs."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from vggtgeo.io.errors import install_hint
 
 
 class ExportError(ValueError):
@@ -53,3 +56,19 @@ class Graph:
     module: Any
     inputs: Mapping[str, np.ndarray]
     published: Mapping[str, np.ndarray]
+
+
+def load(name: str) -> Any:
+    """Return the package `name`; raise `ExportError` naming the extra if it, or a dependency, is missing."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise ExportError(
+            f"exporting needs the package `{error.name}`, which is not installed; {install_hint('export')}"
+        ) from None
+
+
+def check_all() -> None:
+    """Raise `ExportError` unless everything that an export needs is installed; before any work begins."""
+    for name in ("torch", "onnx", "onnxscript", "onnxruntime"):
+        load(name)

@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.models.exporters.packages import load
-from vggtgeo.models.exporters.request import ExportError, Request
+from vggtgeo.models.exporters.request import ExportError, Request, load
 
 _NAMED = 12
 """How many missing or superfluous weights an error names."""

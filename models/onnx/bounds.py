@@ -7,8 +7,9 @@ no segment, no view), and counted for the verdict. A network that fails to run s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 from vggtgeo.models.classical.depth import no_depth
@@ -31,6 +32,8 @@ from vggtgeo.models.roles import (
     WindowGuess,
 )
 
+_Role = TypeVar("_Role")
+_Answer = TypeVar("_Answer")
 NEAREST, FARTHEST = 0.05, 100.0
 """Minimum and maximum depth of an indoor world, a sports hall included, metres."""
 AVERAGE = 0.5
@@ -62,11 +65,24 @@ class Refusals:
 
 
 @dataclass(frozen=True, eq=False)
-class BoundedDepth:
-    """A `MetricDepth` with depth between `NEAREST` and `FARTHEST` and a positive deviation."""
+class _Bounded(Generic[_Role]):
+    """A role whose answers are checked."""
 
-    source: MetricDepth
+    source: _Role
     refusals: Refusals = field(default_factory=Refusals)
+
+    def _asked(self, ask: Callable[[], _Answer], values: int = 1) -> _Answer | None:
+        """Return an answer; None, with so many values counted as refused, if the network gives none."""
+        try:
+            return ask()
+        except NetworkValueError:
+            self.refusals.note(values, values, left=False)
+            return None
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedDepth(_Bounded[MetricDepth]):
+    """A `MetricDepth` with depth between `NEAREST` and `FARTHEST` and a positive deviation."""
 
     def estimate(
         self,
@@ -75,10 +91,8 @@ class BoundedDepth:
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
         """See `MetricDepth.estimate`."""
-        try:
-            found = self.source.estimate(image, sensor_depth, intrinsics)
-        except NetworkValueError:
-            self.refusals.note(image[..., 0].size, image[..., 0].size, left=False)
+        found = self._asked(lambda: self.source.estimate(image, sensor_depth, intrinsics), image[..., 0].size)
+        if found is None:
             return no_depth(image.shape[:2])
         with np.errstate(invalid="ignore"):
             given = np.isfinite(found.depth)
@@ -95,19 +109,14 @@ class BoundedDepth:
 
 
 @dataclass(frozen=True, eq=False)
-class BoundedConfidence:
+class BoundedConfidence(_Bounded[DenseConfidence]):
     """A `DenseConfidence` in [0, 1]; `AVERAGE` where that of the source is invalid."""
-
-    source: DenseConfidence
-    refusals: Refusals = field(default_factory=Refusals)
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         """See `DenseConfidence.confidence`."""
         average = np.full(image.shape[:2], AVERAGE, np.float32)
-        try:
-            found = self.source.confidence(image)
-        except NetworkValueError:
-            self.refusals.note(average.size, average.size, left=False)
+        found = self._asked(lambda: self.source.confidence(image), average.size)
+        if found is None:
             return average
         with np.errstate(invalid="ignore"):
             good = np.isfinite(found) & (found >= 0) & (found <= 1)
@@ -116,18 +125,13 @@ class BoundedConfidence:
 
 
 @dataclass(frozen=True, eq=False)
-class BoundedLines:
+class BoundedLines(_Bounded[LineDetector]):
     """A `LineDetector` with segments inside the image."""
-
-    source: LineDetector
-    refusals: Refusals = field(default_factory=Refusals)
 
     def detect(self, image: np.ndarray) -> Segments:
         """See `LineDetector.detect`."""
-        try:
-            found = self.source.detect(image)
-        except NetworkValueError:
-            self.refusals.note(1, 1, left=False)
+        found = self._asked(lambda: self.source.detect(image))
+        if found is None:
             return Segments(np.zeros((0, 2, 2)), np.zeros(0))
         inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
         good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
@@ -136,18 +140,13 @@ class BoundedLines:
 
 
 @dataclass(frozen=True, eq=False)
-class BoundedLineMatcher:
+class BoundedLineMatcher(_Bounded[LineMatcher]):
     """A `LineMatcher` without segments for an image on which its network failed."""
-
-    source: LineMatcher
-    refusals: Refusals = field(default_factory=Refusals)
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
         """See `LineMatcher.describe`."""
-        try:
-            found = self.source.describe(image, segments)
-        except NetworkValueError:
-            self.refusals.note(1, 1, left=False)
+        found = self._asked(lambda: self.source.describe(image, segments))
+        if found is None:
             return LineFeatures(Segments(np.zeros((0, 2, 2)), np.zeros(0)))
         self.refusals.note(1, 0, left=True)
         return found
@@ -163,48 +162,35 @@ class BoundedLineMatcher:
 
 
 @dataclass(frozen=True, eq=False)
-class BoundedPoints:
+class BoundedPoints(_Bounded[PointMatcher]):
     """A `PointMatcher` without matches if its network fails; bounds are checked by `PointMatches`."""
-
-    source: PointMatcher
-    refusals: Refusals = field(default_factory=Refusals)
 
     def describe(self, image: np.ndarray) -> Features:
         """See `PointMatcher.describe`."""
-        try:
-            return self.source.describe(image)
-        except NetworkValueError:
-            self.refusals.note(1, 1, left=False)
-            return Features(np.zeros((0, 2)), np.zeros(0))
+        found = self._asked(lambda: self.source.describe(image))
+        return Features(np.zeros((0, 2)), np.zeros(0)) if found is None else found
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
         """See `PointMatcher.match`."""
         none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
         if not (len(features_i) and len(features_j)):
             return PointMatches(none, none, nowhere, nowhere, np.zeros(0))
-        try:
-            found = self.source.match(features_i, features_j, predicted)
-        except NetworkValueError:
-            self.refusals.note(1, 1, left=False)
+        found = self._asked(lambda: self.source.match(features_i, features_j, predicted))
+        if found is None:
             return PointMatches(none, none, nowhere, nowhere, np.zeros(0))
         self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
         return found
 
 
 @dataclass(frozen=True, eq=False)
-class BoundedWindow:
+class BoundedWindow(_Bounded[WindowGeometry]):
     """A `WindowGeometry` that fails for values that are not finite; views with values out of bounds are not found."""
-
-    source: WindowGeometry
-    refusals: Refusals = field(default_factory=Refusals)
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
         """See `WindowGeometry.window`."""
         count, size = len(images), images[0].shape[:2]
-        try:
-            found = self.source.window(images, intrinsics)
-        except NetworkValueError:
-            self.refusals.note(count, count, left=False)
+        found = self._asked(lambda: self.source.window(images, intrinsics), count)
+        if found is None:
             focal, (height, width) = float(max(size)), size
             camera = np.array([focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)])
             return WindowGuess(

@@ -7,7 +7,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from vggtgeo.models.onnx.providers import warn_once
@@ -18,21 +17,6 @@ from vggtgeo.io.persistence import Format
 
 Outputs = dict[str, np.ndarray]
 _FORMAT = Format("network output", 1, {})
-
-
-@runtime_checkable
-class OutputCache(Protocol):
-    """Keeps arrays that networks computed."""
-
-    def get(
-        self,
-        sessions: Sequence[Session],
-        settings: tuple[object, ...],
-        images: Sequence[np.ndarray],
-        compute: Callable[[], Outputs],
-    ) -> Outputs:
-        """Return the output for these networks, settings and images (uint8 [H, W, 3]); call `compute` if it is new."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +33,7 @@ class MemoryCache:
         images: Sequence[np.ndarray],
         compute: Callable[[], Outputs],
     ) -> Outputs:
-        """Return an output as `OutputCache.get`."""
+        """Return the output for these networks, settings and images (uint8 [H, W, 3]); call `compute` if it is new."""
         key = key_of([str(id(session)) for session in sessions], settings, images)
         found = self._kept.pop(key, None)
         if found is None:
@@ -77,7 +61,7 @@ class FolderCache:
         images: Sequence[np.ndarray],
         compute: Callable[[], Outputs],
     ) -> Outputs:
-        """Return an output as `OutputCache.get`; networks are identified by the SHA-256 of their files."""
+        """Return an output as `MemoryCache.get`; networks are identified by the SHA-256 of their files."""
         key = key_of([session.digest for session in sessions], settings, images)
         path = self.folder / key[:2] / f"{key}.npz"
         found = _read(path)
@@ -89,6 +73,9 @@ class FolderCache:
                 reason = error.strerror or error
                 warn_once(f"network outputs cannot be cached in `{self.folder}` ({reason}); the run continues")
         return found
+
+
+OutputCache = MemoryCache | FolderCache
 
 
 def key_of(networks: Sequence[str], settings: tuple[object, ...], images: Sequence[np.ndarray]) -> str:

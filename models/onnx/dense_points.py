@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_image
-from vggtgeo.models.classical.key_points import spread
-from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher, spread
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 from vggtgeo.models.onnx.session import Session

@@ -1,12 +1,17 @@
-"""Is this file the network it should be? Answered from its first bytes and its signature, before anything runs."""
+"""Checks of a network's file by its first bytes and its signature, before it runs.
+
+An entry of metadata or of external data is a protobuf message of a key (field 1) and a value (field 2), both text: a
+search for the key with its tags and length suffices, without a package for ONNX.
+"""
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vggtgeo.models.onnx.contracts import CONTRACTS, Contract, Patches, Tensor
+from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_WEIGHTS, RANDOM_WEIGHTS, Contract, Patches, Tensor
 
 
 class NetworkFileError(ValueError):
@@ -36,7 +41,7 @@ _STRANGERS = (
 )
 
 
-_MOST_BYTES = 2**31
+_MAX_BYTES = 2**31
 """What a protocol buffer may have; larger weights are in a file beside it."""
 
 
@@ -48,8 +53,8 @@ def check_looks_like_onnx(path: Path) -> None:
     with path.open("rb") as file:
         start = file.read(32)
     size = path.stat().st_size
-    if size > _MOST_BYTES:
-        raise NetworkFileError(f"`{path}` has {size} bytes; an ONNX file has at most {_MOST_BYTES}")
+    if size > _MAX_BYTES:
+        raise NetworkFileError(f"`{path}` has {size} bytes; an ONNX file has at most {_MAX_BYTES}")
     if not start:
         raise NetworkFileError(f"`{path}` is empty, expected an ONNX file; export or fetch it again")
     for mark, what in _STRANGERS:
@@ -151,3 +156,37 @@ def _token_counts(pairs: Sequence[tuple[Tensor, Signature]], letters: Mapping[st
                 if size != count:
                     wrong.append(f"`{tensor.name}` has {size} tokens, expected {count} ({expected})")
     return wrong
+
+
+def external_files(path: Path) -> list[Path]:
+    """Return the existing files of external data that the graph in `path` names, sorted by name."""
+    files = [path.parent / name for name in sorted(set(_values(path, "location")))]
+    return [file for file in files if file.parent == path.parent and _is_there(file)]
+
+
+def _is_there(file: Path) -> bool:
+    try:
+        return file.is_file()
+    except OSError:  # a damaged name may be longer than a file system takes
+        return False
+
+
+def has_random_weights(path: Path) -> bool:
+    """Return whether the file says that its weights were drawn at random, as an export for tests does."""
+    return RANDOM_WEIGHTS in _values(path, METADATA_WEIGHTS)
+
+
+def _values(path: Path, key: str) -> list[str]:
+    """Return the values of all entries with this key. A value is shorter than 128 bytes: its length is one byte."""
+    mark = b"\x0a" + bytes([len(key)]) + key.encode() + b"\x12"
+    if not path.stat().st_size:
+        return []
+    found = []
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        place = content.find(mark)
+        while place >= 0:
+            start = place + len(mark)
+            length = content[start] if start < len(content) else 0
+            found.append(content[start + 1 : start + 1 + length].decode(errors="replace"))
+            place = content.find(mark, start)
+    return found

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-_MOST_STRETCH = 1.05
+_MAX_STRETCH = 1.05
 _BORDER = (127, 127, 127)
 
 
@@ -28,7 +28,7 @@ class Fit:
         """Return the fit: stretched if that changes the aspect by less than 5 %, else with a border."""
         (height, width), (rows, columns) = image_size, network_size
         across, down = columns / width, rows / height
-        if max(across, down) <= _MOST_STRETCH * min(across, down):
+        if max(across, down) <= _MAX_STRETCH * min(across, down):
             return cls(image_size, network_size, network_size)
         factor = min(across, down)
         content = max(1, min(rows, round(factor * height))), max(1, min(columns, round(factor * width)))

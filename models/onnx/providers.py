@@ -11,8 +11,9 @@ from importlib import metadata
 from typing import Literal
 
 import onnxruntime
-from vggtgeo.models.extras import install_hint, put_back_hint
 from vggtgeo.models.onnx.file_checks import NetworkFileError
+
+from vggtgeo.io.errors import install_hint, put_back_hint
 
 GPU_PACKAGE = "onnxruntime-gpu"
 Provider = Literal["auto", "cuda", "cpu"]

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
+import threading
 import time
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +25,9 @@ from vggtgeo.models.onnx.file_checks import (
     Signatures,
     check_looks_like_onnx,
     check_signature,
+    external_files,
     wrong_sizes,
 )
-from vggtgeo.models.onnx.graph_bytes import external_files
-from vggtgeo.models.onnx.patience import Call, watched
 from vggtgeo.models.onnx.providers import (
     CUDA_OPTIONS,
     NAMES,
@@ -154,11 +156,10 @@ class Session:
             binding.bind_ortvalue_input(name, self._on_device(name, value))
         for name in names:
             binding.bind_output(name, self.provider, 0)
-        with watched(self.path) as call:
-            try:
-                call.run(partial(self.session.run_with_iobinding, binding, call.options))
-            except _RUNTIME_ERRORS as error:
-                raise NetworkRunError(self._why_failed(call, error)) from None
+        try:
+            _run_beside(self.session, binding)
+        except _RUNTIME_ERRORS as error:
+            raise NetworkRunError(f"`{self.path}` failed on {self.provider}: {error}") from None
         self.tally.calls += 1
         self.tally.seconds += time.perf_counter() - began
         found = dict(zip(names, map(DeviceArray, binding.get_outputs()), strict=True))
@@ -180,14 +181,6 @@ class Session:
             self.run({name: noise.uniform(size=shape) for name, shape in fixed.items()})
             self.tally.calls, self.tally.seconds = 0, 0.0
 
-    def _why_failed(self, call: Call, error: Exception) -> str:
-        if call.ended:
-            return (
-                f"`{self.path}` was ended after {call.seconds:.0f} s without a result: it may have an endless loop; "
-                "export it again, or give smaller images"
-            )
-        return f"`{self.path}` failed on {self.provider}: {error}"
-
     def _check_sizes(self, inputs: Mapping[str, Input], found: Mapping[str, DeviceArray]) -> None:
         given = {
             name: array.shape if isinstance(array, DeviceArray) else np.shape(array) for name, array in inputs.items()
@@ -205,6 +198,32 @@ class Session:
         array = np.ascontiguousarray(value, dtype=self.inputs[name].dtype)
         # `ascontiguousarray` makes a scalar an array of one.
         return onnxruntime.OrtValue.ortvalue_from_numpy(array.reshape(np.shape(value)), self.provider, 0)
+
+
+def _run_beside(session: onnxruntime.InferenceSession, binding: Any) -> None:
+    """Run a network; for the main thread in another one, so that Ctrl-C ends it between two nodes of the graph: Python
+    handles signals only in the main thread, and not while compiled code runs there.
+    """
+    options = onnxruntime.RunOptions()
+    options.log_severity_level = 4  # the exception reports what is wrong, once
+    if threading.current_thread() is not threading.main_thread():
+        session.run_with_iobinding(binding, options)
+        return
+    try:
+        _beside().submit(session.run_with_iobinding, binding, options).result()
+    except BaseException:  # whatever a signal raises
+        options.terminate = True
+        raise
+
+
+@cache
+def _beside() -> ThreadPoolExecutor:
+    """Return the thread for calls of the main thread; one only, since CUDA keeps memory for each calling thread."""
+    return ThreadPoolExecutor(1, thread_name_prefix="network")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_beside.cache_clear)  # a forked process lacks the thread
 
 
 def open_session(

@@ -11,7 +11,7 @@ import numpy as np
 from vggtgeo.models.onnx.contracts import Patches, Tensor
 from vggtgeo.models.onnx.file_checks import NetworkFileError, Signature
 from vggtgeo.models.onnx.fit import Fit, at_multiples
-from vggtgeo.models.onnx.mlsd import prepare
+from vggtgeo.models.onnx.line_detectors import prepare
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.onnx.vggt import WIDTH
 

@@ -12,11 +12,7 @@ depend on the seed and the frames alone, not on the order of calls.
 | `WindowGeometry` | `SimulatedVggt` | VGGT |
 """
 
-from vggtgeo.models.stubs.confidence import SimulatedDino
-from vggtgeo.models.stubs.depth import SimulatedMoge
-from vggtgeo.models.stubs.lines import SimulatedLetr
-from vggtgeo.models.stubs.matches import SimulatedMast3r
-from vggtgeo.models.stubs.oracle import Oracle
+from vggtgeo.models.stubs.perception import Oracle, SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge
 from vggtgeo.models.stubs.window import SimulatedVggt
 
 __all__ = ["Oracle", "SimulatedDino", "SimulatedLetr", "SimulatedMast3r", "SimulatedMoge", "SimulatedVggt"]

@@ -9,8 +9,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.roles import GeometryResult, WindowGuess
-from vggtgeo.models.stubs.oracle import Oracle
-from vggtgeo.models.stubs.random_fields import SmoothField, check_settings, stream, weakness
+from vggtgeo.models.stubs.perception import Oracle, SmoothField, check_settings, stream, weakness
 
 _GRID = (12, 9)
 

@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 import tiny_suites as tiny
 from conftest import ROOT
+from reported import raises
 
 from vggtgeo.benchmark.cluster import Cluster, run_remotely
 from vggtgeo.benchmark.processes import Limits, claim_cores
 from vggtgeo.benchmark.runner import all_rows
 from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import NO_SPACE
-from vggtgeo.io.errors import InputError
 
 LIMITS = Limits(60.0, 2.0)
 SCRIPT = """
@@ -50,7 +50,7 @@ def command(folder: Path, scratch: Path) -> list[str]:
 
 def test_a_cluster_that_is_not_there_is_told(tmp_path: Path) -> None:
     # Proves one line for a wrong address, or for a package that is not installed.
-    with pytest.raises(InputError, match=r"no Ray cluster at|needs Ray"):
+    with raises("Ray"):
         all_rows(tiny.jobs(), Store(tmp_path, "t", "s"), LIMITS, cluster=Cluster("127.0.0.1:9"), command=command)
 
 
@@ -86,7 +86,7 @@ def test_a_node_without_space_ends_the_batch(tmp_path: Path, monkeypatch: pytest
         exceptions=SimpleNamespace(RayError=ConnectionError),
     )
     monkeypatch.setattr("vggtgeo.benchmark.cluster._connect", lambda _: ray)
-    with pytest.raises(InputError, match=r"no space left for the run `.*` \(No space left on device: 'map"):
+    with raises("No space left on device"):
         all_rows(
             tiny.jobs()[:1],
             store,

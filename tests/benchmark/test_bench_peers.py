@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 import tiny_suites as tiny
 from bench_rows import EXTERNAL, ROWS, row
+from reported import raises, warns
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.benchmark import markdown
-from vggtgeo.benchmark.common_time import subtract_baseline
 from vggtgeo.benchmark.external import external_rows, warn_of_missing
 from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.published import published
-from vggtgeo.benchmark.statistics import paired
+from vggtgeo.benchmark.runner import subtract_baseline
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row
+from vggtgeo.benchmark.table import Row, paired
 from vggtgeo.evaluation import comparability
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
 
 
 def test_other_systems_are_rows_of_their_own(tmp_path: Path) -> None:
@@ -97,7 +96,7 @@ def test_a_system_without_any_file_is_told_before_the_runs(tmp_path: Path) -> No
     # Proves that a misspelt place of other systems' trajectories is a warning, and one file is enough for none. Oracle:
     # that nothing is said where it is there (warnings are errors here).
     suite = tiny.suite(tiny.TEXT + EXTERNAL)
-    with pytest.warns(InputWarning, match=r"`other` .*`.*other/walk.txt`.*of 2"):
+    with warns("`other`", "other/walk.txt", 2):
         warn_of_missing(suite, tiny.jobs(), tmp_path)
     (tmp_path / "other").mkdir()
     (tmp_path / "other/hall.txt").touch()
@@ -123,5 +122,5 @@ def test_published_figures_have_source_and_protocol_and_stand_apart() -> None:
     other = markdown.published_table(published("averages"))
     assert "| SLAM3R* | - | - | 0.066 | - | - | Y. Liu et al., SLAM3R" in other
     assert "`-`: not published." in other
-    with pytest.raises(InputError, match=r"`published` .*`x`"):
+    with raises("`published`", "`x`"):
         published("x")

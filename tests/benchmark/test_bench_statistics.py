@@ -10,7 +10,7 @@ from scipy.stats import ttest_rel
 
 from vggtgeo.benchmark import cells, markdown
 from vggtgeo.benchmark.measure import between, trajectory_errors
-from vggtgeo.benchmark.statistics import Summary, paired
+from vggtgeo.benchmark.table import Summary, paired
 from vggtgeo.geometry.trajectory import Trajectory
 
 

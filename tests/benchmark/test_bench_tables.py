@@ -2,7 +2,6 @@
 
 import csv
 import io
-import os
 import runpy
 import sys
 from dataclasses import replace
@@ -115,19 +114,6 @@ def test_the_table_comes_back_from_csv_and_parquet(tmp_path: Path) -> None:
         for name in columns(rows):
             assert typed[name] == given.get(name)
             assert text[name] == ("" if given.get(name) is None else str(given[name]))
-
-
-def test_names_that_are_no_utf8_stand_in_every_table(tmp_path: Path) -> None:
-    # Proves that the name of a folder in a message does not end a batch whose runs are all done. Oracle: the texts.
-    parquet = pytest.importorskip("pyarrow.parquet", reason="PyArrow is not installed")
-    name = os.fsdecode(b"d" + bytes([255]))
-    failed = row("walk", "full", 0, None, status="error", message=f"no `x` in `{name}`")
-    folder = tmp_path / name
-    BenchReport(tiny.suite(), (failed,), folder).write(folder)
-    (folder / "runs.parquet").rename(tmp_path / "runs.parquet")
-    assert parquet.read_table(tmp_path / "runs.parquet").to_pylist()[0]["message"] == "no `x` in `d\ufffd`"
-    for name in ("runs.csv", "tables.md", "report.html"):
-        assert "no `x` in `d" in (folder / name).read_text(encoding="utf-8", errors="replace"), name
 
 
 def test_the_tables_say_what_makes_a_row_doubtful() -> None:

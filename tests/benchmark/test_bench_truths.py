@@ -9,17 +9,17 @@ import pytest
 import tiny_layouts as tiny
 import tiny_sequences
 import tiny_suites
+from reported import raises
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.benchmark.inputs import Input, open_input
 from vggtgeo.benchmark.jobs import jobs_of
-from vggtgeo.benchmark.map_errors import pooled_depth_errors, thinned
-from vggtgeo.benchmark.measure import measure
+from vggtgeo.benchmark.measure import measure, pooled_depth_errors, thinned
 from vggtgeo.evaluation import Similarity, pose_consistency
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.result import Result
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.verdict.finding import Verdict
@@ -86,7 +86,7 @@ def test_a_reference_is_read_before_the_run(tmp_path: Path) -> None:
     # as a path of twice the size fits after Sim(3).
     folder = tiny.tanks(tmp_path / "Ignatius", _walk())
     line = 'references = { twice = "twice.txt" }'
-    with pytest.raises(InputError, match=r"twice\.txt"):
+    with raises("twice.txt"):
         _given(folder, line)
     truth = _given(folder, "")[0].truth
     assert truth is not None
@@ -132,7 +132,7 @@ def test_a_recording_whose_depth_is_exact_has_errors_of_depth_map_and_mesh(tmp_p
     assert alone.exact is None  # nothing to compare with is no reason to run nothing
     wide = tiny_sequences.tum(tmp_path / "wide")
     tiny_sequences.write_calibration(wide, (*tiny_sequences.INTRINSICS, -0.3, 0.1, 0.0, 0.0))
-    with pytest.raises(InputError, match=r"`exact_depth` .*`wide`"):
+    with raises("`exact_depth`", "`wide`"):
         _given(wide, "exact_depth = true")
 
 
@@ -155,7 +155,7 @@ def test_nees_tells_whether_stated_deviations_are_those_of_the_errors(factor: fl
     place, rotation = pose_consistency(Trajectory(times, off), truth, sigma, turned, scale)
     assert place.mean / 3 == pytest.approx(factor**2, rel=0.15)
     assert rotation.mean / 3 == pytest.approx(factor**2, rel=0.15)
-    with pytest.raises(InputError, match="`place_sigma`"):
+    with raises("`place_sigma`"):
         pose_consistency(truth, truth, sigma[1:], turned[1:])
 
 

@@ -5,10 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import bad_files as bad
 import pytest
 
-from vggtgeo.cli.address_space import MIN_GB, check_address_space
+from vggtgeo.cli.environment import MIN_GB, check_address_space
 from vggtgeo.cli.main import COMMANDS
 
 
@@ -37,19 +36,6 @@ def test_memory_that_runs_out_is_told(tmp_path: Path) -> None:
     done = limited(2000, "simulate", "room", "--size", "8000x8000", "--frames", "2", "-o", tmp_path / "new")
     assert done.returncode == 2, done.stderr
     assert done.stderr.splitlines()[-1].startswith("error: not enough memory"), done.stderr
-
-
-def test_a_folder_that_is_gone_is_told(tmp_path: Path) -> None:
-    """The folder that a command is started in was removed meanwhile; it said that some file is not there, not which."""
-    bad.frames(tmp_path / "frames")
-    script = f"""
-import os
-os.mkdir({str(tmp_path / "gone")!r}); os.chdir({str(tmp_path / "gone")!r}); os.rmdir({str(tmp_path / "gone")!r})
-from vggtgeo.cli import main; main()"""
-    command = [sys.executable, "-c", script, "run", str(tmp_path / "frames"), "-o", "out"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr == "error: the working folder no longer exists; change to another (`cd`)\n"
 
 
 def test_each_command_of_the_table_is_one(monkeypatch: pytest.MonkeyPatch) -> None:

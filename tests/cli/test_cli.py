@@ -3,7 +3,6 @@
 import importlib.metadata
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -158,7 +157,7 @@ def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
     # Proves that the program computes in 64 bits, keeps compiled code in the user's cache folder, adjusts on the
     # processor, and, where it is told to use a GPU, leaves its memory to others.
     script = (
-        "from vggtgeo.cli.jax_flags import set_jax_flags; set_jax_flags(); import jax, os; "
+        "from vggtgeo.cli.environment import set_jax_flags; set_jax_flags(); import jax, os; "
         "print(jax.numpy.ones(1).dtype, jax.config.jax_compilation_cache_dir, "
         "jax.config.jax_persistent_cache_min_compile_time_secs, os.environ['XLA_PYTHON_CLIENT_PREALLOCATE'], "
         "jax.config.jax_platforms)"
@@ -250,87 +249,3 @@ def test_the_version_is_that_of_the_package() -> None:
     result = invoke("--version")
     assert result.exit_code == 0
     assert result.stdout == f"vggtgeo {importlib.metadata.version('vggtgeo')}\n"
-
-
-def test_a_device_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`JAX_PLATFORMS` of a device that JAX does not find was an internal error; oracle: the line."""
-
-    def raising(*_: object, **__: object) -> None:
-        raise AssertionError
-
-    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
-    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
-    monkeypatch.setattr(jax, "devices", raising)
-    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
-    assert result.exit_code == 2
-    assert result.stderr == "error: JAX finds no device for JAX_PLATFORMS=cuda; unset it, or use cpu\n"
-
-
-@pytest.mark.parametrize(
-    ("switch", "error", "code", "line"),
-    [
-        ("JAX_DEBUG_NANS", FloatingPointError("nan"), 2, "error: JAX_DEBUG_NANS makes every NaN an error"),
-        ("JAX_NUMPY_DTYPE_PROMOTION", RuntimeError("strict"), 1, "the environment sets .*JAX_NUMPY_DTYPE_PROMOTION"),
-    ],
-)
-def test_a_switch_of_jax_that_ends_a_command_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, switch: str, error: Exception, code: int, line: str
-) -> None:
-    """What the environment asks of JAX was an internal error without a word of it; oracle: the line."""
-
-    def raising(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setenv(switch, "1")
-    monkeypatch.setattr("vggtgeo.cli.timed_solve.load_problem", raising)
-    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
-    assert result.exit_code == code
-    assert re.search(line, result.stderr)
-
-
-def test_a_solve_without_compilation_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`JAX_DISABLE_JIT=1` was an internal error after all the work; oracle: the line, and that nothing is written."""
-    monkeypatch.setenv("JAX_DISABLE_JIT", "1")
-    result = invoke("solve", str(write(tmp_path)), "-o", str(tmp_path / "solution.npz"))
-    assert result.exit_code == 2
-    assert (
-        result.stderr == "error: the environment variable `JAX_DISABLE_JIT` is set, but `solve` needs JIT: unset it\n"
-    )
-    assert not (tmp_path / "solution.npz").exists()
-    assert invoke("data", "list").exit_code == 0
-
-
-def test_a_switch_of_jax_that_is_none_is_named(tmp_path: Path) -> None:
-    """`JAX_ENABLE_X64=maybe` was an internal error: JAX refuses it where it is imported; oracle: the line."""
-    command = [
-        sys.executable,
-        "-c",
-        "from vggtgeo.cli import main; main()",
-        "solve",
-        str(write(tmp_path)),
-        "-o",
-        "x.npz",
-    ]
-    environment = {**os.environ, "JAX_ENABLE_X64": "maybe"}
-    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
-    assert result.returncode == 2
-    assert result.stderr == "error: the environment variable `JAX_ENABLE_X64` is `maybe`; JAX expects true or false\n"
-
-
-@pytest.mark.parametrize(
-    ("flags", "unknown"),
-    [
-        ("--xla_cpu_multi_thread_eigen=false  --xla_nonsense=1", "--xla_nonsense"),
-        ("--xla_force_host_platform_device_count=2 --xla_cpu_enable_fast_math=false --xla_dump_to=/tmp/--x", None),
-        ("", None),
-    ],
-)
-def test_a_flag_that_xla_does_not_know_is_told(
-    flags: str, unknown: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """XLA itself ends the process in C++; flags that it knows pass. Oracle: the line."""
-    monkeypatch.setenv("XLA_FLAGS", flags)
-    result = CliRunner().invoke(make_app(), ["solve", "no.npz", "-o", "x.npz"])
-    assert result.exit_code == 2
-    told = f"the environment variable `XLA_FLAGS` has `{unknown}`, which jaxlib"
-    assert result.stderr.startswith(f"error: {told}" if unknown else "error: `no.npz` does not exist"), result.stderr

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny_sequences as tiny
 import typer
+from reported import warns
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -63,7 +64,7 @@ def test_a_run_in_metres_of_another_size_is_of_another_sequence(tmp_path: Path) 
     Trajectory(small.timestamps, poses).save_tum(tmp_path / "trajectory.txt")
     assert CliRunner().invoke(app, [str(tmp_path / "trajectory.txt"), str(truth)]).exit_code == 0
     (tmp_path / "summary.json").write_text(json.dumps({"scale": "metric, by the depth"}))
-    with pytest.warns(InputWarning, match="in metres, but the ground truth is 4 times as large"):
+    with warns(4):
         found = CliRunner().invoke(app, [str(tmp_path), str(truth)])
     assert found.exit_code == 3
     assert "NOT COMPARABLE" in found.output

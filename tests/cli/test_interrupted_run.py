@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
-from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.simulation.sequence import write_tum_folder
 
 FRAMES = 120
 PROGRAM = "from vggtgeo.cli import main; main()"

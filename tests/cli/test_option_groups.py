@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from vggtgeo.cli.option_groups import with_option_groups
+from vggtgeo.cli.options import with_option_groups
 
 
 @dataclass(frozen=True)

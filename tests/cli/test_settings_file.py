@@ -10,6 +10,7 @@ import bad_files as bad
 import pytest
 import typer
 from conftest import ROOT
+from reported import raises
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import COMMANDS, EXIT_INPUT, EXIT_INTERNAL, CommandEntry, load_command, make_app
@@ -142,7 +143,7 @@ def test_a_value_that_is_no_choice_is_refused(tmp_path: Path) -> None:
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     # Proves that the message names the flag and the file.
-    with pytest.raises(InputError, match=r"`--settings` is .*none.toml"):
+    with raises("--settings", "none.toml"):
         seen_by_the_command("clip", "--settings", str(tmp_path / "none.toml"))
 
 

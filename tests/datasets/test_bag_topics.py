@@ -13,9 +13,8 @@ from reported import raises
 
 from vggtgeo.datasets.bag_cameras import camera_of
 from vggtgeo.datasets.bag_images import image_of, metres_of
-from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, told
+from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, described_choice
 from vggtgeo.datasets.check import inspect
-from vggtgeo.io.errors import InputError
 
 PLACE = Path("a.bag, /c, 0")
 
@@ -65,7 +64,7 @@ def packed(kind: str, data: bytes = b"") -> Any:
 )
 def test_the_best_topics_are_chosen(topics: dict[str, str], colour: str, depth: str) -> None:
     # Proves colour before grey, infrared last, and never as depth, and registered depth before any other.
-    chosen = chosen_topics({name: raw(encoding) for name, encoding in topics.items()})
+    chosen = chosen_topics(PLACE, {name: raw(encoding) for name, encoding in topics.items()})
     assert (chosen.colour, chosen.depth) == (colour, depth)
     assert set(chosen.others) == set(topics) - {colour, depth}
 
@@ -74,25 +73,25 @@ def test_compressed_topics() -> None:
     # Proves that depth is known by its format, or by the name of its topic.
     colour = packed("bgr8; jpeg compressed bgr8")
     for name, kind in (("/d/image_raw/compressedDepth", COMPRESSED), ("/d/compressed", "16UC1; png compressed ")):
-        assert chosen_topics({name: packed(kind), "/c/compressed": colour}) == Chosen("/c/compressed", name, ())
+        assert chosen_topics(PLACE, {name: packed(kind), "/c/compressed": colour}) == Chosen("/c/compressed", name, ())
 
 
 def test_what_cannot_be_read_is_named() -> None:
     # Proves that the sentence has the topics with what they hold, since one encoding is all that is wrong.
     with raises("/a", "/d"):
-        chosen_topics({"/a": raw("64FC1"), "/d": raw("16UC1")})
-    with pytest.raises(InputError, match=r"its topics of images: none"):
-        chosen_topics({})
+        chosen_topics(PLACE, {"/a": raw("64FC1"), "/d": raw("16UC1")})
+    with raises("a.bag"):
+        chosen_topics(PLACE, {})
 
 
 def test_what_was_chosen_is_told() -> None:
     # Proves a sentence where there was a choice, and none where there was none.
     chosen = Chosen("/rgb", "/depth_registered", ("/depth", "/ir"))
-    assert told(chosen, "/gt") == (
+    assert described_choice(chosen, "/gt") == (
         "images of `/rgb`, depth of `/depth_registered`, truth of `/gt`; not read: `/depth`, `/ir`"
     )
-    assert told(Chosen("/rgb", "", ("/ir",)), "") == "images of `/rgb`, no depth; not read: `/ir`"
-    assert not told(Chosen("/rgb", "/depth", ()), "")
+    assert described_choice(Chosen("/rgb", "", ("/ir",)), "") == "images of `/rgb`, no depth; not read: `/ir`"
+    assert not described_choice(Chosen("/rgb", "/depth", ()), "")
 
 
 @pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import bad_files as bad
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from reported import raises, warns
 
 from vggtgeo.datasets import open_sequence, with_rate
 from vggtgeo.datasets.live import LiveCamera, is_live
-from vggtgeo.io.errors import GuessedCameraWarning, InputError
+from vggtgeo.io.errors import GuessedCameraWarning, LeftOutWarning
 from vggtgeo.results.source import Source
 
 
@@ -91,7 +92,7 @@ def test_a_rate_is_for_what_has_no_times(tmp_path: Path) -> None:
     folder = open_sequence(tiny_sequences.images(tmp_path / "images"), rate=5.0)
     assert [frame.timestamp for frame in folder.frames()] == pytest.approx([0.0, 0.2, 0.4])
     for write in (tiny.replica, tiny.euroc, tiny.kitti, tiny.arkit):
-        with pytest.raises(InputError, match="has times of its own"):
+        with raises("rate"):
             with_rate(tiny.quietly_opened(write(tmp_path / write.__name__)), 5.0)
 
 
@@ -99,3 +100,22 @@ def test_a_run_on_a_stream_has_no_total(tmp_path: Path) -> None:
     # Proves that an unknown length is told as None to what shows the progress. Oracle: the callback.
     stream = LiveCamera("webcam", CAMERA)
     assert Source("x", stream, None, CAMERA).count(0, None, 1) is None
+
+
+def test_a_video_goes_on_behind_damaged_data(tmp_path: Path) -> None:
+    """Damaged frames, and those predicted from them, are left out and counted, up to the next that stands alone (every
+    twelfth); all others are read. Oracle: the frames and times of the whole clip.
+    """
+    holed = open_sequence(bad.holed_video(tmp_path), "video")
+    whole = open_sequence(bad.video(tmp_path / "whole.mp4", 40, walk=True), "video")
+    with warns("clip.mp4", "12", "23", warning=LeftOutWarning) as told:
+        found = {frame.index: frame for frame in holed.frames()}
+    assert list(found) == [*range(12), *range(24, 40)]
+    assert sum(entry.message.frames for entry in told) == 12
+    for frame in whole.frames():
+        if frame.index in found:
+            assert frame.timestamp == pytest.approx(found[frame.index].timestamp)
+            np.testing.assert_array_equal(frame.image, found[frame.index].image)
+    with pytest.warns(LeftOutWarning) as told:
+        assert [frame.index for frame in holed.frames(1, 27, 4)] == [1, 5, 9, 25]
+    assert sum(entry.message.frames for entry in told) == 3

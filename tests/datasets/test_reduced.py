@@ -11,7 +11,7 @@ from reported import raises
 
 import vggtgeo as vg
 from vggtgeo.datasets.in_memory import frame_stream
-from vggtgeo.datasets.reduced import ReducedSequence, reduced, reduced_camera
+from vggtgeo.datasets.views import ReducedSequence, reduced, reduced_camera
 
 LARGE, MOST = (320, 240), 160 * 120
 

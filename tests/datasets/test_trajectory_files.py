@@ -8,7 +8,7 @@ from reported import raises, warns
 from scipy.spatial.transform import Rotation
 
 import vggtgeo as vg
-from vggtgeo.datasets.trajectory_files import load_trajectory
+from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import NoteWarning
 

@@ -15,7 +15,7 @@ from reported import raises, warns
 
 from vggtgeo.datasets import open_sequence, with_rate, without_depth
 from vggtgeo.datasets.check import inspect
-from vggtgeo.datasets.video_tracks import Track, choose_tracks
+from vggtgeo.datasets.video_stream import Track, choose_tracks
 from vggtgeo.io.errors import GuessedCameraWarning, NoteWarning
 
 COUNT, RATE = 6, 10

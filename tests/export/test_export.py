@@ -482,8 +482,6 @@ def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
     for name, wrong in (
         ("view", replace(scene, tracks=replace(scene.tracks, view=scene.tracks.view + 1000))),
         ("poses", replace(scene, poses=np.zeros(3))),
-        ("frames", replace(scene, frames=np.array([3.0]))),
-        ("frames", replace(scene, frames=0 * scene.frames)),
         ("Tracks", scene.tracks),
     ):
         SCENE.write(tmp_path / "scene.npz", wrong)

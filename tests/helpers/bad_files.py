@@ -83,14 +83,6 @@ def cut_jpeg(progressive: bool = False) -> bytes:
     return whole[: len(whole) // 2] + b"\xff\xd9"
 
 
-def damaged_jpeg() -> bytes:
-    """A JPEG of which bytes in the middle are others, so that the blocks after them come to lie elsewhere."""
-    whole = bytearray(encoded(".jpg", picture(1)))
-    place = len(whole) // 2
-    whole[place : place + 32] = np.random.default_rng(0).integers(0, 255, 32).astype(np.uint8).tobytes()
-    return bytes(whole)
-
-
 def turned_jpeg() -> bytes:
     """A JPEG that asks to be turned by 90 degrees."""
     part = b"Exif\0\0" + TURN

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from bad_row import nothing, rows
 
-from vggtgeo.cli.address_space import check_address_space
+from vggtgeo.cli.environment import check_address_space
 from vggtgeo.io.jax_environment import cache_folder
 
 
@@ -50,16 +50,11 @@ def listed(**variables: str) -> dict[str, Any]:
     return {"call": call, "slack": 3.0}
 
 
-ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ENVIRONMENT = rows(
     "Environment",
     [
         ("no terminal", nothing, listed()),
-        ("a terminal of 20 columns", nothing, listed(COLUMNS="20")),
-        ("a terminal that can do nothing", nothing, listed(TERM="dumb", COLUMNS="1")),
-        ("a locale without other letters than ASCII's", nothing, listed(**ASCII)),
         ("one thread", nothing, listed(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")),
-        ("32 threads", nothing, listed(OMP_NUM_THREADS="32", OPENBLAS_NUM_THREADS="32")),
         ("no home folder, or one that cannot be written: nothing is cached", nothing, {"call": without_home}),
         ("`ulimit -v` that is too small", nothing, {"call": lambda made: limited(2.5)}),
         ("`ulimit -v` that is small", nothing, {"call": lambda made: limited(4.0)}),

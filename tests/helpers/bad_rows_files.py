@@ -18,7 +18,6 @@ from bad_row import Row, read_frames, rows, solve_with
 
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem_file import load_problem
-from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.results.source import open_source
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -28,10 +27,6 @@ WIDE = (PICTURE.astype(np.uint16) << 8) + 128
 HALF_GREY = np.vstack([PICTURE[:16], np.full((32, 64, 3), 128, np.uint8)])
 NUL = b"\0" * 999
 XYZ = "\nproperty float x\nproperty float y\nproperty float z\n"
-FACES = (
-    f"format binary_little_endian 1.0\nelement vertex 3{XYZ}element face 1000000000000000\n"
-    "property list uchar int vertex_indices\n"
-)
 WEIGHTS = ("pt_weight", "ln_weight", "d_weight")
 LISTED = (
     *("edges", "var_kf", "var_uv", "d_init", "d_prior", "d_sigma", "pt_edge", "pt_var", "pt_target", "ln_edge"),
@@ -82,12 +77,6 @@ def matrix(content: str) -> Any:
         return folder / "frames"
 
     return make
-
-
-def truth_folder(folder: Path) -> None:
-    """A folder in the place of the truth."""
-    (folder / "groundtruth.txt").unlink()
-    (folder / "groundtruth.txt").mkdir()
 
 
 def poses(content: str) -> Any:
@@ -155,19 +144,15 @@ IMAGES = rows(
     "Images",
     [
         ("no bytes", bad.with_image(lambda: b"")),
-        ("text", bad.with_image(lambda: b"no picture")),
         ("half a PNG", bad.with_image(lambda: bad.encoded(".png")[:2000])),
         ("half a JPEG", bad.with_image(lambda: bad.cut_jpeg()[:-2], ".jpg")),
         ("half a JPEG with an end mark", bad.with_image(bad.cut_jpeg, ".jpg")),
-        ("half a progressive JPEG with an end mark", bad.with_image(lambda: bad.cut_jpeg(True), ".jpg")),
-        ("a JPEG with other bytes in its middle", bad.with_image(bad.damaged_jpeg, ".jpg")),
         (
             "a JPEG with three bytes before its end mark, as some cameras write it",
             bad.with_image(lambda: bad.encoded(".jpg")[:-2] + b"\1\2\3\xff\xd9", ".jpg"),
         ),
         ("a header of 60000 x 60000 pixels", bad.with_image(bad.huge_png)),
         ("another size than the others", bad.with_image(lambda: bad.encoded(".png", bad.picture(1, 80, 60)))),
-        ("12-bit values in a 16-bit PNG", bad.with_image(lambda: bad.encoded(".png", PICTURE.astype(np.uint16) << 4))),
         ("16-bit PNG", bad.with_image(lambda: bad.encoded(".png", WIDE))),
         ("floating-point TIFF", bad.with_image(lambda: bad.encoded(".tiff", PICTURE.astype(np.float32)), ".tiff")),
         ("a JPEG that asks to be turned (EXIF)", bad.with_image(bad.turned_jpeg, ".jpg")),
@@ -179,21 +164,14 @@ IMAGES = rows(
         ("an empty folder", empty),
         ("a folder of other files", lambda folder: bad.file("a/notes.txt", "")(folder).parent),
         ("a single image", bad.file("a.png", bad.encoded(".png"))),
-        ("an animated GIF", bad.file("a.gif", b"GIF89a" + NUL)),
         ("a recording of Record3D, one depth damaged", spoilt(layouts.record3d, "rgbd/1.depth", "bvx2 and no more")),
-        (
-            "a recording of Record3D whose camera is of other images",
-            spoilt(layouts.record3d, "metadata", '{"w": 960, "h": 720}'),
-        ),
-        ("a recording of Record3D, its metadata cut off", spoilt(layouts.record3d, "metadata", '{"w": 40, "h"')),
         ("a damaged EXR", spoilt(layouts.record3d_exported, "depth/1.exr", "v/1")),
-        ("one camera of a raw drive of KITTI", lambda folder: layouts.kitti_raw(folder) / "image_02"),
     ],
     call=read_frames,
 )
 SMALL = rows(
     "Images",
-    [("2000 x 3 pixels", flat), ("20000 x 33 pixels", lambda folder: flat(folder, 20000, 33))],
+    [],
     argv=lambda made: ["run", made, "-o", made.parent / "out", "--intrinsics", "1500,1500,1000,1"],
 )
 DEPTH = rows(
@@ -202,10 +180,8 @@ DEPTH = rows(
         ("16 bits in metres", bad.every_depth(lambda: np.full((tiny.HEIGHT, tiny.WIDTH), 2, np.uint16))),
         ("one pixel for a whole image", lambda folder: phone(folder, (1, 1))),
         ("8 bits", bad.every_depth(lambda: tiny.image(1)[..., 0])),
-        ("three channels", bad.every_depth(lambda: tiny.image(1))),
         ("all zero", bad.every_depth(lambda: np.zeros((tiny.HEIGHT, tiny.WIDTH), np.uint16))),
         ("another size than the images", bad.every_depth(lambda: tiny.depth_codes(0, 20, 15))),
-        ("a phone's, of fewer pixels", phone),
         ("one that is cut off", bad.rgbd(bad.write("depth/10.104000.png", b"\x89PNG\r\n\x1a\n"))),
         ("one that is not there", bad.rgbd(lambda folder: (folder / "depth/10.104000.png").unlink())),
         ("none near in time", lines("depth.txt", "99 depth/10.104000.png\n")),
@@ -219,24 +195,14 @@ LISTS = rows(
     [
         ("`rgb.txt` without a line", lines("rgb.txt", "# nothing\n")),
         ("a word for a time", lines("rgb.txt", "now rgb/10.000000.png\n")),
-        ("a NaN for a time", lines("rgb.txt", "nan rgb/10.000000.png\n")),
-        ("a time with a decimal comma", lines("rgb.txt", "1,5 rgb/10.000000.png\n")),
-        (
-            "a file that several lines name",
-            lines("rgb.txt", "10.0 rgb/10.000000.png\n10.1 rgb/10.000000.png\n10.2 rgb/10.000000.png\n"),
-        ),
-        ("a TUM folder that lost its `rgb.txt`", bad.rgbd(lambda folder: (folder / "rgb.txt").unlink())),
-        ("a time without a file", lines("rgb.txt", "10.0\n")),
         ("a file that is not there", lines("rgb.txt", "10.0 rgb/10.000000.png\n10.1 rgb/no.png\n")),
         ("times out of order", lines("rgb.txt", "10.1 rgb/10.100000.png\n10.0 rgb/10.000000.png\n")),
         ("a time twice", lines("rgb.txt", "10.0 rgb/10.000000.png\n10.0 rgb/10.100000.png\n")),
         ("UTF-16, as spreadsheets write it", bad.rgbd(wide_list)),
         ("a byte order mark and CR LF", bad.rgbd(windows_list)),
         ("truth with seven columns", lines("groundtruth.txt", "10 0 0 0 0 0 1\n"), OPENED),
-        ("truth that is a folder", bad.rgbd(truth_folder), OPENED),
         ("a pose file of 7-Scenes with NaN", poses("nan " * 16)),
         ("a pose file of 7-Scenes with nine numbers", poses("1 " * 9), OPENED),
-        ("a pose file of 7-Scenes with another last row", poses("1 0 0 0 0 1 0 0 0 0 1 0 5 5 5 5"), OPENED),
         ("a pose file of 7-Scenes that is no rotation", poses("2 " * 12 + "0 0 0 1"), OPENED),
     ],
     call=read_frames,
@@ -247,19 +213,11 @@ CALIBRATION = rows(
         ("words", calibrated("fx fy cx cy")),
         ("nothing", calibrated("")),
         ("three numbers", calibrated("55 55 31.5")),
-        ("a NaN", calibrated("55 nan 31.5 23.5")),
         ("a focal length of 0.001", calibrated("0.001 0.001 31.5 23.5")),
-        ("a focal length of zero", calibrated("0 0 31.5 23.5")),
-        ("distortion 5, 5, 5, 5", calibrated("55 55 31.5 23.5 5 5 5 5")),
-        ("seven numbers", calibrated("55 55 31.5 23.5 0 0 0")),
-        ("a fisheye of three coefficients", calibrated("55 55 31.5 23.5 0 0 0 fisheye")),
         ("a lens of another kind in EuRoC's `sensor.yaml`", sensor("radial-tangential", "omni")),
         ("a `sensor.yaml` of other images", sensor("[40, 30]", "[752, 480]")),
         ("of another image size", calibrated("525 525 120 90")),
-        ("binary data", calibrated(bytes(range(256)))),
         ("commas, a byte order mark and CR LF", calibrated(b"\xef\xbb\xbf55, 55, 31.5, 23.5\r\n")),
-        ("decimal commas", calibrated("55,0 55,0 31,5 23,5")),
-        ("a matrix in `calibration.txt`", calibrated("55 0 31.5\n0 55 23.5\n0 0 1")),
         ("a matrix of eight numbers", matrix("1 " * 8)),
         ("a matrix that is none of intrinsics", matrix("1 2 3 4 5 6 7 8 9")),
         ("none", calibrated(None)),
@@ -273,10 +231,8 @@ VIDEOS = rows(
         ("no bytes", bad.file("clip.mp4", b"")),
         ("cut off", cut_video),
         ("zeros in its middle", bad.holed_video),
-        ("no regular file", lambda folder: Path("/dev/null")),
         ("text: FFmpeg draws its letters", bad.file("clip.mp4", "1305031102.175 rgb/1.png\n" * 99)),
         ("a list of other files for FFmpeg", bad.file("clip.mp4", "ffconcat version 1.0\nfile /etc/passwd\n")),
-        ("a sound", bad.file("clip.wav", b"RIFF\x24\0\0\0WAVEfmt " + NUL)),
     ],
     call=read_frames,
 )
@@ -285,13 +241,11 @@ CLOUDS = rows(
     [
         ("text", bad.file("map.ply", "no cloud")),
         ("no vertices", bad.ply("format ascii 1.0\n")),
-        ("no coordinates", bad.ply("format ascii 1.0\nelement vertex 1\nproperty float a\n", b"1\n")),
         ("fewer points than declared", bad.ply("format ascii 1.0\nelement vertex 3" + XYZ, b"1 2 3\n")),
         (
             "a header of 10^15 points",
             bad.ply("format binary_little_endian 1.0\nelement vertex 1000000000000000" + XYZ, NUL),
         ),
-        ("a mesh whose header declares 10^15 faces", bad.ply(FACES, NUL), {"call": Mesh.load_ply}),
         ("a point that is NaN", bad.ply("format ascii 1.0\nelement vertex 1" + XYZ, b"nan 2 3\n")),
         ("20 GB of zeros", lambda folder: bad.lengthened(folder / "map.ply")),
         ("not there", lambda folder: folder / "map.ply"),

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import bad_files as bad
-from bad_row import line, nothing, rows
+from bad_row import nothing, rows
 
 
 def network(content: bytes | None, *words: Any) -> dict[str, Any]:
@@ -32,11 +32,6 @@ NETWORKS = rows(
         ("a PyTorch checkpoint", None, network(b"PK\x03\x04" + b"\0" * 99)),
         ("a pickle", None, network(b"\x80\x02}q\0." + b"\0" * 99)),
         ("a Git LFS pointer", None, network(b"version https://git-lfs.github.com/spec/v1\n")),
-        ("a web page", None, network(b"<!DOCTYPE html><html></html>")),
-        ("random bytes", None, network(bytes(range(256)) * 20)),
-        ("20 GB of zeros", lambda folder: bad.lengthened(folder / "net.onnx"), {"argv": verify}),
-        ("a network that is none", None, network(b"\x08\x09", "--network", "resnet")),
-        ("`models fetch` of a network that is none", nothing, {"argv": line("models", "fetch", "resnet")}),
     ],
     slack=3.0,
 )

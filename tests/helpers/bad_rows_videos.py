@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import av
 import bad_files as bad
 import cv2
 from bad_row import read_frames, rows
@@ -31,18 +30,6 @@ def calibrated(path: Path) -> Path:
     return path
 
 
-def interlaced_video(path: Path) -> Path:
-    """A video whose rows are of two times."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
-        stream.width, stream.height, stream.pix_fmt = bad.WIDTH, bad.HEIGHT, "yuv420p"
-        for number in range(6):
-            frame = av.VideoFrame.from_ndarray(bad.picture(number), format="bgr24").reformat(format="yuv420p")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return calibrated(path)
-
-
 def jpegs(path: Path) -> Path:
     """A stream that tells nothing of its times."""
     path.write_bytes(b"".join(bad.encoded(".jpg", bad.picture(number)) for number in range(12)))
@@ -57,50 +44,13 @@ def resized_jpegs(path: Path, size: tuple[int, int]) -> Path:
     return calibrated(path)
 
 
-def joined_video(path: Path) -> Path:
-    """Two streams, each of which begins at its time 0."""
-    path.write_bytes(2 * bad.video(path, 20).read_bytes())
-    return calibrated(path)
-
-
-def headless(path: Path) -> Path:
-    """A video whose first block was lost: its frames are there, and nothing says when they were taken."""
-    whole = bad.video(path).read_bytes()
-    path.write_bytes(bytes(8) + whole[8:])
-    return calibrated(path)
-
-
-def hasty(path: Path) -> Path:
-    """A video that states so many frames a second as no camera takes."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 65535.0, (bad.WIDTH, bad.HEIGHT))
-    for number in range(6):
-        writer.write(bad.picture(number))
-    writer.release()
-    return calibrated(path)
-
-
 VIDEOS = rows(
     "Videos",
     [
         ("a name that is no UTF-8", named(b"clip\xff.mp4", lambda path: calibrated(bad.video(path)))),
         ("no frame", named("c.mp4", lambda path: bad.video(path, 0))),
-        ("a pipe", named("c.mp4", os.mkfifo)),
-        ("a bag of ROS that is a pipe", named("c.bag", os.mkfifo)),
-        ("a bag of ROS of 20 GB of zeros", lambda folder: bad.lengthened(folder / "c.bag")),
-        ("a video that is called .png", named("c.png", bad.video)),
-        ("a GIF that is called .mp4", bad.file("clip.mp4", bad.encoded(".gif"))),
-        ("a PNG that is called .mp4", bad.file("clip.mp4", bad.encoded(".png"))),
-        ("a JPEG that is called .mov", bad.file("clip.mov", bad.encoded(".jpg"))),
-        ("interlaced frames", lambda folder: interlaced_video(folder / "clip.mkv")),
         ("JPEGs one behind the other, without a container", lambda folder: jpegs(folder / "clip.mjpg")),
         ("pictures of other proportions in its second half", lambda folder: resized_jpegs(folder / "c.mjpg", (48, 48))),
-        ("pictures of half the size in its second half", lambda folder: resized_jpegs(folder / "c.mjpg", (32, 24))),
-        ("two recordings that were joined (.ts)", lambda folder: joined_video(folder / "clip.ts")),
-        ("a picture of a phone (.heic)", bad.file("a.heic", b"\0\0\0\x18ftypheic" + bytes(40))),
-        ("a zip archive", bad.file("clip.mp4", b"PK\x03\x04" + b"\0" * 999)),
-        ("one whose header is lost, and its frames are not", lambda folder: headless(folder / "clip.mp4")),
-        ("65535 frames a second in its header", lambda folder: hasty(folder / "clip.mp4")),
-        ("a file by its address, in place of a stream", lambda folder: f"file://{bad.video(folder / 'clip.mp4')}"),
     ],
     call=read_frames,
 )

@@ -9,7 +9,7 @@ from typing import Any
 from hypothesis import HealthCheck, Phase, settings
 
 COUNT = int(os.environ.get("VGGTGEO_FUZZ", "0"))
-"""Examples of each property and damaged files of each kind; 0: those of the tests."""
+"""Examples of each property; 0: those of the tests."""
 
 
 def examples(quick: int) -> Callable[[Any], Any]:

@@ -188,8 +188,3 @@ def but(topic: Topic, number: int, content: Fields | bytes | None) -> Topic:
 def jpeg(number: int) -> bytes:
     """A picture, as cameras compress it."""
     return cv2.imencode(".jpg", tiny.image(number))[1].tobytes()
-
-
-def depth_png(number: int) -> bytes:
-    """Depth in millimetres."""
-    return cv2.imencode(".png", tiny.depth_codes(number))[1].tobytes()

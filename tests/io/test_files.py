@@ -11,8 +11,7 @@ import pytest
 from reported import raises
 from small_disk import small_disk
 
-from vggtgeo.io.files import atomic_open, atomic_path, write_json, write_text
-from vggtgeo.io.pictures import write_picture
+from vggtgeo.io.files import atomic_open, atomic_path, write_json, write_picture, write_text
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:

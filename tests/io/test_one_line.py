@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vggtgeo.io.one_line import MOST, one_line
+from vggtgeo.io.errors import MOST, one_line
 
 
 def test_names_cannot_break_or_clear_a_terminal() -> None:

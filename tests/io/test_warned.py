@@ -4,8 +4,7 @@ import warnings
 
 import pytest
 
-from vggtgeo.io.errors import InputWarning
-from vggtgeo.io.warned import collected_warnings
+from vggtgeo.io.errors import InputWarning, collected_warnings
 
 
 def test_two_that_gather_do_not_take_warnings_from_each_other(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from vggtgeo.models.onnx.bounds import (
     Refusals,
 )
 from vggtgeo.models.onnx.contracts import MOGE2
-from vggtgeo.models.onnx.letr import LetrDetector
+from vggtgeo.models.onnx.line_detectors import LetrDetector
 from vggtgeo.models.onnx.moge2 import MogeDepth
 from vggtgeo.models.onnx.session import NetworkValueError, open_session
 from vggtgeo.models.onnx.vggt import decode_cameras

@@ -8,7 +8,7 @@ from reported import raises
 from synthetic_room import room
 from vggtgeo.models.roles import DenseConfidence, LineDetector, MetricDepth, PointMatcher, WindowGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
-from vggtgeo.models.stubs.random_fields import SmoothField, at_pixels, weakness
+from vggtgeo.models.stubs.perception import SmoothField, at_pixels, weakness
 
 from vggtgeo.simulation import SimulatedOracle
 

@@ -16,8 +16,7 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.report import MapView, Pictured, map_scene, viewer
-from vggtgeo.report.decimation import decimated_cloud, decimated_mesh
-from vggtgeo.report.map_scene import MAX_POINTS, MapScene
+from vggtgeo.report.map_scene import MAX_POINTS, MapScene, decimated_cloud, decimated_mesh
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 
 INTRINSICS = (500.0, 400.0, 320.0, 240.0)

@@ -245,7 +245,7 @@ def test_a_saved_result_leaves_the_state_of_a_killed_run(undisturbed: Run, tmp_p
     keep(tmp_path)
     kept = tmp_path / "unfinished/checkpoint.npz"
     before = kept.read_bytes()
-    with pytest.warns(InputWarning, match="killed run"):
+    with warns("--resume"):
         undisturbed.result.save(tmp_path)
     assert kept.read_bytes() == before
     assert sorted(path.name for path in kept.parent.iterdir()) == ["README.txt", "checkpoint.npz"]

@@ -17,8 +17,7 @@ from vggtgeo.simulation.camera_errors import (
     motion_field,
     vignetted,
 )
-from vggtgeo.simulation.degradations import Recording, without_depth
-from vggtgeo.simulation.rolling_rows import camera_velocities
+from vggtgeo.simulation.degradations import Recording, camera_velocities, without_depth
 
 RATE = 25.0
 INNER = (slice(8, -8), slice(8, -8))

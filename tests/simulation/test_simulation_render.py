@@ -7,9 +7,8 @@ from synthetic_room import room
 
 from vggtgeo.simulation import IDEAL, Scene, SyntheticSequence, render
 from vggtgeo.simulation.furniture import lamp_panel
-from vggtgeo.simulation.raster import inverse_depth_at, surface_coordinates, view_from
+from vggtgeo.simulation.raster import encode, inverse_depth_at, surface_coordinates, view_from
 from vggtgeo.simulation.scene import finish
-from vggtgeo.simulation.shade import encode
 from vggtgeo.simulation.shapes import Look, SceneBuilder
 
 SIZE = (160, 120)

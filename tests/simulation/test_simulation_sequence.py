@@ -11,13 +11,13 @@ from synthetic_room import room
 from vggtgeo.cli.simulate import parse_size
 from vggtgeo.cli.simulate import simulate as simulate_command
 from vggtgeo.datasets import open_sequence
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
+from vggtgeo.simulation.raster import encode
 from vggtgeo.simulation.room import build_room
-from vggtgeo.simulation.shade import encode
+from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.simulation.textures import paint_texture
 from vggtgeo.simulation.trajectories import HandheldMotion
-from vggtgeo.simulation.tum_folder import write_tum_folder
 
 SIZE = (96, 72)
 
@@ -48,7 +48,7 @@ def test_frames_are_a_sequence(walk: SyntheticSequence) -> None:
     truth = walk.ground_truth()
     assert np.array_equal(truth.timestamps[[4, 9, 14, 19]], [frame.timestamp for frame in frames])
     assert np.abs(walk.pose(9) @ truth.poses[9] - np.eye(4)).max() < 1e-12
-    with pytest.raises(InputError, match="stride"):
+    with raises("stride"):
         next(walk.frames(stride=0))
 
 
@@ -154,7 +154,7 @@ def test_wrong_arguments_are_named(arguments: dict, name: str) -> None:
 def test_wrong_sensors_are_named() -> None:
     # Negative noise, an empty range and no samples are refused by name.
     for setting in ({"noise": -1.0}, {"depth_range": (2.0, 1.0)}, {"blur_samples": 0}):
-        with pytest.raises(InputError, match=f"`{next(iter(setting))}`"):
+        with raises(f"`{next(iter(setting))}`"):
             Sensor(**setting)
 
 
@@ -171,7 +171,7 @@ def test_tum_folder_reads_back(tmp_path: Path, walk: SyntheticSequence) -> None:
         assert np.nanmax(np.abs(ours.depth - theirs.depth)) <= 0.51 / 5000
         assert abs(ours.timestamp - theirs.timestamp) < 1e-6
     assert np.abs(read.ground_truth().poses - few.ground_truth().poses).max() < 1e-8
-    with pytest.raises(InputError, match="not an empty folder"):
+    with raises(tmp_path.name):
         next(write_tum_folder(few, folder))
 
 

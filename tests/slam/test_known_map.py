@@ -25,7 +25,7 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
 from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.result import Result
-from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.known_map import as_map, entered, save_map
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam

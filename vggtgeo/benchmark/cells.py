@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.benchmark.protocols import PROTOCOLS
-from vggtgeo.benchmark.statistics import Summary, paired, select, values
-from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row, number
+from vggtgeo.benchmark.suite import PROTOCOLS, Suite
+from vggtgeo.benchmark.table import Row, Summary, number, paired, select, values
 
 
 @dataclass(frozen=True)

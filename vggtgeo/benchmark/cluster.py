@@ -23,9 +23,8 @@ from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.scheduling import Command, Finished, check_space, describe_ending, worker_command
 from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import JOB, LOG, ROW
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path
-from vggtgeo.models.extras import install_hint
 
 RETRIES = 3
 """Of a task whose worker or node is lost."""

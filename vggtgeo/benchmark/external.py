@@ -12,7 +12,7 @@ from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.suite import ExternalTable, Suite
 from vggtgeo.benchmark.table import Row
 from vggtgeo.datasets import open_sequence
-from vggtgeo.datasets.trajectory_files import load_trajectory
+from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 

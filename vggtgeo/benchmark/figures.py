@@ -12,10 +12,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from vggtgeo.benchmark import cells
-from vggtgeo.benchmark.statistics import Summary, select, values
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row
-from vggtgeo.datasets.trajectory_files import load_trajectory
+from vggtgeo.benchmark.table import Row, Summary, select, values
+from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import align, associate
 from vggtgeo.figures.plots import NotebookFigure, view_axes
 from vggtgeo.geometry.trajectory import Trajectory

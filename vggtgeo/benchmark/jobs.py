@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.inputs import find_sequences
-from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.provenance import input_hash
-from vggtgeo.benchmark.suite import SequenceTable, SettingTable, Suite
+from vggtgeo.benchmark.suite import PROTOCOLS, SequenceTable, SettingTable, Suite
 from vggtgeo.datasets.opening import is_readable
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -52,17 +51,17 @@ class Job:
 
 
 def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
-    """Return all runs of a suite, sequence by sequence, with recordings from the folders `data`; warn of recordings
-    that were found in subfolders.
-    """
+    """Return all runs of a suite, sequence by sequence, with recordings from the folders `data`."""
     roots = tuple(data)
     # An archive unpacked into a folder of its own name has the recording one level deeper.
     first_readable = lambda places: sorted(places, key=lambda place: not is_readable(place))
     places = {one.name: first_readable(find_sequences(one.path, roots) if one.path else []) for one in suite.sequence}
-    _warn_of_subfolders(suite, places, roots)
     found = []
     for sequence in suite.sequence:
         place = next(iter(places[sequence.name]), None)
+        if len(places[sequence.name]) > 1:
+            text = f"`{sequence.path}` exists {len(places[sequence.name])} times below `data`; `{place}` is taken"
+            warnings.warn(text, InputWarning, stacklevel=2)
         absent = _absent(sequence.path, roots) if place is None else ""
         digest = "" if place is None else input_hash(place)
         settings = [table for table in suite.setting if not table.sequences or sequence.name in table.sequences]
@@ -73,20 +72,6 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
                 if seed - suite.first_seed < (setting.seeds or suite.seeds):
                     found.append(Job(sequence.name, setting.name, seed, specs[setting.name], digest, absent))
     return found
-
-
-def _warn_of_subfolders(suite: Suite, places: Mapping[str, Sequence[Path]], roots: Iterable[Path]) -> None:
-    """Warn of recordings found in subfolders: they may be others of the same name."""
-    found = []
-    for one in suite.sequence:
-        there = places[one.name]
-        wanted = Path(one.path).expanduser()
-        if not there or wanted.is_absolute() or there[0] in [(root / wanted).resolve() for root in roots]:
-            continue
-        rest = ", ".join(f"`{other}`" for other in there[1:])
-        found.append(f"{one.name} in `{there[0]}`" + (f" (the first of {len(there)}, with {rest})" if rest else ""))
-    if found:
-        warnings.warn(f"recordings found in subfolders of `data`: {'; '.join(found)}", InputWarning, stacklevel=3)
 
 
 def _absent(path: str, roots: Sequence[Path]) -> str:

@@ -7,9 +7,8 @@ from collections.abc import Iterable, Sequence
 from vggtgeo.benchmark import cells
 from vggtgeo.benchmark.cells import Cell
 from vggtgeo.benchmark.published import PublishedTable, published
-from vggtgeo.benchmark.statistics import select
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row
+from vggtgeo.benchmark.table import Row, select
 
 
 def page(suite: Suite, rows: Sequence[Row]) -> str:

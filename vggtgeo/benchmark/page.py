@@ -8,9 +8,8 @@ from typing import Any
 
 from vggtgeo.benchmark import cells, figures, markdown
 from vggtgeo.benchmark.published import published
-from vggtgeo.benchmark.statistics import select
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row
+from vggtgeo.benchmark.table import Row, select
 from vggtgeo.benchmark.worker import LOG, RECORDING
 from vggtgeo.io.files import write_text
 from vggtgeo.report.figures import svg

@@ -10,35 +10,11 @@ from typing import Any
 
 from vggtgeo.benchmark.jobs import Job
 from vggtgeo.benchmark.measure import NOT_COMPARABLE
-from vggtgeo.benchmark.table import NUMBERS, Row
+from vggtgeo.benchmark.table import Row
 from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 from vggtgeo.io.text_files import whole_text
-
-_LARGEST = 2**63
-
-
-def _check_row(row: Row, job: Job) -> None:
-    """Raise ValueError or KeyError for a row of another run, or with invalid values."""
-    for name, wanted in (("sequence", job.sequence), ("setting", job.setting), ("seed", job.seed)):
-        if row[name] != wanted or type(row[name]) is not type(wanted):
-            raise ValueError(f"its `{name}` is {row[name]!r:.40}; expected {wanted!r}")
-    for name, value in row.items():
-        if not (value is None or isinstance(value, bool | int | float | str)):
-            raise ValueError(f"its `{name}` is {value!r:.40}; expected a number or a text")
-        if isinstance(value, str):
-            value.encode("utf-8", "surrogateescape")
-        if name in NUMBERS and (isinstance(value, str) or (isinstance(value, int) and abs(value) >= _LARGEST)):
-            raise ValueError(f"its `{name}` is {value!r:.40}; expected a number")
-    if row["status"] == "ok":
-        for name, kind in (("frames", int), ("tracked", int), ("verdict", str)):
-            if type(row[name]) is not kind:
-                raise ValueError(f"its `{name}` is {row[name]!r:.40}; expected {kind.__name__}")
-        if row["protocol"] != job.spec["protocol"]:
-            raise ValueError(f"its `protocol` is {row['protocol']!r:.40}; expected {job.spec['protocol']!r}")
-    elif not isinstance(row["status"], str):
-        raise ValueError(f"its `status` is {row['status']!r:.40}; expected a word")
 
 
 @dataclass(frozen=True)
@@ -64,8 +40,6 @@ class Store:
         try:
             row = json.loads(whole_text(path, errors="strict"))
             same, status = row["fingerprint"] == job.fingerprint(self.source), row["status"]
-            if same:
-                _check_row(row, job)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"`{path}` is damaged ({error}); delete it and call again") from None
         return row if same and not (retry and status not in ("ok", NOT_COMPARABLE)) else None

@@ -10,14 +10,12 @@ import dataclasses
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from vggtgeo.benchmark.checked_table import CheckedTable
-from vggtgeo.benchmark.protocols import PROTOCOLS
 from vggtgeo.benchmark.published import check_published
 from vggtgeo.datasets.opening import KINDS
 from vggtgeo.evaluation.alignment import AXES
@@ -27,6 +25,92 @@ from vggtgeo.simulation.degradations import DEGRADATIONS
 from vggtgeo.simulation.sequence import check_walk
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import Tables, updated
+
+
+def _of(*kinds: type) -> Callable[[Any], bool]:
+    """Exact type check: in Python, `isinstance(True, int)`."""
+    return lambda value: type(value) in kinds
+
+
+def _list_of(kind: type) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list | tuple) and all(type(one) is kind for one in value)
+
+
+def _table_of(allowed: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, Mapping) and all(map(allowed, value.values()))
+
+
+_ANY_TABLE = _table_of(lambda _: True)
+
+
+_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "int": (_of(int), "a whole number"),
+    "int | None": (_of(int, type(None)), "a whole number"),
+    "float": (_of(int, float), "a number"),
+    "float | None": (_of(int, float, type(None)), "a number"),
+    "str": (_of(str), "a text"),
+    "str | None": (_of(str, type(None)), "a text"),
+    "bool": (_of(bool), "true or false"),
+    "tuple[str, ...]": (_list_of(str), "a list of texts"),
+    "tuple[int, ...]": (_list_of(int), "a list of whole numbers"),
+    "Mapping[str, Any]": (_ANY_TABLE, "a table"),
+    "Mapping[str, str]": (_table_of(_of(str)), "a table of texts"),
+    "Tables": (_table_of(_ANY_TABLE), "a table of groups of settings, as `[setting.set.line]` makes one"),
+}
+"""Check and description of the allowed values, by the field's annotation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckedTable:
+    """A table of the file; its fields are the keys."""
+
+    @classmethod
+    def read(cls, where: str, values: Any) -> Self:
+        """Return the table of plain values; raise InputError with `where` for an unknown key or an invalid value."""
+        known = {entry.name: entry for entry in dataclasses.fields(cls)}
+        if not isinstance(values, Mapping):
+            raise InputError(f"{where} is {values!r}; it must be a table")
+        for key in values:
+            if key not in known:
+                raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
+        missing = [f"`{name}`" for name, entry in known.items() if name not in values and _is_required(entry)]
+        if missing:
+            raise InputError(f"{where}: {', '.join(missing)} missing")
+        for key, value in values.items():
+            allowed, words = _KINDS.get(str(known[key].type), (lambda _: True, ""))
+            if not allowed(value):
+                raise InputError(f"{where}: `{key}` is {value!r}; it must be {words}")
+        plain = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        try:
+            return cls(**plain)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+
+
+def _is_required(entry: dataclasses.Field[Any]) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """stride: take every n-th frame. poses: evaluate "all" frames or "keyframes". about: source and description."""
+
+    stride: int
+    poses: str
+    about: str
+
+
+PROTOCOLS: dict[str, Protocol] = {
+    "every-frame": Protocol(1, "all", "a pose for every frame, metric"),
+    "every-frame-sim3": Protocol(1, "all", "a pose for every frame, scale free"),
+    "mast3r-slam": Protocol(
+        2, "keyframes", "MASt3R-SLAM: every second frame, keyframes only, `evo_ape tum GT EST -as`"
+    ),
+    "droid-slam": Protocol(2, "all", "DROID-SLAM: every second frame, a pose for each of them"),
+    "dpvo": Protocol(1, "all", "DPVO: every frame; its own tables print the median of the trials, these the mean"),
+    "vggt-slam": Protocol(1, "keyframes", "VGGT-SLAM: keyframes by the flow of the image"),
+}
+
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 _MAX_NAME = 100
@@ -73,7 +157,7 @@ class SequenceTable(CheckedTable):
         kind: reader; by default detected.
         simulate: `{scene = "office", frames = 80, rate = 6.0, size = [320, 240]}`; the seed determines the walk.
         degrade: degradation of a rendered walk, see `vggtgeo/simulation/degradations.py`.
-        protocol: see `vggtgeo/benchmark/protocols.py`; overrides the suite's.
+        protocol: see `vggtgeo/benchmark/suite.py`; overrides the suite's.
         start, end: first frame, and frame to stop before.
         rgb_only: ignore depth.
         key_points: per frame, of the simulated matcher.
@@ -194,7 +278,7 @@ class Suite(CheckedTable):
         title, about: for the head of the report.
         seeds, first_seed: runs of each setting on each sequence.
         baseline: setting that the others are compared with, run by run; by default the first.
-        protocol: see `vggtgeo/benchmark/protocols.py`.
+        protocol: see `vggtgeo/benchmark/suite.py`.
         timeout_minutes, memory_gb: limits of one run.
         pages: whether each run writes its report and its map.
         recordings: whether each run writes `run.rrd` for the Rerun viewer, which takes extra time.

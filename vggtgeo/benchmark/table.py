@@ -1,17 +1,21 @@
-"""The table of runs, one row each, as CSV and Parquet."""
+"""The table of runs, one row each: CSV, Parquet, means and paired differences with Student intervals."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from vggtgeo.io.errors import InputError
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import t as student
+
+from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path
-from vggtgeo.models.extras import install_hint
 
 Row = Mapping[str, Any]
 """A row of the table: plain values by column."""
@@ -51,7 +55,7 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         import pyarrow.parquet
     except ImportError:
         raise InputError(f"a Parquet table needs PyArrow; {install_hint('bench')}") from None
-    values = {name: [_printable(row.get(name)) for row in rows] for name in columns(rows)}
+    values = {name: [row.get(name) for row in rows] for name in columns(rows)}
     table = pyarrow.table({name: pyarrow.array(_same_type(column)) for name, column in values.items()})
     with atomic_path(path) as temporary, temporary.open("wb") as stream:  # PyArrow accepts UTF-8 paths only
         pyarrow.parquet.write_table(table, stream)
@@ -63,14 +67,86 @@ def number(row: Row, column: str) -> float:
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else math.nan
 
 
-def _printable(value: Any) -> Any:
-    """A text as valid UTF-8, as Parquet requires: file names need not be."""
-    return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace") if isinstance(value, str) else value
-
-
 def _same_type(column: list[Any]) -> list[Any]:
     """The values converted to one type: to float if any is a float, else to text if types differ."""
     if any(isinstance(value, float) for value in column):
         return [float(value) if isinstance(value, int | float) else None for value in column]
     kinds = {type(value) for value in column if value is not None}
     return column if len(kinds) < 2 else [None if value is None else str(value) for value in column]
+
+
+LEVEL = 0.95
+LESS_BASELINE = "_less_baseline"
+"""Suffix of a column: the difference to the baseline over the common time."""
+SAME = 1e-6
+"""Relative spread below which numbers are equal: the runs had no random part."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Count, mean, sample standard deviation, half width of the mean's 95 % Student interval, median of numbers.
+
+    Deviation and half width of a single number are NaN.
+    """
+
+    count: int
+    mean: float
+    deviation: float
+    half: float
+    median: float
+
+    @classmethod
+    def of(cls, values: Float[np.ndarray, " n"]) -> Self:
+        """Return the summary of the finite `values`."""
+        known = values[np.isfinite(values)]
+        count = len(known)
+        if not count:
+            return cls(0, np.nan, np.nan, np.nan, np.nan)
+        deviation = float(np.std(known, ddof=1)) if count > 1 else np.nan
+        half = float(student.ppf(0.5 + LEVEL / 2, count - 1)) * deviation / np.sqrt(count) if count > 1 else np.nan
+        return cls(count, float(known.mean()), deviation, float(half), float(np.median(known)))
+
+    @property
+    def differs(self) -> bool:
+        """Whether the interval excludes zero. Never for equal numbers: seeds without effect do not sample the noise."""
+        return bool(abs(self.mean) > self.half > SAME * abs(self.mean))
+
+
+def select(rows: Sequence[Row], sequence: str | None = None, setting: str | None = None) -> list[Row]:
+    """Return the rows of a sequence and a setting, sorted by sequence and seed."""
+    chosen = [
+        row
+        for row in rows
+        if (sequence is None or row["sequence"] == sequence) and (setting is None or row["setting"] == setting)
+    ]
+    return sorted(chosen, key=lambda row: (str(row["sequence"]), int(row["seed"])))
+
+
+def values(rows: Sequence[Row], column: str) -> Float[np.ndarray, " n"]:
+    """Return a column as numbers, NaN where missing."""
+    return np.array([number(row, column) for row in rows], float)
+
+
+def paired(
+    rows: Sequence[Row],
+    setting: str,
+    baseline: str,
+    column: str,
+    sequence: str | None = None,
+    recorded: Collection[str] = (),
+) -> Float[np.ndarray, " n"]:
+    """Return setting minus baseline on the same sequence and seed; over the common time where a row has that.
+
+    recorded: sequences that are the same for every seed. In a mean over sequences, such a sequence is one sample (the
+    mean over its seeds): ten seeds of two recordings are not twenty independent recordings.
+    """
+    other = {(row["sequence"], row["seed"]): number(row, column) for row in select(rows, sequence, baseline)}
+    samples: dict[tuple[str, int | None], list[float]] = {}
+    for row in select(rows, sequence, setting):
+        difference = number(row, column) - other.get((row["sequence"], row["seed"]), np.nan)
+        if np.isfinite(difference) and f"{column}{LESS_BASELINE}" in row:
+            difference = number(row, f"{column}{LESS_BASELINE}")
+        if np.isfinite(difference):
+            one = sequence is None and row["sequence"] in recorded
+            samples.setdefault((row["sequence"], None if one else row["seed"]), []).append(difference)
+    return np.array([np.mean(sample) for sample in samples.values()], float)

@@ -20,10 +20,9 @@ from vggtgeo.benchmark.inputs import open_input
 from vggtgeo.benchmark.measure import measure, truth_of_run
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, collected_warnings
 from vggtgeo.io.files import write_json
 from vggtgeo.io.peak_memory import peak_memory_gb
-from vggtgeo.io.warned import collected_warnings
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback

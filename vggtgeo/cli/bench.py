@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.option_groups import with_option_groups
-from vggtgeo.cli.options import JsonOption
+from vggtgeo.cli.options import JsonOption, with_option_groups
 
 if TYPE_CHECKING:
     from vggtgeo.benchmark.table import Row

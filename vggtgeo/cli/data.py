@@ -1,8 +1,11 @@
-"""`vggtgeo data`: list datasets, and check a recording."""
+"""`vggtgeo data`: list known datasets (`datasets/catalogue.toml`), and check a recording."""
 
 from __future__ import annotations
 
 import json
+import tomllib
+from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +23,7 @@ def list_command(as_json: JsonOption = False) -> None:
     """List what the readers know: where to get it, its size, licence and layout."""
     from dataclasses import asdict
 
-    from vggtgeo.datasets.catalogue import catalogue
+    from vggtgeo.cli.data import catalogue
 
     entries = catalogue()
     if as_json:
@@ -56,3 +59,23 @@ def check_command(
         typer.echo(f"{len(found.problems)} problems" if found.problems else "no problem found")
     if found.problems:
         raise typer.Exit(EXIT_INPUT)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """name; kind, of the reader; suite of `vggtgeo bench`, "" for none; url; size, rough; licence; layout; note."""
+
+    name: str
+    kind: str
+    suite: str
+    url: str
+    size: str
+    licence: str
+    layout: str
+    note: str
+
+
+def catalogue() -> tuple[Entry, ...]:
+    """Return all entries."""
+    text = (files("vggtgeo.datasets") / "catalogue.toml").read_text("utf-8")
+    return tuple(Entry(**entry) for entry in tomllib.loads(text)["entry"])

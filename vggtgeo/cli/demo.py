@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.option_groups import with_option_groups
-from vggtgeo.cli.options import AssignmentsOption, ReportOptions, RerunOption
+from vggtgeo.cli.options import AssignmentsOption, ReportOptions, RerunOption, with_option_groups
 from vggtgeo.cli.run_options import ResumeOption
 from vggtgeo.cli.settings_file import SettingsOption
 

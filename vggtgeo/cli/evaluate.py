@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from vggtgeo.cli.option_groups import with_option_groups
-from vggtgeo.cli.options import EXIT_FAILED, JsonOption
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.cli.options import EXIT_FAILED, JsonOption, with_option_groups
+from vggtgeo.io.errors import InputError, InputWarning, collected_warnings
 from vggtgeo.io.text_files import whole_text
-from vggtgeo.io.warned import collected_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -120,8 +118,8 @@ def evaluate(
 
 def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
     """Load the trajectory of a file, or `trajectory.txt` of a folder. truth: gives the times of poses without times."""
-    from vggtgeo.datasets.trajectory_files import load_trajectory
-    from vggtgeo.results.summary_file import warn_if_truncated
+    from vggtgeo.datasets.pose_files import load_trajectory
+    from vggtgeo.results.summary import warn_if_truncated
     from vggtgeo.results.unfinished import unfinished_message
 
     unfinished = unfinished_message(path)
@@ -135,7 +133,7 @@ def load_scale(path: Path) -> str | None:
     """Return the scale in a run's summary, for its folder or a pose file in it; None for other files, and, with a
     warning, if the summary is invalid.
     """
-    from vggtgeo.results.summary_file import describe_error
+    from vggtgeo.results.summary import describe_error
 
     file = (path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path) / "summary.json"
     if not file.is_file():
@@ -153,7 +151,7 @@ def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
     metres (None if unknown).
     """
     from vggtgeo.datasets import open_sequence
-    from vggtgeo.datasets.trajectory_files import load_trajectory
+    from vggtgeo.datasets.pose_files import load_trajectory
 
     if not path.is_dir():
         return load_trajectory(path), _in_metres(path)

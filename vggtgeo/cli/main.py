@@ -7,7 +7,6 @@ import importlib
 import importlib.metadata
 import logging
 import os
-import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -17,14 +16,14 @@ from typing import Annotated, Any, NamedTuple, NoReturn, TextIO
 import typer
 from typer.core import TyperGroup
 
-from vggtgeo.cli.address_space import check_address_space
-from vggtgeo.cli.jax_flags import check_cache, check_jit, check_xla_flags, set_jax_flags
+from vggtgeo.cli.environment import (
+    check_address_space,
+    set_jax_flags,
+    show_unknown_characters,
+)
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
-from vggtgeo.cli.streams import exit_code, use_lasting_streams, use_readable_width
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, one_line
 from vggtgeo.io.interruption import end_on_signals, ignore_signals
-from vggtgeo.io.jax_environment import jax_environment
-from vggtgeo.io.one_line import one_line
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1
@@ -164,9 +163,6 @@ class _LazyGroup(TyperGroup):
         entry = next((entry for entry in COMMANDS if entry.name == name), None)
         if entry is not None and not set(ctx.help_option_names) & set(rest):
             check_address_space(entry.name)
-            check_jit(entry.name)
-            check_xla_flags(entry.name)
-            check_cache(entry.name)
         return name, load_command(entry) if entry else stand_in, rest
 
     def invoke(self, ctx: Any) -> Any:
@@ -219,11 +215,6 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
         message, code = "interrupted", EXIT_INTERRUPTED
     elif isinstance(error, OSError) and error.filename is not None:
         message, code = f"error: `{error.filename}`: {error.strerror}", EXIT_INPUT
-    elif isinstance(error, FileNotFoundError) and _lacks_folder():
-        message, code = (
-            "error: the working folder no longer exists; change to another (`cd`)",
-            EXIT_INPUT,
-        )
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
     elif _is_short_of_memory(error):
@@ -231,25 +222,11 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
         code = EXIT_INPUT
     elif _is_usage_error(error):
         message, code = f"error: {_usage_message(error, command)}", EXIT_INPUT
-    elif (wrong := _wrong_switch(error)) is not None:
-        message, code = f"error: {wrong}", EXIT_INPUT
-    elif _lacks_platform():
-        message = f"error: JAX finds no device for JAX_PLATFORMS={os.environ['JAX_PLATFORMS']}; unset it, or use cpu"
-        code = EXIT_INPUT
     else:
-        message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`){_switches_of_jax()}"
+        message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`)"
         code = EXIT_INTERNAL
     typer.echo(one_line(message), err=True)
     raise typer.Exit(code) from None
-
-
-def _lacks_folder() -> bool:
-    """Whether the working folder was removed, so that relative paths are invalid."""
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        return True
-    return False
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
@@ -258,34 +235,6 @@ def _is_short_of_memory(error: BaseException) -> bool:
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error) or "cannot allocate memory" in str(error).lower()
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(words))
-
-
-def _wrong_switch(error: BaseException) -> str | None:
-    """A message if the error comes from an environment variable of JAX: an invalid truth value, or `JAX_DEBUG_NANS`,
-    which makes NaN an error, although NaN is unknown depth here.
-    """
-    if "FloatingPoint" in type(error).__name__ and "JAX_DEBUG_NANS" in os.environ:  # JAX's error or Python's
-        return "JAX_DEBUG_NANS makes every NaN an error, but NaN is used for unknown values; unset it"
-    found = re.fullmatch(r"invalid truth value '(.*)' for environment '(\w+)'", str(error))
-    return found and f"the environment variable `{found[2]}` is `{found[1]}`; JAX expects true or false"
-
-
-def _switches_of_jax() -> str:
-    """Hint to JAX's environment variables set by the user, which may be the cause."""
-    ours = jax_environment()
-    theirs = [name for name in os.environ if name.startswith("JAX_") and name not in ours]
-    return f"; the environment sets {', '.join(theirs)}: unset that, and try again" if theirs else ""
-
-
-def _lacks_platform() -> bool:
-    """Whether the environment requests a JAX device that does not exist, for which JAX has many kinds of errors."""
-    jax = sys.modules.get("jax")
-    if jax is None or "JAX_PLATFORMS" not in os.environ:
-        return False
-    try:
-        return not jax.devices()
-    except Exception:  # noqa: BLE001 - of any kind
-        return True
 
 
 def _usage_message(error: Any, command: str) -> str:
@@ -347,14 +296,11 @@ def main() -> None:
     set_jax_flags()
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; an unknown backend in the environment would end a run
     end_on_signals()
-    use_lasting_streams()
-    use_readable_width()
+    show_unknown_characters()
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # no messages about its cache folder
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
     try:
         make_app()(prog_name="vggtgeo")
-    except SystemExit as end:
-        raise SystemExit(exit_code(end.code, EXIT_INPUT)) from None
     finally:
         ignore_signals()
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from vggtgeo.datasets import Frame
 from vggtgeo.evaluation.report import ABSURD_SCALE
-from vggtgeo.io.one_line import one_line
+from vggtgeo.io.errors import one_line
 from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam

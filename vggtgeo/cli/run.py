@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vggtgeo.cli.option_groups import with_option_groups
+from vggtgeo.cli.options import with_option_groups
 from vggtgeo.cli.run_options import (
     InputOptions,
     OutputOption,
@@ -22,8 +22,7 @@ from vggtgeo.cli.run_options import (
     SwitchOptions,
 )
 from vggtgeo.cli.settings_file import SettingsOption
-from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning
-from vggtgeo.io.warned import collected_warnings
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning, collected_warnings
 
 if TYPE_CHECKING:
     from vggtgeo.datasets import Sequence
@@ -197,7 +196,7 @@ def check_provider(provider: Provider) -> None:
     """Raise InputError if a GPU is requested and not available."""
     if provider != "cuda":
         return
-    from vggtgeo.io.network_errors import as_input_errors
+    from vggtgeo.io.network_files import as_input_errors
     from vggtgeo.models.onnx.providers import choose_provider
 
     with as_input_errors():

@@ -16,12 +16,12 @@ from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.cli.progress import ProgressBar, print_result
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence, without_depth
-from vggtgeo.datasets.reduced import reduced
+from vggtgeo.datasets.views import reduced
 from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import whole_path
 from vggtgeo.io.interruption import interruption
-from vggtgeo.io.network_errors import as_input_errors
+from vggtgeo.io.network_files import as_input_errors
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories

@@ -61,19 +61,8 @@ def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
     tables = {key: value for key, value in given.items() if has_pipeline and isinstance(value, dict)}
     flags = {key: value for key, value in given.items() if key not in tables}
     positive = _positive(path, flags, context)
-    context.default_map = _validated(path, positive, _keys(context), _types(context), has_pipeline)
+    context.default_map = _validated(path, positive, _keys(context), _types(context))
     return SettingsInUse(context, tables, path)
-
-
-def _settings_by_group() -> dict[str, list[str]]:
-    """Names of the pipeline's settings by group."""
-    from vggtgeo.slam.settings.table import names  # slow: imports JAX
-
-    settings: dict[str, list[str]] = {}
-    for name in names():
-        group, _, setting = name.partition(".")
-        settings.setdefault(group, []).append(setting)
-    return settings
 
 
 SettingsOption = Annotated[
@@ -114,26 +103,12 @@ def _validated(
     given: dict[str, Any],
     names: dict[str, str],
     types: dict[str, Any],
-    has_pipeline: bool,
 ) -> dict[str, Any]:
-    """The values by parameter name. has_pipeline: whether the command also has settings of the pipeline."""
+    """The values by parameter name."""
     for key, value in given.items():
         if key not in names:
-            settings = _settings_by_group() if has_pipeline else {}
-            if key in settings:
-                raise InputError(
-                    f"`{path}`: `{key}` is {_short(value)}; it must be a table of settings: a line `[{key}]`, and "
-                    "below it lines `name = value`"
-                )
-            group = next((group for group, fields in settings.items() if key in fields), None)
-            if group is not None:
-                raise InputError(f"`{path}`: `{key}` is a setting of `{group}`: write it below a line `[{group}]`")
             near = difflib.get_close_matches(key, names, 1, 0.0)[0]
             raise InputError(f"`{path}`: `{key}` is not a setting of this command; the nearest is `{near}`")
-        if value == "":
-            raise InputError(f"`{path}`: `{key}` is empty; give a value, or leave the line out")
-        if isinstance(value, str) and "\0" in value:
-            raise InputError(f"`{path}`: `{key}` is {_short(value)}, which has a zero byte in it; leave that out")
         wanted, accepted = _KINDS.get(types[names[key]], ("text in quotes", (str,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
             raise InputError(f"`{path}`: `{key}` is {_short(value)}; it must be {wanted}")

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.option_groups import with_option_groups
-from vggtgeo.cli.options import JsonOption, QuietOption
+from vggtgeo.cli.options import JsonOption, QuietOption, with_option_groups
 from vggtgeo.io.errors import InputError
 
 
@@ -46,7 +45,7 @@ def simulate(
     from rich.progress import track
 
     from vggtgeo import simulation
-    from vggtgeo.simulation.tum_folder import check_new, write_tum_folder
+    from vggtgeo.simulation.sequence import check_new, write_tum_folder
 
     check_new(output)  # before a world is built
     sensor = simulation.Sensor(

@@ -10,7 +10,7 @@ import typer
 
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.network_errors import as_input_errors
+from vggtgeo.io.network_files import as_input_errors
 from vggtgeo.models.onnx import verification
 from vggtgeo.models.onnx.bounds import BoundedDepth, BoundedWindow
 from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, PARITY_SUFFIX

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vggtgeo.datasets.bag_images import COLOUR, DEPTH, GREY, Unread, encoding_of, kind_of
@@ -25,8 +26,8 @@ class Chosen:
     others: tuple[str, ...]
 
 
-def chosen_topics(first: Mapping[str, Any]) -> Chosen:
-    """Of the topics of images, by the first message of each: the best in colour, and the best depth.
+def chosen_topics(path: Path, first: Mapping[str, Any]) -> Chosen:
+    """Return the best topic of images in colour, and the best of depth, by the first message of each.
 
     Colour goes before grey and infrared, depth that is registered to the colour camera before any other; then the
     order of their names. InputError where none is an image that can be read, with what they are.
@@ -37,8 +38,8 @@ def chosen_topics(first: Mapping[str, Any]) -> Chosen:
     if not images:
         found = ", ".join(f"`{name}` ({kind_of(message)})" for name, message in first.items()) or "none"
         raise InputError(
-            f"has no topic with images in colour or grey that can be read; its topics of images: {found}; convert "
-            f"to what is read: JPEG, PNG, {', '.join(COLOUR)}"
+            f"`{path}` has no topic with images in colour or grey that can be read; its topics of images: {found}; "
+            f"convert to what is read: JPEG, PNG, {', '.join(COLOUR)}"
         )
     colour, depth = _best(images), _best(depths)
     return Chosen(colour, depth, tuple(name for name in first if name not in (colour, depth)))
@@ -83,7 +84,7 @@ def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:
     return int(bool(_INFRARED.search(name))), int("depth" in name.lower()), int(encoding in GREY)
 
 
-def told(chosen: Chosen, poses: str) -> str:
+def described_choice(chosen: Chosen, poses: str) -> str:
     """What was chosen, as a sentence; empty where there was no choice. poses: the topic of the truth, "" for none."""
     if not chosen.others:
         return ""

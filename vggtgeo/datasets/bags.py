@@ -19,7 +19,7 @@ import numpy as np
 from vggtgeo.datasets.bag_cameras import CAMERA_INFO, camera_of
 from vggtgeo.datasets.bag_depth import DepthCamera, depth_camera_of
 from vggtgeo.datasets.bag_images import Unread, image_of, metres_of
-from vggtgeo.datasets.bag_topics import IMAGES, Chosen, chosen_topics, told, truth_topic
+from vggtgeo.datasets.bag_topics import IMAGES, Chosen, chosen_topics, described_choice, truth_topic
 from vggtgeo.datasets.bag_transforms import TRANSFORMS, frame_name
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import orientation_message
@@ -28,15 +28,10 @@ from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
-from vggtgeo.io.text_files import whole_text
-from vggtgeo.models.extras import install_hint
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning, install_hint
 
 _DELAY = 0.02
 """Seconds between an image and its depth."""
-_SECOND = 1_000_000_000
-"""Nanoseconds."""
-_BEGINS = b"#ROSBAG V"
 METADATA = "metadata.yaml"
 ROS_2 = (".db3", ".mcap")
 """Suffixes of the files that lie beside a `metadata.yaml`."""
@@ -97,13 +92,9 @@ class RosBag:
         with _reader(path) as reader:
             topics = {name: str(info.msgtype) for name, info in reader.topics.items()}
             first = {name: _first(reader, name) for name in topics if topics[name] in IMAGES}
-            try:
-                chosen = chosen_topics(first)
-            except InputError as error:
-                raise InputError(f"`{path}` {error}{_others(topics)}") from None
+            chosen = chosen_topics(path, first)
             poses = truth_topic(topics)
-            _tell_of_parts(path)
-            if text := told(chosen, poses):
+            if text := described_choice(chosen, poses):
                 _warn(f"`{path}`: {text}", NoteWarning)
             times, (width, height) = _times_and_size(reader, path, chosen.colour)
             infos = _infos(reader, topics)
@@ -114,7 +105,7 @@ class RosBag:
             size = (other.camera.width, other.camera.height) if other else (width, height)
             has_depth = depth and bool(chosen.depth) and _depth_is_usable(reader, path, chosen.depth, times, size)
             if has_depth and other:
-                _warn(f"`{path}`: {_told_registered(chosen, other)}", NoteWarning)
+                _warn(f"`{path}`: {_registration_note(chosen, other)}", NoteWarning)
         return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, times, has_depth, other)
 
     def __len__(self) -> int:
@@ -193,20 +184,6 @@ class RosBag:
         return register(depth) if register else depth
 
 
-def _tell_of_parts(path: Path) -> None:
-    """Warn of files of a ROS 2 bag that its metadata does not list, which are not read."""
-    folder = path.parent if path.suffix in ROS_2 else path
-    if not (folder / METADATA).is_file():
-        return
-    text = whole_text(folder / METADATA)
-    unnamed = sorted(file.name for file in folder.iterdir() if file.suffix in ROS_2 and file.name not in text)
-    if unnamed:
-        _warn(
-            f"`{folder}` holds {len(unnamed)} files that its `{METADATA}` does not name, `{unnamed[0]}` first: not "
-            f"read; `ros2 bag reindex {folder}` takes them in"
-        )
-
-
 def _place(path: Path, topic: str, number: int) -> Path:
     """Return a name of one message, for errors."""
     return Path(f"{path}, {topic}, {number}")
@@ -214,10 +191,9 @@ def _place(path: Path, topic: str, number: int) -> Path:
 
 def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, ...], tuple[int, int]]:
     """Return all times of the images, and width and height of the first that can be read."""
-    times, size, wrong, over = [], None, "", 0
+    times, size, wrong = [], None, ""
     for number, (time, message) in enumerate(_messages(reader, topic)):
         times.append(time)
-        over += not isinstance(message, Unread) and message.header.stamp.nanosec >= _SECOND
         if size is None:
             try:
                 height, width = image_of(message, _place(path, topic, number)).image.shape[:2]
@@ -226,14 +202,6 @@ def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, .
                 wrong = wrong or str(error)
     if size is None:
         raise InputError(f"none of the {len(times)} images of `{path}` can be read; the first: {wrong}")
-    if len(times) < (declared := reader.topics[topic].msgcount):
-        text = f"`{path}` declares {declared} images of `{topic}` and has {len(times)}; the rest is lost"
-        _warn(text, LeftOutWarning)
-    if over:
-        _warn(
-            f"`{path}`: {over} of {len(times)} images of `{topic}` have a time of {_SECOND} nanoseconds or more beside "
-            "its seconds; added to them"
-        )
     return tuple(times), size
 
 
@@ -318,18 +286,12 @@ def _whole(reader: Any, connections: list[Any]) -> Iterator[Any]:
             yield reader.deserialize(raw, connection.msgtype)
 
 
-def _told_registered(chosen: Chosen, other: DepthCamera) -> str:
+def _registration_note(chosen: Chosen, other: DepthCamera) -> str:
     distance = 1e3 * float(np.linalg.norm(other.motion[:3, 3]))
     return (
         f"the depth of `{chosen.depth}` is of a camera of its own (f = {other.camera.intrinsics[0]:.1f}, "
         f"{distance:.0f} mm from that of the images): it is registered to the images of `{chosen.colour}`"
     )
-
-
-def _others(topics: Mapping[str, str]) -> str:
-    """Return the content of a bag without images, for the message."""
-    names = ", ".join(f"`{name}` ({kind})" for name, kind in list(topics.items())[:6] if kind not in IMAGES)
-    return f"; other topics: {names}" if names else ""
 
 
 @contextmanager
@@ -339,12 +301,6 @@ def _reader(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise InputError(f"bags of ROS need the package rosbags; {install_hint('bags')}") from None
-    if not path.is_dir() and not path.is_file():  # a pipe has no end
-        raise InputError(f"`{path}` is not a regular file; give a bag of ROS")
-    if path.suffix == ".bag" and path.is_file():  # else all of it is read in the search of a line's end
-        with path.open("rb") as file:
-            if not file.read(len(_BEGINS)) == _BEGINS:
-                raise InputError(f"`{path}` is not a bag of ROS: it must begin with `{_BEGINS.decode()}`")
     place = path.parent if path.suffix in ROS_2 else path
     if reason := no_whole_bag(place):
         raise InputError(reason)
@@ -354,8 +310,7 @@ def _reader(path: Path) -> Iterator[Any]:
     except InputError:
         raise
     except Exception as error:  # noqa: BLE001 - whatever a damaged file makes the package raise
-        again = f"; copy all of it again, or see whether `ros2 bag reindex {place}` mends it" if place.is_dir() else ""
-        raise InputError(f"`{path}` cannot be read as a bag of ROS: {error}{again}") from None
+        raise InputError(f"`{path}` cannot be read as a bag of ROS: {error}") from None
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:

@@ -16,6 +16,7 @@ from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.intrinsics import intrinsics_of, is_fisheye
 from vggtgeo.datasets.pose_files import (
     check_size,
+    parsing,
     poses_of,
     read_matrices,
     read_text,
@@ -28,8 +29,6 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
-_MOST_DIGITS = 20
-"""Maximum digits of a time in nanoseconds; Python refuses to parse thousands of digits."""
 _TRUTH = ("state_groundtruth_estimate0", "leica0", "vicon0")
 _MODEL = re.compile(r"^\s*distortion_model\s*:\s*['\"]?([\w-]+)", re.MULTILINE)
 
@@ -97,16 +96,10 @@ def _base(folder: Path) -> Path | None:
 
 
 def _images(file: Path) -> list[tuple[float, str]]:
-    entries = []
-    for number, line in enumerate(whole_text(file).splitlines(), start=1):
-        text = line.split("#", 1)[0].strip()
-        if not text:
-            continue
-        time, name = (part.strip() for part in text.partition(",")[::2])
-        if not time.isdecimal() or len(time) > _MOST_DIGITS:
-            raise InputError(f"`{file}`, line {number}: found {text[:60]!r}; expected `nanoseconds,file`")
-        entries.append((int(time) * 1e-9, name or f"{time}.png"))
-    return entries
+    with parsing(file, "lines `nanoseconds,file`"):
+        lines = [line.split("#", 1)[0] for line in whole_text(file).splitlines()]
+        parts = [[part.strip() for part in line.partition(",")[::2]] for line in lines if line.strip()]
+        return [(int(time) * 1e-9, name or f"{time}.png") for time, name in parts]
 
 
 def _numbers(file: Path) -> np.ndarray:

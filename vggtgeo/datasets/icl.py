@@ -1,29 +1,40 @@
-"""ICL-NUIM in its TUM-compatible form: `rgb/N.png`, `depth/N.png`, `*.gt.freiburg`, mostly with `associations.txt`.
+"""ICL-NUIM in its TUM-compatible form: `rgb/N.png`, `depth/N.png`, `*.gt.freiburg`, mostly with `associations.txt`; and
+as POV-Ray rendered it: `scene_00_0000.png` with the camera in `scene_00_0000.txt` and depth in `scene_00_0000.depth`.
 
 Its camera has a negative fy: the image's y axis points up. Images are read unchanged with a positive fy, which mirrors
-the world; so the ground truth is mirrored as well, and errors are the same. Source: A. Handa et al., "A benchmark
+the world; so the ground truth is mirrored as well, and errors are the same.
+
+The rendered depth is a text of 640 x 480 distances from the camera's centre along the ray of each pixel, metres, row by
+row. With the ray `r = ((u - cx) / fx, (v - cy) / fy, 1)` of the pixel (u, v) the depth is `z = d / |r|`. The camera's
+file names its place, where it looks and what is up in the image: `z = dir`, `x = up x z`, `y = z x x`, camera -> world,
+with y up. Source: A. Handa et al., "A benchmark
 for RGB-D visual odometry, 3D reconstruction and SLAM", ICRA 2014.
 """
 
 import itertools
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 import numpy as np
+from jaxtyping import Float
 
-from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
-from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
+from vggtgeo.datasets.depth_files import FIVE_THOUSANDTHS, metres_of_floats
+from vggtgeo.datasets.folder import FolderSequence, existing
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import guess_with_warning
-from vggtgeo.datasets.pose_files import poses_of, read_matrices, trajectory_of
-from vggtgeo.datasets.tum import MOST_LETTERS, read_pairs
+from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of, read_matrices, read_text, trajectory_of
+from vggtgeo.datasets.tum import MAX_LETTERS, read_pairs
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
 _CAMERA, _SIZE = (481.20, 480.00, 319.50, 239.50), (640, 480)
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_IMAGE = re.compile(r"scene_\d+_\d+")
+_VECTOR = r"^\s*{}\s*=\s*\[([^\]]*)\]"
 _LIST = "associations.txt"
 
 
@@ -43,7 +54,7 @@ class IclNuim(FolderSequence):
         if not file.is_file():
             return truth and bool(_numbered(folder))
         with file.open(encoding="utf-8-sig", errors="replace") as lines:
-            head = (line[:MOST_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
+            head = (line[:MAX_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
             words = next(filter(None, head), [])
         counted = len(words) == 4 and words[0].isdecimal() and "depth" in words[1]
         return counted or truth
@@ -57,21 +68,21 @@ class IclNuim(FolderSequence):
         frames = [
             (number / FRAMES_PER_SECOND, folder / image, folder / depth) for number, image, depth in sorted(pairs)
         ]
-        return cls.listed(folder, frames, lambda *size: icl_camera(folder, *size), FIVE_THOUSANDTHS)
+        return cls.listed(folder, frames, lambda *size: _camera(folder, *size), FIVE_THOUSANDTHS)
 
     def ground_truth(self) -> Trajectory | None:
         """Return the true poses of the mirrored world."""
-        return icl_truth(self.folder)
+        return _truth(self.folder)
 
 
-def icl_camera(folder: Path, width: int, height: int) -> Camera:
+def _camera(folder: Path, width: int, height: int) -> Camera:
     """Return the published camera, fy positive; a guess, with a warning, for images of another size."""
     if (width, height) != _SIZE:
         return guess_with_warning(str(folder), width, height)
     return Camera(_CAMERA, width, height)
 
 
-def icl_truth(folder: Path) -> Trajectory | None:
+def _truth(folder: Path) -> Trajectory | None:
     """Return the poses of `*.gt.freiburg` or `groundtruth.txt` in the mirrored world; None without either."""
     there = [*files_like(folder, "*.gt.freiburg"), folder / "groundtruth.txt"]
     file = next((file for file in there if file.is_file()), None)
@@ -79,7 +90,7 @@ def icl_truth(folder: Path) -> Trajectory | None:
         return None
     rows = read_matrices(file, 8)
     poses = poses_of(rows[:, 1:4], rows[:, 4:])
-    return trajectory_of(rows[:, 0] / FRAMES_PER_SECOND, MIRROR @ poses @ MIRROR, file)
+    return trajectory_of(rows[:, 0] / FRAMES_PER_SECOND, _MIRROR @ poses @ _MIRROR, file)
 
 
 def _numbered(folder: Path) -> list[tuple[float, str, str]]:
@@ -87,3 +98,72 @@ def _numbered(folder: Path) -> list[tuple[float, str, str]]:
     images = [path for path in files_like(folder / "rgb", "*.png") if path.stem.isdecimal()]
     both = [path for path in images if (folder / "depth" / path.name).is_file()]
     return [(float(path.stem), f"rgb/{path.name}", f"depth/{path.name}") for path in both]
+
+
+@dataclass(frozen=True)
+class IclNuimRaw(FolderSequence):
+    """One sequence. Times are numbers of images / 30 s. Truth: that of each image's camera, else `*.gt.freiburg`,
+    mirrored in y.
+    """
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Return whether `folder` has a `scene_00_0000.png` and its depth or camera beside."""
+        beside = (path.with_suffix(end) for path in _images(folder) for end in (".depth", ".txt"))
+        return any(file.is_file() for file in beside)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """List the images."""
+        images = list(_images(folder))
+        if not images:
+            raise InputError(f"`{folder}` has no images `scene_00_0000.png`; expected ICL-NUIM as POV-Ray rendered it")
+        # The number of the scene comes first in the names: `scene_00_0012`.
+        numbers = rows_of([path.with_name(path.stem.rpartition("_")[2]) for path in images], None)
+        frames = [
+            (number / FRAMES_PER_SECOND, image, existing(image.with_suffix(".depth")))
+            for number, image in zip(numbers, images, strict=True)
+        ]
+        return cls.listed(folder, frames, lambda *size: _camera(folder, *size))
+
+    def load_depth(self, path: Path) -> Float[np.ndarray, "h w"]:
+        """Return the depth along the optical axis, float32, NaN for none; InputError for another count of numbers."""
+        width, height = self.camera.width, self.camera.height
+        with parsing(path, f"{width} x {height} distances, metres"):
+            distances = np.array(read_text(path).split(), np.float32).reshape(height, width)
+        fx, fy, cx, cy = self.camera.intrinsics
+        across, down = (np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy
+        return metres_of_floats(distances / np.sqrt(1.0 + across**2 + down[:, None] ** 2))
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return the true poses of the mirrored world."""
+        there = [file for file in self.files if file.image.with_suffix(".txt").is_file()]
+        if not there:
+            return _truth(self.folder)
+        poses = np.stack([_pose(file.image.with_suffix(".txt")) for file in there])
+        return trajectory_of([file.timestamp for file in there], _MIRROR @ poses @ _MIRROR, self.folder)
+
+
+def _images(folder: Path) -> Iterable[Path]:
+    return (path for path in files_like(folder, "scene_*.png") if _IMAGE.fullmatch(path.stem))
+
+
+def _pose(file: Path) -> Float[np.ndarray, "4 4"]:
+    """Return camera -> world, the camera's y up."""
+    text = read_text(file)
+    place, ahead, up = (_vector(file, text, name) for name in ("cam_pos", "cam_dir", "cam_up"))
+    pose = np.eye(4)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # no direction: a pose that is none, left out
+        z = ahead / np.linalg.norm(ahead)
+        x = np.cross(up, z)
+        x /= np.linalg.norm(x)
+        pose[:3] = np.column_stack([x, np.cross(z, x), z, place])
+    return pose
+
+
+def _vector(file: Path, text: str, name: str) -> Float[np.ndarray, "3"]:
+    found = re.search(_VECTOR.format(name), text, re.MULTILINE)
+    numbers = numbers_of(found.group(1).replace(",", " ").split(), f"`{file}`: `{name}`") if found else []
+    if len(numbers) != 3:
+        raise InputError(f"`{file}` has no `{name} = [x, y, z]'`")
+    return np.array(numbers)

@@ -1,78 +1,42 @@
-"""Image and depth files: checked by Pillow (`image_checks.py`), decoded by simplejpeg and OpenCV.
+"""Image files: checked by Pillow before a decoder takes memory for their pixels, decoded by simplejpeg and OpenCV.
 
-simplejpeg reports damaged data of a JPEG, for which OpenCV returns grey or shifted pixels. Images are used as they are
-stored, whatever their EXIF orientation: intrinsics and depth of a folder are those of the stored pixels.
+Pillow reads the header, the EXIF orientation, and the check sums of a PNG. simplejpeg reports damaged data of a JPEG,
+for which OpenCV returns grey or shifted pixels. Images are used as they are stored, whatever their EXIF orientation:
+intrinsics and depth of a folder are those of the stored pixels.
 """
 
 import io
 import re
-from collections.abc import Callable
+import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import simplejpeg
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import UInt8
+from PIL import Image, UnidentifiedImageError
 
-from vggtgeo.datasets.exr_files import exr_depth
-from vggtgeo.datasets.image_checks import WHITE, ImageHeader, image_header
-from vggtgeo.io.archives import UNREADABLE, array_header
 from vggtgeo.io.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
-
-OTHER_PICTURES = frozenset(
-    {
-        *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".j2k", ".gif", ".tga", ".dng", ".raw", ".cr2", ".cr3", ".nef"),
-        *(".arw", ".raf", ".orf", ".rw2"),
-    }
-)
-"""Image formats of phones, cameras and image programs that are not read."""
-
-UNFINISHED = frozenset({".icloud", ".part", ".partial", ".filepart", ".crdownload", ".download", ".tmp"})
-"""Suffixes of files that are not downloaded, or still being copied."""
-
-DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
-
-
-@dataclass(frozen=True)
-class DepthFormat:
-    """Unit of depth files.
-
-    Fields: units_per_metre, of 16-bit values. invalid, 16-bit values that mean "no depth". floats_per_metre, units of
-    floating-point values, which are metres by convention.
-    """
-
-    units_per_metre: float
-    invalid: tuple[int, ...] = (0,)
-    floats_per_metre: float = 1.0
-
-
-MIN_DEPTH, MAX_DEPTH = 1e-3, 1000.0
-"""Metres, of floating-point depth: renderers write 1e10 for the background, and swapped bytes read as 1e-40."""
-
-MILLIMETRES = DepthFormat(1000.0, (0, 65535))
-"""7-Scenes: 0 and 65535 mean no depth."""
-
-FIVE_THOUSANDTHS = DepthFormat(5000.0)
-"""TUM RGB-D: 5000 is one metre."""
-
+OTHER_PICTURES = frozenset({".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".dng", ".raw", ".cr2", ".nef", ".arw"})
+"""Image formats of phones and cameras that are not read."""
+MAX_PIXELS = 100_000_000
+"""Pixels of an image that is decoded: 0.3 GB."""
+MAX_BYTES = 700_000_000
+"""Size of an image file: 100 million pixels of 16 bits in three channels, uncompressed, and some."""
 BITS = (8, 10, 12, 14, 16)
 """Bits of the values in a 16-bit file: cameras of 10 and 12 bits write such files without filling them."""
+_FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "PPM", "TIFF")
+_ORIENTATION = 274
+_BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, struct.error, OverflowError)
+"""What Pillow raises for damaged files."""
+# Of damaged EXIF data and directories: what is wrong with a file is the error below.
+warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
 _FEW_EXTRA_BYTES = re.compile(r"data: [1-4] extraneous bytes before marker 0xd9")
 """Encoders of some cameras write a few bytes between the data and the end mark of a JPEG."""
-_SHOWN_TO_STORED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
-    1: lambda image: image,
-    2: lambda image: image[:, ::-1],
-    3: lambda image: image[::-1, ::-1],
-    4: lambda image: image[::-1],
-    5: lambda image: image.swapaxes(0, 1),
-    6: np.rot90,
-    7: lambda image: image[::-1, ::-1].swapaxes(0, 1),
-    8: lambda image: np.rot90(image, -1),
-}
-"""Inverse of each EXIF orientation: OpenCV applies that of a TIFF whatever its flags."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +48,16 @@ class ImageFile:
 
     image: UInt8[np.ndarray, "h w 3"]
     bits: int
+    orientation: int
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """Header of an image file. Fields: width, height, pixels; format, Pillow's name; orientation, EXIF, 1 to 8."""
+
+    width: int
+    height: int
+    format: str
     orientation: int
 
 
@@ -103,13 +77,10 @@ def read_image_file(path: Path, min_bits: int = 8) -> ImageFile:
 def image_in(content: bytes, path: Path, min_bits: int = 8) -> ImageFile:
     """Return the image in the content of a file; path: for messages. Otherwise as `read_image_file`."""
     header = image_header(content, path)
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = _pixels(content, header, path, flags)
+    image = _pixels(content, header, path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image.dtype not in (np.uint8, np.uint16) or image.ndim != 3:
         raise InputError(f"`{path}` is {image.dtype} of shape {image.shape}; images must have 8 or 16 bits")
     image, bits = eight_bits(image, min_bits)
-    if bits == BITS[0] and header.white < WHITE:
-        image = cv2.convertScaleAbs(image, alpha=WHITE / header.white)
     return ImageFile(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), bits, header.orientation)
 
 
@@ -130,78 +101,37 @@ def orientation_message(path: Path, orientation: int) -> str:
     )
 
 
-def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
-    """Return depth, float32 metres, NaN for none, of an image, a PFM, an EXR or an array of NumPy (`.npy`).
+def image_header(content: bytes, path: Path) -> ImageHeader:
+    """Return the header of an image file; path: for messages.
 
     Raises:
-        InputError: the file cannot be read, or is not one channel of uint16 or floats.
+        InputError: the file is empty, truncated, too large, or of a format that is not read.
 
     """
-    codes = read_codes(path)
-    codes = codes[..., 0] if codes.ndim == 3 and codes.shape[2] == 1 else codes
-    if codes.ndim == 2 and np.issubdtype(codes.dtype, np.floating):
-        return metres_of_floats(codes, coding.floats_per_metre)
-    if codes.dtype != np.uint16 or codes.ndim != 2:
-        raise InputError(
-            f"`{path}` is {codes.dtype} of shape {codes.shape}; depth must have one channel, of uint16 or of floats in "
-            "metres"
-        )
-    return metres_of_codes(codes, coding)
-
-
-def metres_of_codes(codes: UInt16[np.ndarray, "h w"], coding: DepthFormat) -> Float[np.ndarray, "h w"]:
-    """Return depth of 16-bit values, float32 metres, NaN for none."""
-    depth = np.divide(codes, np.float32(coding.units_per_metre), dtype=np.float32)
-    for code in coding.invalid:
-        depth[codes == code] = np.nan
-    return depth
-
-
-def metres_of_floats(codes: np.ndarray, per_metre: float = 1.0) -> Float[np.ndarray, "h w"]:
-    """Return depth of floating-point values, float32 metres, NaN outside `MIN_DEPTH` to `MAX_DEPTH`."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        depth = np.divide(codes, per_metre).astype(np.float32)
-        return np.where((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH), depth, np.float32(np.nan))
-
-
-def floats_out_of_range(path: Path) -> str:
-    """Return a hint about the unit if a file of floats has depth and no value of it is in range; "" otherwise."""
-    codes = read_codes(path)
-    known = codes[np.isfinite(codes) & (codes > 0)] if np.issubdtype(codes.dtype, np.floating) else codes[:0]
-    if not known.size:
-        return ""
-    return (
-        f" (`{path}`: its depth is {known.min():g} to {known.max():g}; it must be {MIN_DEPTH:g} to {MAX_DEPTH:g} m: "
-        "give the values in a metre by `--depth-scale`, 1000 for millimetres)"
-    )
-
-
-def read_codes(path: Path) -> np.ndarray:
-    """Return the values of an image or an array of NumPy as they are stored; raise InputError if it cannot be read."""
-    if path.suffix.lower() == ".npy":
-        return _array(path)
-    if path.suffix.lower() == ".exr":
-        return exr_depth(path)
-    return decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
-
-
-def _array(path: Path) -> np.ndarray:
-    """Return the array of an `.npy` file; pickles are not opened, and the declared size is checked first."""
-    content = file_content(path)
+    if not content:
+        raise InputError(f"`{path}` is empty")
     try:
-        stream = io.BytesIO(content)
-        header = array_header(stream)
-        if header.dtype.hasobject:
-            raise ValueError("it holds Python objects")
-        if header.bytes != len(content) - stream.tell():
-            raise ValueError(f"it declares {header.bytes} bytes and has {len(content) - stream.tell()}")
-        return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
-    except UNREADABLE as error:
-        raise InputError(f"`{path}` is not an array of NumPy that can be read: {error}") from None
-
-
-MAX_BYTES = 700_000_000
-"""Size of an image file: 100 million pixels of 16 bits in three channels, uncompressed, and some."""
+        with Image.open(io.BytesIO(content), formats=_FORMATS) as image:  # its own `getexif` of a PNG decodes the image
+            orientation = (
+                Image.Image.getexif(image).get(_ORIENTATION, 1) if image.format in ("JPEG", "MPO", "PNG", "WEBP") else 1
+            )
+            header = ImageHeader(*image.size, image.format or "", orientation if orientation in range(1, 9) else 1)
+            if header.width * header.height > MAX_PIXELS:
+                size = f"{header.width} x {header.height} pixels"
+                raise InputError(f"`{path}` declares {size}; at most {MAX_PIXELS // 10**6} million are decoded")
+            image.verify()  # the check sums of a PNG, up to its end
+    except InputError:
+        raise
+    except Image.DecompressionBombError as error:
+        raise InputError(f"`{path}` has too many pixels: {error}") from None
+    except UnidentifiedImageError:
+        raise InputError(
+            f"`{path}` begins with {content[:16]!r}; it must be a PNG, JPEG, TIFF, WebP, BMP or PNM: convert it, or "
+            "copy it again if it is damaged"
+        ) from None
+    except _BROKEN as error:
+        raise InputError(f"`{path}` is truncated or damaged: {error}") from None
+    return header
 
 
 def is_there(path: Path) -> bool:
@@ -221,8 +151,8 @@ def file_content(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
         if size > max_bytes:
             raise InputError(f"`{path}` has {size} bytes; at most {max_bytes} are read")
         return path.read_bytes()
-    except (OSError, ValueError) as error:
-        raise InputError(f"`{path}` cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    except OSError as error:
+        raise InputError(f"`{path}` cannot be read: {error.strerror or error}") from None
 
 
 def decoded(content: bytes, path: Path, flags: int) -> np.ndarray:
@@ -241,11 +171,6 @@ def decoded(content: bytes, path: Path, flags: int) -> np.ndarray:
 
 
 def _pixels(content: bytes, header: ImageHeader, path: Path, flags: int) -> np.ndarray:
-    if header.scale != 1:
-        raise InputError(
-            f"`{path}` states a scale of {header.scale:g}, which programs read in different ways; it must be -1.0 or "
-            "1.0, with depth in metres"
-        )
     if header.format in ("JPEG", "MPO"):
         try:
             return simplejpeg.decode_jpeg(content, "BGR")
@@ -259,5 +184,4 @@ def _pixels(content: bytes, header: ImageHeader, path: Path, flags: int) -> np.n
         raise InputError(f"`{path}` cannot be decoded: {error.err}") from None
     if image is None:
         raise InputError(f"`{path}` cannot be decoded: it is damaged, or of a kind that OpenCV does not decode")
-    stored = _SHOWN_TO_STORED[header.orientation](image) if header.format == "TIFF" else image
-    return np.ascontiguousarray(stored)
+    return image

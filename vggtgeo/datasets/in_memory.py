@@ -11,15 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.datasets.depth_files import MAX_DEPTH, MIN_DEPTH
 from vggtgeo.datasets.frame import Frame, check_depth, check_selection, described
-from vggtgeo.datasets.image_checks import MAX_PIXELS
-from vggtgeo.datasets.image_files import MAX_DEPTH, MIN_DEPTH
+from vggtgeo.datasets.image_files import MAX_PIXELS
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.given import check_whole
-
-_LAST = 2**53
-"""Maximum number of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,44 +57,40 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: floa
 
 
 def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
-    """Yield all frames; indices must increase, and depth after a first frame without depth is warned about."""
-    last, told, doubtful = first, first.depth is not None, _tell_of_depth(first)
-    check_whole(f"the index of {first.name}", first.index, 0, _LAST)
+    """Yield all frames; warn of depth that later frames alone have, and of depth in another unit."""
+    last, warned = first, first.depth is not None
+    _warn_of_unit(first)
     yield first
     for frame in others:
-        check_whole(f"the index of {frame.name}", frame.index, 0, _LAST)
-        doubtful = doubtful or _tell_of_depth(frame)
         if frame.index <= last.index:
             raise InputError(
                 f"`{frame.name}` has the index {frame.index} after {last.index}; number the frames from 0 on, as "
                 "`enumerate` does"
             )
-        if frame.depth is not None and not told:
+        if frame.depth is not None and not warned:
             warnings.warn(
                 f"`{frame.name}` has depth, and `{first.name}` had none: depth is used where the first frame has it, "
                 "all NaN if need be; reading the images only",
                 InputWarning,
                 stacklevel=2,
             )
-            told = True
+            warned = True
         yield frame
         last = frame
 
 
-def _tell_of_depth(frame: Frame) -> bool:
-    """Warn of depth without a value in range, and return whether that is so; all NaN is valid."""
+def _warn_of_unit(frame: Frame) -> None:
+    """Warn of depth without a value in range; all NaN is valid."""
     depth = frame.depth
     if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or np.isnan(depth).all():
-        return False
-    if ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
-        return False
-    warnings.warn(
-        f"the depth of `{frame.name}` goes from {np.nanmin(depth):g} to {np.nanmax(depth):g}, and none of it is from "
-        f"{MIN_DEPTH:g} to {MAX_DEPTH:g} m: are these metres (millimetres: divide by 1000.0)? It is not used",
-        InputWarning,
-        stacklevel=3,
-    )
-    return True
+        return
+    if not ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
+        warnings.warn(
+            f"the depth of `{frame.name}` goes from {np.nanmin(depth):g} to {np.nanmax(depth):g}, and none of it is "
+            f"from {MIN_DEPTH:g} to {MAX_DEPTH:g} m: are these metres (millimetres: divide by 1000.0)? It is not used",
+            InputWarning,
+            stacklevel=3,
+        )
 
 
 def _frame(item: Any, index: int, rate: float) -> Frame:
@@ -125,11 +117,6 @@ def copied(frame: Frame) -> Frame:
 
 def _own(name: str, given: Any) -> Any:
     """Return a copy of an image or of depth; raise InputError if it is too large."""
-    if not isinstance(given, np.ndarray) or given.ndim < 2:
-        return given
-    height, width = given.shape[:2]
-    if width * height > MAX_PIXELS:
-        raise InputError(
-            f"`{name}` is {width} x {height} pixels, more than {MAX_PIXELS // 10**6} million; reduce the images"
-        )
-    return given.copy()
+    if isinstance(given, np.ndarray) and given[..., :1].size > MAX_PIXELS:
+        raise InputError(f"`{name}` has the shape {given.shape}, more than {MAX_PIXELS // 10**6} million pixels")
+    return given.copy() if isinstance(given, np.ndarray) else given

@@ -3,13 +3,13 @@
 import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.pose_files import check_size, read_json, same_size
+from vggtgeo.datasets.pose_files import check_size, parsing, read_json, same_size
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 from vggtgeo.io.text_files import whole_text
@@ -18,20 +18,23 @@ NARROWEST, WIDEST = 1.0, 170.0
 """Minimum and maximum field of view of a pinhole camera, degrees."""
 FARTHEST_CENTRE = 10.0
 """Maximum coordinate of a principal point, in image sizes: a cropped image may have it outside."""
-LEAST_VALID = 0.5
+MIN_VALID = 0.5
 """Minimum share of the undistorted image that is inside the original; lenses of benchmarks keep more than 0.8."""
-MOST_ASPECT = 4.0
+MAX_ASPECT = 4.0
 """Maximum ratio of the focal lengths, either way; 1 for square pixels, up to 2 for interlaced and anamorphic ones."""
 _OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
 _FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
 """Names of the two lens models in ROS, Kalibr, EuRoC and RealSense."""
+SAME_SHAPE = 0.01
+"""Maximum relative difference of the aspects of images of one shape."""
+ONE_CAMERA = 0.02
+"""Maximum relative difference of the focal lengths of one camera; autofocus changes them by less."""
 MAX_BYTES = 100_000
 """Maximum size of a file with a few numbers and comments."""
 CALIBRATION = "calibration.txt"
 FISHEYE = "fisheye"
 """Last word of such a file, after four coefficients of Kannala and Brandt."""
 MATRIX = "camera-intrinsics.txt"
-_SAYS_CAMERA = re.compile(r"(intrinsic|calib|camera|(^|[_.-])k(?=[_.-])).*\.(txt|csv)$|^k$", re.IGNORECASE)
 JSON = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
 """Names of cameras that recorders write."""
 
@@ -49,15 +52,16 @@ _FREIBURG_NAME = re.compile(r"freiburg([123])|(?:^|[_-])fr([123])(?:[_-]|$)", re
 
 def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
     """Return `"fx,fy,cx,cy"` as numbers, pixels; raise InputError unless four numbers, focal lengths positive."""
-    return check_intrinsics(_numbers("`intrinsics`", text, "fx,fy,cx,cy"))
+    try:
+        return check_intrinsics(_numbers(text))
+    except InputError as error:
+        raise InputError(f"`intrinsics`: {error}; expected fx,fy,cx,cy") from None
 
 
 def intrinsics_of(file: Path, values: object) -> tuple[float, float, float, float]:
     """Return `values` as fx, fy, cx, cy; raise InputError naming the file if they are invalid."""
-    try:
+    with parsing(file, "fx, fy, cx, cy, in pixels"):
         return check_intrinsics(values)
-    except InputError as error:
-        raise InputError(f"`{file}`: {error}") from None
 
 
 def pinhole_of(matrix: np.ndarray) -> tuple[float, float, float, float]:
@@ -81,18 +85,19 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
     """Return the camera of a file in `folder`, None without one.
 
     Files: `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, or `fx fy cx cy k1 k2 k3 k4 fisheye`), else
-    `camera-intrinsics.txt` (3 x 3), else JSON of Open3D's and RealSense's recorders. Raises InputError for an invalid
-    file.
+    `camera-intrinsics.txt` (3 x 3), else JSON of Open3D's and RealSense's recorders, else Record3D's `metadata.json`.
+    Raises InputError for an invalid file.
     """
     readers = {CALIBRATION: _read_calibration, MATRIX: _read_matrix, **dict.fromkeys(JSON, _read_json_camera)}
     for name, read in readers.items():
         file = folder / name
         if file.is_file():
-            camera = read(file, width, height)
+            with parsing(file, _EXPECTED.get(name, _EXPECTED[JSON[0]])):
+                camera = read(file, width, height)
             check_plausible(f"`{file}`", camera)
             warn_of_other_size(f"`{file}`", camera)
             return camera
-    return _camera_of_record3d(folder, width, height) or _camera_of_another_name(folder, width, height)
+    return _camera_of_record3d(folder / "metadata.json", width, height)
 
 
 def camera_or_guess(folder: Path, width: int, height: int) -> Camera:
@@ -100,74 +105,29 @@ def camera_or_guess(folder: Path, width: int, height: int) -> Camera:
     return camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
 
 
-def _camera_of_record3d(folder: Path, width: int, height: int) -> Camera | None:
-    """Return the camera of `metadata.json` of an export of Record3D; None, with a warning, if the file is invalid; None
-    if it is another program's.
-    """
-    file = folder / "metadata.json"
-    try:
-        content = read_json(file) if file.is_file() else None
-    except InputError as error:
-        warnings.warn(f"{error}: not used", InputWarning, stacklevel=5)
+def _camera_of_record3d(file: Path, width: int, height: int) -> Camera | None:
+    """Return the camera of the metadata of an export of Record3D; None for another program's file."""
+    content = read_json(file) if file.is_file() else None
+    if not isinstance(content, dict) or not {"K", "w", "h"} <= content.keys():
         return None
-    if not isinstance(content, dict) or not same_size((content.get("w"), content.get("h")), (width, height)):
+    if not same_size((content["w"], content["h"]), (width, height)):
         return None
-    values = record3d_intrinsics(content)
-    if values is None:
-        if "K" in content:
-            warnings.warn(f"`{file}`: its `K` is no matrix of a camera: not used", InputWarning, stacklevel=5)
-        return None
-    camera = Camera(intrinsics_of(file, values), width, height)
+    camera = Camera(record3d_intrinsics(file, content), width, height)
     check_plausible(f"`{file}`", camera)
     return camera
 
 
-def record3d_intrinsics(content: Mapping[str, Any]) -> tuple[float, ...] | None:
+def record3d_intrinsics(file: Path, content: Mapping[str, Any]) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy of Record3D's metadata: the median over frames (autofocus changes them slightly), else the
-    matrix `K`, by columns; None if neither is valid.
+    matrix `K`, by columns; raise InputError if they are invalid.
     """
-    frames, matrix = content.get("perFrameIntrinsicCoeffs"), content.get("K")
-    try:
-        if isinstance(frames, list) and frames:
-            return tuple(np.median(np.array(frames, np.float64).reshape(len(frames), 4), axis=0).tolist())
-        columns = np.array(matrix, np.float64).reshape(9)
-    except (ValueError, TypeError):
-        return None
-    return tuple(columns[[0, 4, 6, 7]].tolist())
-
-
-def _camera_of_another_name(folder: Path, width: int, height: int) -> Camera | None:
-    """Return the camera of the only text file with a camera's name (`intrinsics.K.txt`, `cam_K.txt`) that contains just
-    the four numbers or the matrix of a pinhole, with a warning; None otherwise.
-    """
-    named = sorted(path for path in folder.iterdir() if _SAYS_CAMERA.search(path.name) and path.is_file())
-    cameras = {path: found for path in named if (found := _bare_pinhole(path, width, height)) is not None}
-    if len(cameras) != 1:
-        return None
-    ((file, camera),) = cameras.items()
-    numbers = " ".join(f"{value:g}" for value in camera.intrinsics)
-    warnings.warn(
-        f"`{file}` is taken for the camera, fx fy cx cy = {numbers}; call it `{CALIBRATION}` if that is right",
-        InputWarning,
-        stacklevel=4,
-    )
-    return camera
-
-
-def _bare_pinhole(file: Path, width: int, height: int) -> Camera | None:
-    if file.stat().st_size > MAX_BYTES:
-        return None
-    try:
-        numbers = [float(word) for word in _without_comments(file).replace(",", " ").split()]
-        matrix = np.reshape(numbers, (4, 4) if len(numbers) == 16 else (3, 3)) if len(numbers) in (9, 16) else None
-        if matrix is not None and np.allclose([matrix[0, 1], *matrix[1:3, 0], *matrix[2, 1:3]], (0, 0, 0, 0, 1)):
-            numbers = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-        camera = Camera(check_intrinsics(numbers), width, height)
-        check_plausible(f"`{file}`", camera)
-    except (InputError, ValueError):
-        return None
-    inside = 0 < camera.intrinsics[2] < width and 0 < camera.intrinsics[3] < height
-    return camera if inside else None
+    frames = content.get("perFrameIntrinsicCoeffs")
+    with parsing(file, "nine numbers `K`, or four of each frame in `perFrameIntrinsicCoeffs`"):
+        if frames:
+            values = np.median(np.array(frames, np.float64).reshape(len(frames), 4), axis=0)
+        else:
+            values = np.array(content["K"], np.float64).reshape(9)[[0, 4, 6, 7]]
+        return check_intrinsics(tuple(values.tolist()))
 
 
 def check_plausible(where: str, camera: Camera) -> None:
@@ -187,20 +147,37 @@ def check_plausible(where: str, camera: Camera) -> None:
         raise InputError(
             f"{where}: fx {fx:g} and fy {fy:g} make a field of view of {angle:.3g} deg {size}; they must be in pixels"
         )
-    if max(fx, fy) > MOST_ASPECT * min(fx, fy):
+    if max(fx, fy) > MAX_ASPECT * min(fx, fy):
         raise InputError(
-            f"{where}: fx {fx:g} and fy {fy:g} differ by more than a factor of {MOST_ASPECT:g}; give pixels"
+            f"{where}: fx {fx:g} and fy {fy:g} differ by more than a factor of {MAX_ASPECT:g}; give pixels"
         )
     if abs(cx) > FARTHEST_CENTRE * width or abs(cy) > FARTHEST_CENTRE * height:
         raise InputError(f"{where}: the principal point ({cx:g}, {cy:g}) is far outside {size}; give pixels")
     if any(camera.distortion):
         valid = camera.undistorter().valid
         share = 1.0 if valid is None else float(valid.mean())
-        if share < LEAST_VALID:
+        if share < MIN_VALID:
             raise InputError(
                 f"{where}: the distortion {camera.distortion} leaves {100 * share:.0f} % of the image; it must be "
                 "k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order"
             )
+
+
+def check_same_shape(file: Path, stated: tuple[float, float], size: tuple[int, int]) -> None:
+    """Raise InputError if a camera's file is of images of another aspect than those of `size`."""
+    if abs(stated[0] * size[1] - stated[1] * size[0]) > SAME_SHAPE * stated[0] * size[1]:
+        raise InputError(
+            f"`{file}` is of images of {stated[0]:g} x {stated[1]:g} pixels; those here are {size[0]} x {size[1]}, "
+            "which is another shape: were they turned or cut afterwards?"
+        )
+
+
+def warn_of_zoom(file: Path, focal_lengths: Sequence[float]) -> None:
+    """Warn if focal lengths of the frames of one camera differ by more than autofocus changes them."""
+    low, high = min(focal_lengths), max(focal_lengths)
+    if high - low > ONE_CAMERA * abs(low):
+        text = f"focal lengths of its frames go from {low:g} to {high:g} pixels; the median is taken for all"
+        warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=5)
 
 
 def published_camera(name: str, width: int, height: int) -> Camera | None:
@@ -230,30 +207,14 @@ def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float =
 
 
 def _read_calibration(file: Path, width: int, height: int) -> Camera:
-    text = _without_comments(file)
-    words = text.split()
+    words = _without_comments(file).replace(",", " ").split()
     fisheye = words[-1:] == [FISHEYE]
-    expected = "fx fy cx cy k1 k2 k3 k4 fisheye" if fisheye else "fx fy cx cy [k1 k2 p1 p2]"
-    numbers = _numbers(f"`{file}`", " ".join(words[:-1]) if fisheye else text, expected)
-    if len(numbers) in (9, 12, 16) and numbers[1] == 0:
-        raise InputError(
-            f"`{file}` holds {len(numbers)} numbers, which look like a matrix; expected {expected}: a 3 x 3 matrix "
-            f"belongs into `{MATRIX}`"
-        )
-    try:
-        return Camera(check_intrinsics(numbers[:4]), width, height, check_distortion(numbers[4:]), fisheye=fisheye)
-    except InputError as error:
-        raise InputError(f"`{file}`: {error}") from None
+    numbers = _numbers(" ".join(words[:-1] if fisheye else words))
+    return Camera(check_intrinsics(numbers[:4]), width, height, check_distortion(numbers[4:]), fisheye=fisheye)
 
 
 def _read_matrix(file: Path, width: int, height: int) -> Camera:
-    numbers = _numbers(f"`{file}`", _without_comments(file), "a 3 x 3 matrix of intrinsics")
-    if len(numbers) != 9:
-        raise InputError(f"`{file}`: found {len(numbers)} numbers; expected a 3 x 3 matrix of intrinsics")
-    try:
-        return Camera(pinhole_of(np.reshape(numbers, (3, 3))), width, height)
-    except InputError as error:
-        raise InputError(f"`{file}`: {error}") from None
+    return Camera(pinhole_of(np.reshape(_numbers(_without_comments(file)), (3, 3))), width, height)
 
 
 def _read_json_camera(file: Path, width: int, height: int) -> Camera:
@@ -261,55 +222,43 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
     `fy`, `ppx`, `ppy`, or `cx`, `cy`).
     """
     content = read_json(file)
-    if not isinstance(content, dict):
-        raise InputError(f"`{file}`: found {type(content).__name__}; expected an object with the camera")
     check_size(file, (content.get("width", width), content.get("height", height)), (width, height))
     matrix = content.get("intrinsic_matrix")
-    if isinstance(matrix, list) and len(matrix) == 9:
-        by_row = matrix[6:8] == [0, 0] and matrix[2] != 0  # of a user's script
-        found = [matrix[0], matrix[4], *(matrix[2:6:3] if by_row else matrix[6:8])]
+    if matrix is not None:
+        found = np.reshape(matrix, 9)[[0, 4, 6, 7]].tolist()
     else:
         found = [content.get(name, content.get(other)) for name, other in _JSON_NAMES]
-    if not all(isinstance(number, int | float) and not isinstance(number, bool) for number in found):
-        raise InputError(f"`{file}`: expected `intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`")
-    try:
-        return Camera(check_intrinsics(tuple(map(float, found))), width, height, _of_realsense(file, content))
-    except InputError as error:
-        raise InputError(f"`{file}`: {error}") from None
+    return Camera(check_intrinsics(tuple(map(float, found))), width, height, _of_realsense(file, content))
 
 
 def _of_realsense(file: Path, content: Mapping[str, Any]) -> tuple[float, ...]:
     """Return k1 k2 p1 p2 k3 of `coeffs` if its `model` is OpenCV's; warn of another model (the inverse one), which is
     ignored.
     """
-    given = content.get("coeffs")
-    if given is None:
-        return ()
-    if not isinstance(given, list) or not all(isinstance(number, int | float) for number in given):
-        raise InputError(f"`coeffs` is {str(given)[:40]}; expected a list of numbers, k1 k2 p1 p2 k3")
-    model = str(content.get("model", "")).lower().removeprefix("distortion.").replace(" ", "_").replace("-", "_")
-    if not any(given) or model == "none":
+    coefficients = content.get("coeffs") or ()
+    model = str(content.get("model", "")).lower().removeprefix("distortion.").replace(" ", "_")
+    if not any(coefficients) or model == "none":
         return ()
     if model in ("", "brown_conrady", "modified_brown_conrady"):
-        return check_distortion(tuple(map(float, given)))
+        return check_distortion(tuple(map(float, coefficients)))
     text = f"`model` is {model[:40]}, which is not read: its `coeffs` are left out; undistort the images"
     warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=5)
     return ()
 
 
-_DECIMAL_COMMA = re.compile(r"-?\d+,\d+")
+_EXPECTED = {
+    CALIBRATION: "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or fx fy cx cy k1 k2 k3 k4 fisheye",
+    MATRIX: "a 3 x 3 matrix of intrinsics",
+    JSON[0]: "`intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`",
+}
 _JSON_NAMES = (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy"))
 
 
-def _numbers(where: str, text: str, expected: str) -> tuple[float, ...]:
-    if len(words := text.split()) >= 4 and all(map(_DECIMAL_COMMA.fullmatch, words)):
-        raise InputError(f"{where}: found {text.strip()!r}; write decimals with a point: {expected}")
+def _numbers(text: str) -> tuple[float, ...]:
     try:
-        if "_" in text:  # which Python accepts within a number
-            raise ValueError(text)
         return tuple(float(word) for word in text.replace(",", " ").split())
     except ValueError:
-        raise InputError(f"{where}: found {text.strip()!r}; expected the numbers {expected}") from None
+        raise InputError(f"found {text.strip()!r}, which must be numbers") from None
 
 
 def _without_comments(file: Path) -> str:
@@ -322,15 +271,6 @@ def _without_comments(file: Path) -> str:
 def warn_of_other_size(where: str, camera: Camera) -> None:
     """Warn of a principal point or a field of view that is implausible for images of this size."""
     fx, fy, cx, cy = camera.intrinsics
-    near = lambda x, y: abs(cx - x) < 0.05 * camera.width and abs(cy - y) < 0.05 * camera.height
-    middle = 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)
-    if near(*middle[::-1]) and not near(*middle):
-        warnings.warn(
-            f"{where}: the principal point ({cx:g}, {cy:g}) is the middle of images of {camera.height} x "
-            f"{camera.width}; these are {camera.width} x {camera.height}: are cx and cy in each other's place?",
-            InputWarning,
-            stacklevel=3,
-        )
     centred = 0 <= cx < camera.width and 0 <= cy < camera.height
     field_of_view = math.degrees(2 * math.atan(0.5 * max(camera.width / fx, camera.height / fy)))
     if not centred or field_of_view < 10:

@@ -15,10 +15,10 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_or_guess, intrinsics_of
-from vggtgeo.datasets.pose_files import numbers_of, read_matrices, trajectory_of_rows
+from vggtgeo.datasets.pose_files import numbers_of, parsing, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.errors import InputError, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
 RATE = 10.0
@@ -88,28 +88,20 @@ class Kitti(FolderSequence):
 
 
 def _times(folder: Path, place: Path) -> list[float]:
-    """Return the times of all lines; empty without a list."""
+    """Return the times of all lines, seconds; empty without a list."""
     seconds, stamps = folder / "times.txt", place.parent / "timestamps.txt"
-    file = next((file for file in (seconds, stamps) if file.is_file()), None)
-    if file is None:
+    file = seconds if seconds.is_file() else stamps
+    if not file.is_file():
         return []
-    times = read_matrices(file, 1)[:, 0].tolist() if file == seconds else _moments(file)
-    if not times:
-        raise InputError(
-            f"`{file}` has no time; give that of the drive, or remove the file (then {RATE:g} frames a second)"
-        )
+    with parsing(file, "the time of each image, `0.1` or `2011-09-26 13:02:25.594360389`"):
+        if file == seconds:
+            times = read_matrices(file, 1)[:, 0].tolist()
+        else:
+            moments = [datetime.fromisoformat(line[:26]) for line in whole_text(file).splitlines() if line.strip()]
+            times = [(moment - moments[0]).total_seconds() for moment in moments]
+        if not times:
+            raise ValueError("it has no time")
     return times
-
-
-def _moments(file: Path) -> list[float]:
-    """Return seconds since the first line's time."""
-    text = whole_text(file)
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    try:
-        moments = [datetime.fromisoformat(line[:26]) for line in lines]
-        return [(moment - moments[0]).total_seconds() for moment in moments]
-    except (ValueError, TypeError) as error:  # times with and without a time zone
-        raise InputError(f"`{file}`: {error}; expected lines `2011-09-26 13:02:25.594360389`") from None
 
 
 def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, float]:
@@ -122,9 +114,6 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
         values = _calibration(file)
         if _is_unrectified(file, values, name, width, height):
             return _as_calibrated(file, values, name, width, height), 0.0
-        if values and not values.keys() & {*_LINES[name]}:
-            lines = " or ".join(f"`{key}:`" for key in _LINES[name])
-            warnings.warn(f"`{file}` has no line {lines}, the camera of `{name}`: not used", InputWarning, stacklevel=4)
         for key in _LINES[name]:
             if key in values:
                 row = _numbers(file, key, values[key], 12)
@@ -157,7 +146,5 @@ def _as_calibrated(file: Path, values: Mapping[str, str], name: str, width: int,
 
 
 def _numbers(file: Path, key: str, text: str, count: int) -> list[float]:
-    values = numbers_of(text.split(), f"`{file}`: `{key}`")
-    if len(values) != count:
-        raise InputError(f"`{file}`: `{key}` has {len(values)} numbers; expected {count}")
-    return values
+    with parsing(file, f"`{key}` of {count} numbers"):
+        return np.reshape(numbers_of(text.split(), f"`{key}`"), count).tolist()

@@ -1,29 +1,20 @@
 """Choice of the reader of a path."""
 
-import math
 import os
-import statistics
 import warnings
-from collections import deque
-from collections.abc import Iterator
-from contextlib import suppress
-from itertools import islice, pairwise
 from pathlib import Path
 from typing import Protocol
 
 from vggtgeo.datasets.bags import RosBag, is_bag, no_whole_bag
 from vggtgeo.datasets.euroc import Euroc
-from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Sequence
-from vggtgeo.datasets.icl import IclNuim
-from vggtgeo.datasets.icl_raw import IclNuimRaw
+from vggtgeo.datasets.icl import IclNuim, IclNuimRaw
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES, is_there
 from vggtgeo.datasets.images import ImageFolder
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
-from vggtgeo.datasets.not_read import reason_not_read
 from vggtgeo.datasets.phone_exports import Polycam, Scanner3d
 from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
@@ -33,7 +24,7 @@ from vggtgeo.datasets.scannet import ScanNet
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
-from vggtgeo.datasets.video import FASTEST, VideoFile
+from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.views import with_rate
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import path_of
@@ -108,18 +99,7 @@ def open_sequence(
     sequence = _open_place(place, kind, depth)
     if sequence.camera.known:
         check_plausible(f"the camera of `{os.fspath(path)}`", sequence.camera)
-    if isinstance(sequence, FolderSequence):
-        _check_pace(sequence)
     return sequence if rate is None else with_rate(sequence, rate)
-
-
-def _check_pace(sequence: FolderSequence) -> None:
-    """Warn of more frames a second than cameras take, such as microseconds in place of nanoseconds."""
-    times = [file.timestamp for file in sequence.files]
-    apart = statistics.median(after - before for before, after in pairwise(times)) if len(times) > 1 else math.inf
-    if 0 < apart < 1 / FASTEST:
-        text = f"its frames are {apart:.2g} s apart, more than {FASTEST} a second: are its times in another unit?"
-        warnings.warn(f"`{sequence.folder}`: {text}", InputWarning, stacklevel=3)
 
 
 def is_readable(place: Path) -> bool:
@@ -163,34 +143,33 @@ def _open_place(place: Path, kind: str | None, depth: bool) -> Sequence:
 def _open_folder(place: Path, kind: str | None) -> Sequence:
     if not any(place.iterdir()):
         raise InputError(f"`{place}` is empty; give a folder with images")
-    dead = _dead_links(place)
-    if dead and (kind is not None or any(reader.matches(place) for reader in FOLDER_KINDS.values())):
-        warnings.warn(f"`{place}`: {dead}", InputWarning, stacklevel=4)
+    dead = _broken_links(place)
     if kind is not None:
         return FOLDER_KINDS[kind].open(place)
     if all((place / name).is_file() for name in ("summary.json", "trajectory.txt")):
         raise InputError(f"`{place}` holds the result of a run; give the recording that it was made of")
     for reader in FOLDER_KINDS.values():
         if reader.matches(place):
+            if dead:
+                warnings.warn(f"`{place}`: {dead}", InputWarning, stacklevel=4)
             return reader.open(place)
+    names = sorted(path.name for path in place.iterdir())
+    other = next((name for name in names if Path(name).suffix.lower() in OTHER_PICTURES | ARCHIVES), None)
     raise InputError(
         no_whole_bag(place)
-        or reason_not_read(place)
-        or f"`{place}` holds {_names(place)}; expected a 7-Scenes folder (`frame-XXXXXX.color.png`), "
-        "a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of `vggtgeo data list`, or a folder "
-        f"of images{_hint(place)}{'; ' if dead else ''}{dead}"
+        or (other and f"`{place}` holds `{other}`: {_NOT_READ}{_hint(place)}")
+        or f"`{place}` holds {', '.join(f'`{name}`' for name in names[:4])}; expected a 7-Scenes folder "
+        "(`frame-XXXXXX.color.png`), a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of "
+        f"`vggtgeo data list`, or a folder of images{_hint(place)}{'; ' if dead else ''}{dead}"
     )
 
 
-def _dead_links(folder: Path) -> str:
-    """Broken links in a folder and in those in it, as a message: of a disk that is not mounted, or of files that a tool
-    for large files has not fetched.
+def _broken_links(folder: Path) -> str:
+    """Broken links in a folder and in those in it, as a message: a disk is missing, or a tool for large files has not
+    fetched their content.
     """
-    dead = []
-    for place in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())[:_MAX_FOLDERS]):
-        with suppress(OSError), os.scandir(place) as entries:
-            links = (Path(entry.path) for entry in entries if entry.is_symlink() and entry.name[0] != ".")
-            dead += [path for path in links if not is_there(path)]
+    places = (folder, *(path for path in sorted(folder.iterdir()) if path.is_dir()))
+    dead = [path for place in places for path in place.iterdir() if path.is_symlink() and not is_there(path)]
     if not dead:
         return ""
     return (
@@ -200,49 +179,24 @@ def _dead_links(folder: Path) -> str:
 
 
 def _open_video(file: Path, depth: bool) -> Sequence:
-    if file.is_dir():
-        raise InputError(f"`{file}` is a folder; the reader 'video' needs a file")
     if not file.is_file():
-        raise InputError(f"`{file}` is no regular file; give a folder of images or a video file")
-    if file.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES:
+        raise InputError(f"`{file}` must be a video file, or a folder of images")
+    if file.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"`{file}` is a single image; give the folder of the sequence, or a video file")
-    if reason := reason_not_read(file):
-        raise InputError(reason)
+    if file.suffix.lower() in OTHER_PICTURES | ARCHIVES:
+        raise InputError(f"`{file}`: {_NOT_READ}")
     return VideoFile.open(file, depth)
 
 
 def _hint(folder: Path) -> str:
-    """Recordings in a folder, as the end of a message."""
-    found = [f"`{path}`" for path in islice(_readable_below(folder), 4)]
-    if not found:
-        return ""
-    return f"; it holds {', '.join(found[:3])}" + (", ..." if len(found) > 3 else "")
+    """Recordings in the folders of a folder, as the end of a message."""
+    inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
+    found = [f"`{path}`" for path in inside if is_readable(path)]
+    return f"; it holds {', '.join(found[:3])}" if found else ""
 
 
-def _readable_below(folder: Path) -> Iterator[Path]:
-    """Recordings in a folder and those below it, the nearest first."""
-    waiting = deque([(folder, 0)])
-    for _ in range(_MAX_FOLDERS):
-        if not waiting:
-            return
-        place, depth = waiting.popleft()
-        try:
-            inside = sorted(path for path in place.iterdir() if not path.name.startswith((".", "__")))
-            yield from (path for path in inside if path.suffix.lower() in _FILES and path.is_file())
-            for path in (path for path in inside if path.is_dir()):
-                if is_readable(path):
-                    yield path
-                elif depth < _MAX_DEPTH:
-                    waiting.append((path, depth + 1))
-        except OSError:  # a folder that may not be looked into
-            continue
-
-
-_FILES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".bag", ".mcap", ".r3d"})
-_MAX_FOLDERS, _MAX_DEPTH = 100, 2
-"""Folders and levels that are searched for a hint."""
-
-
-def _names(folder: Path, most: int = 4) -> str:
-    names = sorted(path.name for path in folder.iterdir())
-    return ", ".join(f"`{name}`" for name in names[:most]) + (", ..." if len(names) > most else "")
+ARCHIVES = frozenset({".zip", ".tgz", ".gz", ".tar", ".7z", ".rar", ".sens"})
+_NOT_READ = (
+    "a kind of image or archive that is not read; convert images to PNG or JPEG, unpack archives, export a scan of "
+    "ScanNet (`.sens`) with its SensReader"
+)

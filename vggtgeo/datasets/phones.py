@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.folder import FolderSequence, enlarged
+from vggtgeo.datasets.depth_files import MILLIMETRES, read_codes, read_depth
+from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.images import files_like
 from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_matrix, trajectory_of
@@ -35,12 +35,12 @@ from vggtgeo.io.text_files import whole_text
 
 LARGEST = 960
 """Maximum pixels of the longer side: the depth has 256, and images of 1920 cost four times as much."""
-_LEAST_CONFIDENCE = 1
+_MIN_CONFIDENCE = 1
 """Minimum of 0 (low), 1 and 2; Polycam writes 0, 127 and 255."""
 _CONFIDENCE = "confidence"
 _LISTS = "odometry.csv", "camera_matrix.csv"
 """Files of Stray Scanner beside the video."""
-_MOST_DELAY = 0.02
+_MAX_DELAY = 0.02
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,9 @@ class StrayScanner:
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Open the video; images are reduced to at most 960 pixels, by an integer factor."""
-        absent = [folder / name for name in _LISTS if not (folder / name).is_file()]
-        if absent:
-            raise InputError(
-                f"`{absent[0]}` is missing, which Stray Scanner writes beside `rgb.mp4`: copy the whole recording, or "
-                "give `rgb.mp4` alone, as a video"
-            )
+        for file in (folder / name for name in _LISTS):
+            if not file.is_file():
+                raise InputError(f"`{file}` is missing: copy the whole recording, or give `rgb.mp4` alone, as a video")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)  # the video has no intrinsics, but the folder has
             video = VideoFile.open(folder / "rgb.mp4", depth=False)
@@ -88,12 +85,6 @@ class StrayScanner:
                 stacklevel=3,
             )
         has_depth = bool(files_like(folder / "depth", "*.png"))
-        if has_depth and not (folder / _CONFIDENCE).is_dir():
-            warnings.warn(
-                f"`{folder}` has no folder `{_CONFIDENCE}`: all depth is used",
-                InputWarning,
-                stacklevel=3,
-            )
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
 
     def __len__(self) -> int:
@@ -122,14 +113,15 @@ class StrayScanner:
         try:
             depth = read_depth(file, MILLIMETRES)
             if (self.folder / _CONFIDENCE).is_dir():
-                leave_out_doubtful(depth, self.folder / _CONFIDENCE / file.name)
-            return enlarged(depth, (self.camera.width, self.camera.height), file)
+                remove_doubtful(depth, self.folder / _CONFIDENCE / file.name)
+            depth = cv2.resize(depth, (self.camera.width, self.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
+            return np.asarray(depth, np.float32)
         except InputError as error:
             warnings.warn(f"{error}; the frame is used without depth", InputWarning, stacklevel=3)
             return np.full(shape, np.nan, np.float32)
 
 
-def leave_out_doubtful(depth: np.ndarray, file: Path) -> None:
+def remove_doubtful(depth: np.ndarray, file: Path) -> None:
     """Replace depth of low confidence by NaN; warn if the confidence cannot be read, and keep all depth."""
     try:
         trust = read_codes(file)
@@ -138,12 +130,14 @@ def leave_out_doubtful(depth: np.ndarray, file: Path) -> None:
     except InputError as error:
         warnings.warn(f"{error}; all depth of the frame is used", InputWarning, stacklevel=4)
     else:
-        depth[trust < _LEAST_CONFIDENCE] = np.nan
+        depth[trust < _MIN_CONFIDENCE] = np.nan
 
 
 @dataclass(frozen=True)
 class ArkitScenes(FolderSequence):
     """A folder of ARKitScenes, low-resolution images. Truth: ARKit's own poses."""
+
+    depth_of_fewer_pixels = True
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -158,11 +152,7 @@ class ArkitScenes(FolderSequence):
             raise InputError(f"`{folder}/lowres_wide` has no images named `..._SECONDS.png`")
         depths = _timed(folder / "lowres_depth") if (folder / "lowres_depth").is_dir() else []
         frames = [(time, image, _nearest(time, depths)) for time, image in images]
-        return cls.listed(folder, frames, lambda *size: _pincam(folder, *size), as_images=False)
-
-    def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth, enlarged to the images."""
-        return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
+        return cls.listed(folder, frames, lambda *size: _pincam(folder, *size))
 
     def ground_truth(self) -> Trajectory | None:
         """Return ARKit's poses; the file has world -> camera as rotation vectors and translations."""
@@ -201,7 +191,7 @@ def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
     if not depths:
         return None
     other, path = min(depths, key=lambda entry: abs(entry[0] - time))
-    return path if abs(other - time) <= _MOST_DELAY else None
+    return path if abs(other - time) <= _MAX_DELAY else None
 
 
 def _pincam(folder: Path, width: int, height: int) -> Camera:

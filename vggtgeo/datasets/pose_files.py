@@ -1,9 +1,13 @@
-"""Files of poses and cameras of benchmarks: matrices, CSV, YAML, JSON."""
+"""Files of poses and cameras: matrices, CSV, YAML, JSON, and trajectories of TUM, KITTI and EuRoC."""
+
+from __future__ import annotations
 
 import json
+import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +19,26 @@ from vggtgeo.geometry.trajectory import FARTHEST, LATEST, LONGEST, SHORTEST, Tra
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
-_MOST_STRETCH = 0.1
+_KITTI, _EUROC = 12, 17
+"""Columns of their trajectory files."""
+_ROUNDING = 1e-5
+"""Rounding of printed rotations, which stay unchanged so that errors equal those of other programs."""
+_NANOSECONDS = 1e17
+"""Times above it: seconds since 1970 are below 1e10, nanoseconds above 1e18."""
+_MAX_STRETCH = 0.1
 """Maximum error of the lengths of a pose's axes; smaller ones (few digits, a scale of 1 %) are corrected."""
+
+
+@contextmanager
+def parsing(file: Path, expected: str) -> Iterator[None]:
+    """Raise InputError, with the file and what it must hold, where its content cannot be used."""
+    try:
+        yield
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+        if f"`{file}`" in str(error):
+            raise
+        found = f"{error} is missing" if isinstance(error, LookupError) else error
+        raise InputError(f"`{file}`: {found}; expected {expected}") from None
 
 
 def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
@@ -153,7 +175,7 @@ def read_json(file: Path) -> Any:
 def json_in(content: str | bytes, where: Path) -> Any:
     """Return the content of JSON text; raise InputError naming `where` if it is not valid JSON."""
     try:
-        return json.loads(content, parse_int=_whole)
+        return json.loads(content)
     except (ValueError, RecursionError) as error:  # of too many brackets
         raise InputError(f"`{where}` is not valid JSON: {error}") from None
 
@@ -175,23 +197,12 @@ def check_size(file: Path, stated: Sequence[object], size: tuple[int, int]) -> N
         )
 
 
-_MOST_DIGITS = 300
-"""Digits of an integer that float64 can represent."""
-
-
-def _whole(digits: str) -> float:
-    """Return an integer; a float, possibly infinite, if it has too many digits: readers check for finite values, not
-    for overflow.
-    """
-    return int(digits) if len(digits) <= _MOST_DIGITS else float(digits)
-
-
 def have_rotations(poses: np.ndarray) -> np.ndarray:
     """Return whether the axes of each pose have nearly unit length and are right-handed, with last row 0 0 0 1."""
-    last = (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) < _MOST_STRETCH).all(axis=1)
+    last = (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) < _MAX_STRETCH).all(axis=1)
     with np.errstate(over="ignore", invalid="ignore"):  # what is no rotation may be of any size
         lengths = np.linalg.norm(poses[:, :3, :3], axis=1)
-        near = (np.abs(lengths - 1.0) < _MOST_STRETCH).all(axis=1)
+        near = (np.abs(lengths - 1.0) < _MAX_STRETCH).all(axis=1)
         return np.asarray(last & near & (np.linalg.det(poses[:, :3, :3]) > 0.0), bool)
 
 
@@ -199,3 +210,56 @@ def _orthonormal(poses: np.ndarray) -> np.ndarray:
     """Return the nearest rigid motions: files have few digits, or a scale of 1 +- 1e-3."""
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     return np.concatenate([np.concatenate([u @ vt, poses[:, :3, 3:]], axis=2), poses[:, 3:]], axis=1)
+
+
+def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = None) -> Trajectory:
+    """Return the trajectory in a file of
+
+    - 8 columns, `timestamp tx ty tz qx qy qz qw` (TUM); times in nanoseconds (ORB-SLAM3 with EuRoC) are
+      converted, with a warning,
+    - 12 columns, the upper three rows of camera -> world (KITTI). They have no times: the times
+      of `clock`, which must have as many poses, or their numbers without one,
+    - 17 columns, EuRoC's `state_groundtruth_estimate0/data.csv`: the poses of the IMU.
+
+    Raises InputError as `Trajectory.load_tum`, and for poses without times if `clock` has another number of poses.
+    """
+    file = Path(path)
+    columns = _columns(file) if file.is_file() else 8
+    if columns == _KITTI:
+        return _kitti(file, clock)
+    if columns == _EUROC:
+        rows = read_matrices(file, _EUROC)
+        return _with_poses(1e-9 * rows[:, 0], poses_of(rows[:, 1:4], rows[:, [5, 6, 7, 4]]), file)
+    found = Trajectory.load_tum(file)
+    if found.timestamps[0] < _NANOSECONDS:
+        return found
+    warnings.warn(f"`{file}`: its times are nanoseconds, and are converted", NoteWarning, stacklevel=2)
+    return Trajectory(1e-9 * found.timestamps, found.poses)
+
+
+def _columns(file: Path) -> int:
+    """Return the number of columns of the first line with any."""
+    lines = (line.split("#", 1)[0].replace(",", " ").split() for line in read_text(file).splitlines())
+    return len(next((words for words in lines if words), ()))
+
+
+def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:
+    rows = read_matrices(file, _KITTI)
+    if clock is not None and len(clock) != len(rows):
+        raise InputError(
+            f"`{file}` has poses without times (12 columns, KITTI), and {len(rows)} of them beside {len(clock)} of the "
+            "truth; give one for each of those, or a file with times, `timestamp tx ty tz qx qy qz qw`"
+        )
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    times = np.arange(float(len(rows))) if clock is None else clock.timestamps
+    found = _with_poses(times, poses, file)
+    rounded = len(found) == len(poses) and np.abs(found.poses - poses).max() < _ROUNDING
+    return Trajectory(found.timestamps, poses) if rounded else found
+
+
+def _with_poses(times: np.ndarray, poses: np.ndarray, file: Path) -> Trajectory:
+    found = trajectory_of(times, poses, file, "trajectory")
+    if found is None:
+        raise InputError(f"`{file}` holds no pose")
+    return found

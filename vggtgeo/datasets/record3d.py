@@ -17,7 +17,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -25,31 +25,23 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from vggtgeo.datasets.folder import FolderSequence, FrameFile, common_size, enlarged, warn_of_no_depth
-from vggtgeo.datasets.image_files import (
-    MAX_BYTES,
-    MILLIMETRES,
-    ImageFile,
-    file_content,
-    image_in,
-    metres_of_floats,
-    read_depth,
-)
+from vggtgeo.datasets.depth_files import metres_of_floats, read_depth
+from vggtgeo.datasets.folder import FolderSequence
+from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, file_content, image_in
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
-from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, intrinsics_of, record3d_intrinsics
+from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, record3d_intrinsics
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.datasets.pose_files import json_in, poses_of, same_size, trajectory_of
+from vggtgeo.datasets.pose_files import json_in, parsing, poses_of, same_size, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
-from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.text_files import MAX_BYTES as MOST_TEXT
-from vggtgeo.models.extras import install_hint
+from vggtgeo.io.errors import InputError, InputWarning, install_hint
+from vggtgeo.io.text_files import MAX_BYTES as MAX_TEXT
 
 SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"
 _IMAGE = re.compile(r"rgbd?/(\d{1,9})\.(jpe?g|png)")
-_LEAST_CONFIDENCE = 1
+_MIN_CONFIDENCE = 1
 """Minimum of 0 (low), 1 and 2."""
 
 
@@ -94,17 +86,16 @@ class Record3d(FolderSequence):
         if not names & {METADATA, EXPORTED} or not numbered:
             raise InputError(f"`{folder}` must be a recording of Record3D, with `{METADATA}` and `rgbd/0.jpg`, ...")
         numbers = sorted(numbered)
-        images = [numbered[number] for number in numbers]
-        depths = [_depth_of(image) for image in images]
+        depths = [_depth_of(numbered[number]) for number in numbers]
         there = [depth if depth.relative_to(folder).as_posix() in names else None for depth in depths]
-        unread = cls(folder, folder.resolve().name, Camera.guess(1, 1), ())
+        unread = cls(folder, "", Camera.guess(1, 1), ())
         metadata = unread.metadata()
-        files = tuple(map(FrameFile, range(len(numbers)), _times(metadata, numbers), images, there))
-        warn_of_no_depth(folder, files)
-        width, height = common_size(str(folder), files, lambda path: unread.load_image(path).image)
-        camera = _camera(unread.file, metadata, width, height) or guess_with_warning(str(folder), width, height)
-        whole = cls(folder, unread.name, camera, files, MILLIMETRES, any(there), _depth_size(metadata))
-        return whole if not any(there) or whole.depth_can_be_read() else replace(whole, has_depth=False)
+        with parsing(unread.file, "`fps`, `frameTimestamps`, `dw` and `dh` as numbers"):
+            times = _times(metadata, numbers)
+            depth_size = int(metadata.get("dw", 0)), int(metadata.get("dh", 0))  # (0, 0): of older versions of the app
+        camera = lambda *size: _camera(unread.file, metadata, *size) or guess_with_warning(str(folder), *size)
+        frames = zip(times, (numbered[number] for number in numbers), there, strict=True)
+        return cls.listed(folder, frames, camera, depth_size=depth_size)
 
     @property
     def file(self) -> Path:
@@ -114,7 +105,7 @@ class Record3d(FolderSequence):
     def metadata(self) -> Mapping[str, Any]:
         """Return the metadata; raise InputError unless they are a JSON object."""
         where = self.file
-        content = json_in(self._content(where, MOST_TEXT), where)
+        content = json_in(self._content(where, MAX_TEXT), where)
         if not isinstance(content, dict):
             raise InputError(f"`{where}` must be a JSON object with `K`, `fps` and `poses`")
         return content
@@ -125,32 +116,30 @@ class Record3d(FolderSequence):
             return path.is_file()
         return path.relative_to(self.folder).as_posix() in self._archive.NameToInfo
 
-    def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
+    def stored_image(self, path: Path, min_bits: int = 8) -> ImageFile:
         """Return the image in a file of the archive."""
         return image_in(self._content(path), path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """Return the depth in a file of the archive, enlarged to the images, without that of low confidence."""
         if path.suffix == ".exr":
-            return enlarged(read_depth(path, self.depth_format), (self.camera.width, self.camera.height), path)
+            return self.enlarged(read_depth(path, self.depth_format))
         shape = self.camera.height, self.camera.width
         depth = _shaped(self._unpacked(path, 4), np.float32, path, self.depth_size[::-1], shape)
         depth = metres_of_floats(depth)
         trusted = path.with_suffix(".conf")
         if self.holds(trusted):
             trust = _shaped(self._unpacked(trusted, 1), np.uint8, trusted, depth.shape, shape)
-            depth[trust < _LEAST_CONFIDENCE] = np.nan
-        return enlarged(depth, (self.camera.width, self.camera.height), path)
+            depth[trust < _MIN_CONFIDENCE] = np.nan
+        return self.enlarged(depth)
 
     def ground_truth(self) -> Trajectory | None:
         """Return ARKit's poses, camera -> world, None without any; the file has OpenGL's axes."""
         poses, where = self.metadata().get("poses"), self.file
         if not (isinstance(poses, list) and poses):
             return None
-        try:
+        with parsing(where, "7 numbers for each of `poses`, a quaternion and a position"):
             rows = np.array(poses, np.float64).reshape(len(poses), 7)
-        except (ValueError, TypeError):
-            raise InputError(f"`{where}`: `poses` must have 7 numbers each, a quaternion and a position") from None
         numbers = [int(file.image.stem) for file in self.files]
         there = [row for row, number in enumerate(numbers) if number < len(rows)]
         found = poses_of(rows[:, 4:], rows[:, :4])[[numbers[row] for row in there]] @ FROM_OPENGL
@@ -228,28 +217,15 @@ def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image
     return np.frombuffer(content, kind).reshape(rows, columns)
 
 
-def _depth_size(metadata: Mapping[str, Any]) -> tuple[int, int]:
-    """Return width and height; (0, 0) for older versions of the app."""
-    width, height = metadata.get("dw"), metadata.get("dh")
-    if isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
-        return width, height
-    return 0, 0
-
-
 def _times(metadata: Mapping[str, Any], numbers: list[int]) -> list[float]:
     """Return the times of the images, seconds: those of the file if they increase, else by its frame rate."""
-    stamps = metadata.get("frameTimestamps")
-    if isinstance(stamps, list) and len(stamps) > numbers[-1]:
-        times = [stamps[number] for number in numbers]
-        if all(map(_is_number, times)) and all(after > before for before, after in pairwise(times)):
-            return [float(time) for time in times]
-    stated: Any = metadata.get("fps")
-    rate = stated if _is_number(stated) and stated > 0 else FRAMES_PER_SECOND
+    stamps = metadata.get("frameTimestamps") or ()
+    if len(stamps) > numbers[-1]:
+        times = [float(stamps[number]) for number in numbers]
+        if all(after > before for before, after in pairwise(times)):
+            return times
+    rate = float(metadata.get("fps") or FRAMES_PER_SECOND)
     return [number / rate for number in numbers]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -> Camera | None:
@@ -262,11 +238,8 @@ def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -
             stacklevel=4,
         )
         return None
-    values = record3d_intrinsics(metadata)
-    if values is None and not {"K", "perFrameIntrinsicCoeffs"} & metadata.keys():
+    if not {"K", "perFrameIntrinsicCoeffs"} & metadata.keys():
         return None
-    if values is None:
-        raise InputError(f"`{where}`: `K` must hold 9 numbers, `perFrameIntrinsicCoeffs` 4 for each frame")
-    camera = Camera(intrinsics_of(where, values), width, height)
+    camera = Camera(record3d_intrinsics(where, metadata), width, height)
     check_plausible(f"`{where}`", camera)
     return camera

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
 
-_MOST_REACH = 16
+_MAX_REACH = 16
 """Pixels from the centre of a depth pixel's square to its border, at most."""
 _BORDER_STEPS = 64
 
@@ -62,7 +62,7 @@ class DepthRegistration:
 
     def _nearest(self, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:
         width, height = self.target.width, self.target.height
-        near = ((pixels > -_MOST_REACH) & (pixels < np.array([width, height]) + _MOST_REACH)).all(axis=1)
+        near = ((pixels > -_MAX_REACH) & (pixels < np.array([width, height]) + _MAX_REACH)).all(axis=1)
         pixels, z = pixels[near], z[near].astype(np.float32)
         order = np.argsort(-z)  # what is written last stays
         z = z[order]
@@ -80,7 +80,7 @@ class DepthRegistration:
 
 def _covered(pixels: np.ndarray, reach: float, size: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Along one axis, the pixels that may be covered: int64 [n], and whether each is covered and inside; bool [n]."""
-    reach = min(reach, _MOST_REACH)
+    reach = min(reach, _MAX_REACH)
     middle = np.rint(pixels).astype(np.int64)
     most = math.ceil(reach + 0.5) - 1
     found = []

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+from vggtgeo.datasets.depth_files import DepthFormat
 from vggtgeo.datasets.folder import FolderSequence, existing
-from vggtgeo.datasets.image_files import DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
-from vggtgeo.datasets.pose_files import check_size, read_json, read_matrices, trajectory_of_rows
+from vggtgeo.datasets.pose_files import check_size, parsing, read_json, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -82,15 +82,13 @@ class _Stated(NamedTuple):
 
     @classmethod
     def of(cls, file: Path) -> Self:
-        try:
+        with parsing(file, "`camera` with fx, fy, cx, cy and a positive `scale`, units a metre"):
             camera = read_json(file)["camera"]
-            intrinsics = intrinsics_of(file, [float(camera[name]) for name in ("fx", "fy", "cx", "cy")])
             scale = float(camera["scale"])
-        except (KeyError, TypeError) as error:
-            raise InputError(f"`{file}` must have `camera` with fx, fy, cx, cy and scale ({error!r})") from None
-        if not (math.isfinite(scale) and scale > 0):
-            raise InputError(f"`{file}`: `scale` must be a positive number of units a metre, got {scale}")
-        return cls(file, intrinsics, (camera.get("w"), camera.get("h")), scale)
+            if not 0 < scale < math.inf:
+                raise ValueError(f"`scale` is {scale}")
+            values = intrinsics_of(file, [camera[name] for name in ("fx", "fy", "cx", "cy")])
+            return cls(file, values, (camera.get("w"), camera.get("h")), scale)
 
 
 def _camera(folder: Path, stated: _Stated | None, width: int, height: int) -> Camera:
@@ -98,10 +96,12 @@ def _camera(folder: Path, stated: _Stated | None, width: int, height: int) -> Ca
         if None not in stated.size:
             check_size(stated.file, stated.size, (width, height))
         return Camera(stated.intrinsics, width, height)
+    if (width, height) == _PUBLISHED_SIZE:
+        return Camera(_PUBLISHED, width, height)
     own = camera_from_folder(folder, width, height)
-    if own is None and (width, height) != _PUBLISHED_SIZE:
+    if own is None:
         raise InputError(
-            f"`{folder}` has no `{_CAMERA}`, and its images are {width} x {height} pixels; those of the published "
-            f"camera are {_PUBLISHED_SIZE[0]} x {_PUBLISHED_SIZE[1]}: put that file beside the scene"
+            f"`{folder}` has no `{_CAMERA}`, which belongs beside it; its images have another size than "
+            f"those of the published camera, {_PUBLISHED_SIZE[0]} x {_PUBLISHED_SIZE[1]} pixels"
         )
-    return own or Camera(_PUBLISHED, width, height)
+    return own

@@ -14,26 +14,24 @@ from itertools import groupby
 from pathlib import Path
 from typing import Self
 
+from vggtgeo.datasets.depth_files import DEPTH_SUFFIXES
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import image_files, times_by_name, warn_of_unread
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
-from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, list_of, lists_no_times, partners_in_time
+from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, partners_in_time
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
 COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
 DEPTH = ("depth", "depths")
-INVERSE = {"inv", "inverse", "disp", "disparity", "disparities"}
-"""Words of names of files that are not depth, even `inverse_depth`."""
-CONFIDENCE = {"conf", "confidence"}
-"""Words of names of files of confidence, neither images nor depth."""
-_SAYS_NOTHING = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
+_NEITHER = {"conf", "confidence", "mask", "inverse", "disparity"}
+"""Words of names of files that are neither images nor depth."""
+_FORMAT = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
 """Endings of folder names without meaning: `rgb_png`, `depth_images`."""
-MOST_LOOSE, MOST_LOOSE_BESIDE_DEPTH = 0.1, 0.5
-"""Maximum share of images beside the folder of colour that are not of the recording; more if there is a folder of as
-many depths."""
-LEAST_WITH_DEPTH = 0.5
+_LOOSE_SHARE = 0.5
+"""Maximum share of images beside the folder of colour that are not of the recording."""
+_WITH_DEPTH = 0.5
 """Minimum depths per image of a folder of both: a single image called `depth` is not enough."""
 
 
@@ -53,37 +51,20 @@ class RgbdFolders(FolderSequence):
         """Return whether `folder` has images in a folder of `COLOUR`, and few of its own; or names of its own images
         distinguish depth.
         """
-        colour = _folder(folder, COLOUR)
+        colour = _folder(folder, COLOUR, IMAGE_SUFFIXES)
         if colour is None:
-            return _told_apart(folder) is not None
-        count, depth = len(image_files(colour)), _folder(folder, DEPTH, DEPTH_SUFFIXES)
-        paired = depth is not None and len(image_files(depth, DEPTH_SUFFIXES)) == count
-        return len(image_files(folder)) <= (MOST_LOOSE_BESIDE_DEPTH if paired else MOST_LOOSE) * count
+            return _of_one_folder(folder) is not None
+        return len(image_files(folder)) <= _LOOSE_SHARE * len(image_files(colour))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """List the images and find their depths; raise InputError if they cannot be paired."""
         colour, (images, depths) = _listed(folder)
-        if (file := list_of(folder)) and lists_no_times(file):
-            _warn(
-                f"`{file}`: its first column is no time, it falls while the files are numbered on; frames are taken in "
-                "the order of their numbers, depth in millimetres"
-            )
-        if (folder / "depth.txt").is_file() and list_of(folder) is None:
-            _warn(
-                f"`{folder}` has a `depth.txt`, as TUM RGB-D has it, and no `rgb.txt`: read as two folders, depth in "
-                "millimetres; TUM's has 5000 units a metre (`--depth-scale 5000`), and its images come from the list"
-            )
-        loose = [file for file in image_files(folder) if file not in {*images, *depths}]
-        if loose:
-            beside = f" beside `{colour.name}`" if colour != folder else ""
-            _warn(f"`{folder}`: {len(loose)} images{beside} ({loose[0].name}, ...) are left out")
         warn_of_unread(colour, images)
-        _tell_of_others(folder, colour)
         times = times_by_name(images)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
         rows = sorted(zip(times, images, partners, strict=True), key=lambda row: row[0])
-        _tell_of_no_image(folder, depths, partners)
+        _warn_of_depth_alone(folder, depths, partners)
         camera = lambda *size: (
             camera_from_folder(folder, *size)
             or camera_from_folder(colour, *size)
@@ -99,33 +80,21 @@ class RgbdFolders(FolderSequence):
 
 def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
     """Return the folder of the images, and the files of images and depths."""
-    colour = _folder(folder, COLOUR)
-    if colour is None:
-        both = _told_apart(folder)
-        if both is None:
-            raise InputError(f"`{folder}` has no folder of images named {', '.join(f'`{name}`' for name in COLOUR)}")
-        return folder, both
-    depth = _folder(folder, DEPTH, DEPTH_SUFFIXES)
-    if depth is None and (other := _there(folder, DEPTH)):
-        suffixes = sorted({path.suffix for path in other.iterdir()})
-        found = f"holds {', '.join(f'`{name}`' for name in suffixes[:4])}" if suffixes else "is empty"
-        known = ", ".join(sorted(DEPTH_SUFFIXES))
-        _warn(f"`{other}` {found}, and depth is read from files {known}; reading the images only")
-    elif depth is None and (other := next(filter(_is_inverse, _folders(folder)), None)):
-        _warn(
-            f"`{other}` holds inverse depth or disparity, by its name, which is not read: make depth of it (1 / "
-            "inverse depth, focal length * baseline / disparity); reading the images only"
-        )
-    return colour, (image_files(colour), [] if depth is None else image_files(depth, DEPTH_SUFFIXES))
+    colour, depth = _folder(folder, COLOUR, IMAGE_SUFFIXES), _folder(folder, DEPTH, DEPTH_SUFFIXES)
+    if colour is not None:
+        return colour, (image_files(colour), [] if depth is None else image_files(depth, DEPTH_SUFFIXES))
+    both = _of_one_folder(folder)
+    if both is None:
+        raise InputError(f"`{folder}` has no folder of images named {', '.join(f'`{name}`' for name in COLOUR)}")
+    return folder, both
 
 
-def _told_apart(folder: Path) -> tuple[list[Path], list[Path]] | None:
+def _of_one_folder(folder: Path) -> tuple[list[Path], list[Path]] | None:
     """Return images and depths of one folder, by the words of their names; None if few names say depth."""
-    inverse = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_inverse(path)]
-    depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_depth(path) and path not in inverse]
-    others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *INVERSE, *CONFIDENCE}]
+    depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_depth(path)]
+    others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *_NEITHER}]
     images = [path for path in others if _words(path) & set(COLOUR)] or others
-    return (images, depths) if images and len(depths) >= LEAST_WITH_DEPTH * len(images) else None
+    return (images, depths) if images and len(depths) >= _WITH_DEPTH * len(images) else None
 
 
 def _words(path: Path) -> set[str]:
@@ -133,53 +102,31 @@ def _words(path: Path) -> set[str]:
 
 
 def _is_depth(path: Path) -> bool:
-    return bool(_words(path) & set(DEPTH)) and not _words(path) & CONFIDENCE
+    return bool(_words(path) & set(DEPTH)) and not _words(path) & _NEITHER
 
 
-def _is_inverse(path: Path) -> bool:
-    return bool(_words(path) & INVERSE)
-
-
-def _folders(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_dir())
-
-
-def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str] = IMAGE_SUFFIXES) -> Path | None:
-    """Return the first of the folders `names` that has images; see `_there`."""
-    return next((found for name in names if (found := _there(folder, [name])) and image_files(found, suffixes)), None)
-
-
-def _there(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the first existing folder of `names`, in any case; `rgb_png` counts as `rgb`, and any name with the word
-    depth as depth (`aligned_depth_to_color`).
+def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str]) -> Path | None:
+    """Return the first of the folders `names` that has images, in any case; `rgb_png` counts as `rgb`, and any name
+    with the word depth as depth (`aligned_depth_to_color`).
     """
-    folders = _folders(folder)
-    there = {_SAYS_NOTHING.sub("", path.name.lower()): path for path in folders}
-    there |= {path.name.lower(): path for path in folders}
-    for path in folders:
-        for word in set(re.findall(r"[a-z]+", path.name.lower())) & set(DEPTH):
-            if not _is_inverse(path) and _is_depth(path):
-                there.setdefault(word, path)
+    there = {}
+    for path in sorted(path for path in folder.iterdir() if path.is_dir() and image_files(path, suffixes)):
+        there[path.name.lower()] = path
+        there.setdefault(_FORMAT.sub("", path.name.lower()), path)
+        if _is_depth(path):
+            there.setdefault(DEPTH[0], path)
     return next((there[name] for name in names if name in there), None)
 
 
 def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path | None]:
     """Return the depth of each image, None without one."""
-    if shift := _shift(images, depths):
-        _warn(
-            f"`{folder}`: there are as many depths as images, and their numbers are {abs(shift)} "
-            f"{'higher' if shift > 0 else 'lower'}: they are paired in their order, `{images[0].name}` with "
-            f"`{depths[0].name}`; if that is wrong, give them the same names"
-        )
-        return list(depths)
-    for key in (_stem, _number):
+    for key in (lambda path: path.stem, _number):
         found = _by(key, images, depths)
         if found is not None:
             return found
     image_times, depth_times = _seconds(images), _seconds(depths)
     if image_times is not None and depth_times is not None:
-        order = sorted(range(len(depths)), key=lambda row: depth_times[row])
-        listed = [(depth_times[row], depths[row]) for row in order]
+        listed = sorted(zip(depth_times, depths, strict=True))
         rows = partners_in_time(list(zip(image_times, images, strict=True)), listed)
         if any(row is not None for row in rows):
             return [None if row is None else listed[row][1] for row in rows]
@@ -203,26 +150,7 @@ def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path
     return found if paired >= 0.5 * min(len(images), len(depths)) else None
 
 
-def _shift(images: list[Path], depths: list[Path]) -> int:
-    """Return the constant difference between the numbers of depths and of as many images; 0 if there is none."""
-    numbers = [[_number(path) for path in paths] for paths in (images, depths)]
-    if len(images) != len(depths) or len(images) < 2 or any(None in own for own in numbers):
-        return 0
-    apart = {int(depth or 0) - int(image or 0) for image, depth in zip(*numbers, strict=True)}
-    return apart.pop() if len(apart) == 1 else 0
-
-
-def _tell_of_others(folder: Path, colour: Path) -> None:
-    """Warn of other folders with names of image folders, which may be a part of the recording."""
-    others = [path for name in COLOUR if (path := _there(folder, [name])) and path != colour and image_files(path)]
-    for path in dict.fromkeys(others):
-        _warn(
-            f"`{folder}` has images in `{colour.name}` and in `{path.name}` ({len(image_files(path))}): those of "
-            f"`{colour.name}` are read; give the other folder to read that"
-        )
-
-
-def _tell_of_no_image(folder: Path, depths: list[Path], partners: Sequence[Path | None]) -> None:
+def _warn_of_depth_alone(folder: Path, depths: list[Path], partners: Sequence[Path | None]) -> None:
     """Warn of depths without an image, unless every second or third has one (a slower colour camera)."""
     paired = {partner for partner in partners if partner is not None}
     alone = len(depths) - len(paired)
@@ -231,10 +159,6 @@ def _tell_of_no_image(folder: Path, depths: list[Path], partners: Sequence[Path 
     longest = max(len(list(run)) for known, run in groupby(depth in paired for depth in depths) if not known)
     if alone < 0.5 * len(depths) or longest > len(depths) / len(paired) + 1:
         _warn(f"`{folder}`: {alone} of {len(depths)} depths have no image: are images missing?")
-
-
-def _stem(path: Path) -> str:
-    return path.stem
 
 
 def _number(path: Path) -> str | None:

@@ -24,11 +24,12 @@ from typing import Self
 import cv2
 import numpy as np
 
+from vggtgeo.datasets.depth_files import MILLIMETRES, read_depth
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth, read_image_file
+from vggtgeo.datasets.image_files import ImageFile
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_of_other_size
-from vggtgeo.datasets.pose_files import have_rotations, numbers_of, read_matrix, read_text, trajectory_of
+from vggtgeo.datasets.pose_files import have_rotations, numbers_of, parsing, read_matrix, read_text, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -74,11 +75,11 @@ class ScanNet(FolderSequence):
             return Camera(depth, *_size(folder, [depth for _, _, depth in frames]))
 
         motion = _extrinsics(folder, "color") @ np.linalg.inv(_extrinsics(folder, "depth"))
-        return cls.listed(folder, frames, camera, as_images=False, colour=colour, motion=motion)
+        return cls.listed(folder, frames, camera, colour=colour, motion=motion)
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
         """Return the image with the intrinsics of the depth camera, resampled with an average."""
-        read = read_image_file(path, min_bits)
+        read = self.stored_image(path, min_bits)
         image = read.image
         fx, fy, cx, cy = self.camera.intrinsics
         gx, gy, dx, dy = self.colour
@@ -166,21 +167,18 @@ def _calibration(folder: Path, what: str, camera: str, unstated: np.ndarray | No
     found = re.search(rf"^{key}\s*=(.*)$", read_text(info), re.MULTILINE)
     if found is None and unstated is not None:
         return info, unstated
-    values = numbers_of(found.group(1).split() if found else [], f"`{info}`: `{key}`")
-    if len(values) != 16:
-        raise InputError(f"`{info}`: `{key}` has {len(values)} numbers; expected 16")
-    return info, np.array(values).reshape(4, 4)
+    with parsing(info, f"`{key}` of 16 numbers"):
+        return info, np.reshape(numbers_of(found.group(1).split() if found else [], f"`{key}`"), (4, 4))
 
 
 def _size(folder: Path, depths: Sequence[Path | None]) -> tuple[int, int]:
     """Return width and height of the first depth image that can be read."""
-    wrong = "has no depth image"
-    for file in depths:
-        if file is not None:
-            try:
-                height, width = read_depth(file, MILLIMETRES).shape
-            except InputError as error:
-                wrong = f"has no depth image that can be read ({error})"
-                continue
-            return width, height
-    raise InputError(f"`{folder}/depth` {wrong}; the size of the depth camera is not known")
+    reason = ""
+    for file in filter(None, depths):
+        try:
+            height, width = read_depth(file, MILLIMETRES).shape
+        except InputError as error:
+            reason = reason or f" ({error})"
+            continue
+        return width, height
+    raise InputError(f"`{folder}` has no depth image that can be read{reason}; the camera's size is unknown")

@@ -20,12 +20,11 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
-from vggtgeo.datasets.pose_files import trajectory_of
+from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
-from vggtgeo.io.text_files import whole_text
 
 FRAMES_PER_SECOND = 30.0
 COLOUR_TRUTH = "groundtruth-colour.txt"
@@ -85,13 +84,13 @@ class SevenScenes(FolderSequence):
         """Return the true poses; warn of pose files with NaN or infinity (lost tracking), which are left out."""
         if (self.folder / COLOUR_TRUTH).exists():
             return Trajectory.load_tum(self.folder / COLOUR_TRUTH)
-        times, poses = [], []
-        for file in self.files:
-            pose_file = _beside(file.image, "pose.txt")
-            if pose_file.is_file() and (pose := _read_pose(pose_file)) is not None:
-                times.append(file.timestamp)
-                poses.append(pose @ np.linalg.inv(_TO_COLOUR) if self.as_published else pose)
-        return trajectory_of(times, np.array(poses), self.folder) if poses else None
+        places = {file.timestamp: _beside(file.image, "pose.txt") for file in self.files}
+        poses = {time: read_matrix(place, (4, 4)) for time, place in places.items() if place.is_file()}
+        if not poses:
+            return None
+        to_camera = np.linalg.inv(_TO_COLOUR) if self.as_published else np.eye(4)
+        with np.errstate(invalid="ignore"):  # of lost frames, which have NaN
+            return trajectory_of(list(poses), np.array(list(poses.values())) @ to_camera, self.folder)
 
 
 def _colour_files(folder: Path) -> dict[int, Path]:
@@ -135,16 +134,3 @@ def _camera(folder: Path, width: int, height: int) -> Camera:
         stacklevel=3,
     )
     return _AS_PUBLISHED
-
-
-def _read_pose(file: Path) -> np.ndarray | None:
-    try:
-        pose = np.array(whole_text(file, errors="strict").replace(",", " ").split(), np.float64).reshape(4, 4)
-    except ValueError:
-        raise InputError(f"`{file}`: expected a 4 x 4 matrix of numbers, camera to world") from None
-    if np.isfinite(pose).all() and not np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), atol=1e-3):
-        raise InputError(f"`{file}`: the last row of the matrix is {pose[3].tolist()}; it must be 0 0 0 1")
-    if not np.isfinite(pose).all():
-        warnings.warn(f"`{file}` has a NaN or an infinity; left out of the truth", NoteWarning, stacklevel=3)
-        return None
-    return pose

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_or_guess
-from vggtgeo.datasets.pose_files import read_json, read_matrix, read_text, trajectory_of
+from vggtgeo.datasets.pose_files import parsing, read_json, read_matrix, read_text, trajectory_of
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -21,10 +21,8 @@ from vggtgeo.io.errors import InputError
 _LOG = "_COLMAP_SfM.log"
 _LINES = 5
 """Lines of a pose in the log: numbers, and four rows of a matrix camera -> world."""
-_MOST_DIGITS = 9
-
 _AXES = ["X", "Y", "Z"]
-_LEAST_CORNERS = 3
+_MIN_CORNERS = 3
 """Minimum corners of a polygon."""
 
 
@@ -118,19 +116,13 @@ def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"
 
 def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Return which points are in the volume of `SCENE.json`: a polygon across an axis, between two bounds on it."""
-    crop = read_json(file)
-    try:
+    with parsing(file, "orthogonal_axis, axis_min below axis_max, and a bounding_polygon of three corners or more"):
+        crop = read_json(file)
         axis = _AXES.index(str(crop["orthogonal_axis"]).upper())
         low, high = float(crop["axis_min"]), float(crop["axis_max"])
         polygon = np.array(crop["bounding_polygon"], np.float64).reshape(-1, 3)
-    except (KeyError, ValueError, AttributeError, TypeError) as error:
-        raise InputError(
-            f"`{file}`: expected orthogonal_axis, axis_min, axis_max, bounding_polygon ({error!r})"
-        ) from None
-    if not (np.isfinite([low, high]).all() and low < high):
-        raise InputError(f"`{file}`: axis_min is {low:g} and axis_max {high:g}; expected the lower and the upper bound")
-    if len(polygon) < _LEAST_CORNERS or not np.isfinite(polygon).all():
-        raise InputError(f"`{file}`: bounding_polygon is {polygon.tolist()}; expected three corners or more, [x, y, z]")
+        if not low < high or len(polygon) < _MIN_CORNERS or not np.isfinite([low, high, *polygon.ravel()]).all():
+            raise ValueError(f"axis_min is {low:g}, axis_max {high:g}, and the polygon {polygon.tolist()}")
     across = [number for number in range(3) if number != axis]
     between = (points[:, axis] >= low) & (points[:, axis] <= high)
     return between & _in_polygon(points[:, across], polygon[:, across])
@@ -149,34 +141,8 @@ def _in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:
     """Return number of the image, and camera -> world, of each pose."""
-    lines = [(place, line) for place, line in enumerate(read_text(file).splitlines(), start=1) if line.strip()]
-    numbers, rows = [], []
-    for count, (place, line) in enumerate(lines):
-        words = line.split()
-        row = _floats(words)
-        if count % _LINES == 0:
-            if not words[0].isdecimal() or len(words[0]) > _MOST_DIGITS:
-                raise _not_in_log(file, place, line, "the number of an image, which a pose begins with, as in `0 0 0`")
-            numbers.append(int(words[0]))
-        elif len(row) != 4:
-            raise _not_in_log(file, place, line, f"row {count % _LINES} of a pose's 4 x 4 matrix, four numbers")
-        else:
-            rows.append(row)
-    if len(lines) % _LINES:
-        raise InputError(
-            f"`{file}` ends within a pose (line {lines[-1][0]}); expected a line of numbers and four rows of a matrix "
-            "each: is the file cut off?"
-        )
-    return numbers, np.array(rows, np.float64).reshape(-1, 4, 4)
-
-
-def _floats(words: list[str]) -> list[float]:
-    """Return the words as numbers; empty if one is not a number."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        return []
-
-
-def _not_in_log(file: Path, place: int, line: str, expected: str) -> InputError:
-    return InputError(f"`{file}`, line {place}: found {line.strip()[:60]!r}; expected {expected}")
+    rows = [line.split() for line in read_text(file).splitlines() if line.strip()]
+    with parsing(file, "for each pose the number of its image, as in `0 0 0`, and four rows of a matrix"):
+        numbers = [int(row[0]) for row in rows[::_LINES]]
+        poses = np.array([row for place, row in enumerate(rows) if place % _LINES], np.float64)
+        return numbers, poses.reshape(len(numbers), 4, 4)

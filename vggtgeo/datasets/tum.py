@@ -1,16 +1,12 @@
-"""TUM RGB-D folders: `rgb.txt` and `depth.txt` (lines `timestamp file`), `groundtruth.txt`, 16-bit depth /
-5000.
+"""TUM RGB-D folders: `rgb.txt` and `depth.txt` (lines `timestamp file`), `groundtruth.txt`, 16-bit depth / 5000.
 
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. ETH3D SLAM (whose
-`calibration.txt` is the one read here) and Bonn RGB-D Dynamic have the same layout. Colour and depth
-are taken at different times: an image gets the depth nearest in time, at most 0.02 s away, each depth used
-once. A list of pairs, as ETH3D SLAM comes with and ORB-SLAM2 takes (`associations.txt`), is read where `rgb.txt` is not
-there.
+`calibration.txt` is the one read here) and Bonn RGB-D Dynamic have the same layout. Colour and depth are taken at
+different times: an image gets the depth nearest in time, at most 0.02 s away, each depth used once. A list of pairs, as
+ETH3D SLAM comes with and ORB-SLAM2 takes (`associations.txt`), is read where `rgb.txt` is missing.
 """
 
 import itertools
-import math
-import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +14,8 @@ from typing import Self
 
 import numpy as np
 
+from vggtgeo.datasets.depth_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
 from vggtgeo.datasets.folder import LATEST, FolderSequence
-from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.camera import Camera
@@ -29,15 +25,9 @@ from vggtgeo.io.text_files import whole_text
 
 MAX_DEPTH_DELAY = 0.02
 """Maximum seconds between an image and its depth."""
-
-MOST_LETTERS = 200
-LEAST_FALLING, LEAST_LINES = 0.1, 10
-"""Minimum share of lines at which the first column of a list decreases, and of lines, for it not to be a time: lists of
-two processes have a few lines out of order, durations of frames decrease at every second line."""
-_DECIMAL_COMMA = re.compile(r"-?\d+,\d+\s")
-_TRUTH = "groundtruth.txt"
+MAX_LETTERS = 200
 _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")
-MOST_FRAMES = 1e6
+MAX_FRAMES = 1e6
 """Integers up to this one are numbers of frames, not times."""
 _Entry = tuple[float, Path]
 _Frame = tuple[float, Path, Path | None]
@@ -49,23 +39,22 @@ class TumRgbd(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has an `rgb.txt` of times, or a list of pairs."""
-        file = list_of(folder)
-        return file is not None and not lists_no_times(file)
+        """Return whether `folder` has an `rgb.txt`, or a list of pairs."""
+        return _list_of(folder) is not None
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Read and pair the lists; without `depth.txt` the sequence has no depth."""
-        pairs = list_of(folder)
-        if pairs is None or pairs.name == "rgb.txt":
+        file = _list_of(folder)
+        if file is None or file.name == "rgb.txt":
             frames, coding = _of_lists(folder), FIVE_THOUSANDTHS
         else:
-            frames, coding = _of_pairs(pairs)
+            frames, coding = _of_pairs(file)
         return cls.listed(folder, frames, lambda *size: _camera(folder, *size), coding)
 
     def ground_truth(self) -> Trajectory | None:
         """Return the true poses at their own times (100 Hz in the benchmark), not those of the images."""
-        file = self.folder / _TRUTH
+        file = self.folder / "groundtruth.txt"
         return Trajectory.load_tum(file) if file.exists() else None
 
 
@@ -78,28 +67,9 @@ def _camera(folder: Path, width: int, height: int) -> Camera:
     )
 
 
-def list_of(folder: Path) -> Path | None:
+def _list_of(folder: Path) -> Path | None:
     """Return the list of images in a folder, or of pairs without `rgb.txt`; None without either."""
     return next((file for name in ("rgb.txt", *_PAIRS) if (file := folder / name).is_file()), None)
-
-
-def lists_no_times(file: Path) -> bool:
-    """Return whether the first column of a list is not a time: it decreases often while the files are numbered in
-    order. Some scripts write durations instead of times; sorted by them, frames would be shuffled.
-    """
-    try:
-        lines = [line.split("#", 1)[0].split() for line in whole_text(file).splitlines()]
-        times, names = zip(*((float(words[0]), words[1]) for words in lines if words), strict=True)
-    except (InputError, ValueError, IndexError):  # reported by the reader
-        return False
-    if not np.isfinite(times).all():
-        return False
-    falling = np.count_nonzero(np.diff(times) < 0)
-    if len(times) < LEAST_LINES or falling < LEAST_FALLING * len(times) or max(map(len, names)) > MOST_LETTERS:
-        return False
-    numbered = [found for name in names if (found := re.fullmatch(r"(.*?)(\d+)(\.\w+)?", name))]
-    one_name = len(numbered) == len(names) and len({found.group(1) for found in numbered}) == 1
-    return one_name and bool(np.all(np.diff([int(found.group(2)) for found in numbered]) > 0))
 
 
 def _recording(folder: Path) -> str:
@@ -108,7 +78,7 @@ def _recording(folder: Path) -> str:
     if not file.is_file():
         return ""
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        head = [line[:MOST_LETTERS] for line in itertools.islice(lines, 5)]
+        head = [line[:MAX_LETTERS] for line in itertools.islice(lines, 5)]
     return " ".join(line.partition("file:")[2] for line in head if line.startswith("#"))
 
 
@@ -127,7 +97,7 @@ def _of_lists(folder: Path) -> list[_Frame]:
 def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
     """Return the frames, and the unit of their depth: millimetres if the list counts frames, as no benchmark does."""
     pairs = read_pairs(file, "TIME")
-    counted = all(time.is_integer() and abs(time) < MOST_FRAMES for time, *_ in pairs)
+    counted = all(time.is_integer() and abs(time) < MAX_FRAMES for time, *_ in pairs)
     if counted:
         rate = f"{FRAMES_PER_SECOND:g} a second"
         _warn(f"`{file}`: its first column counts frames; {rate} are assumed, and depth in millimetres")
@@ -137,9 +107,7 @@ def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
         (time / FRAMES_PER_SECOND if counted else time, file.parent / image): file.parent / depth
         for time, image, depth in pairs
     }
-    frames: list[tuple[float, Path, Path | None]] = [
-        (at, image, depths[at, image]) for at, image in _in_order(file, list(depths), frames=True)
-    ]
+    frames: list[_Frame] = [(at, image, depths[at, image]) for at, image in _in_order(file, list(depths), frames=True)]
     return frames, MILLIMETRES if counted else FIVE_THOUSANDTHS
 
 
@@ -147,20 +115,10 @@ def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
     """Return time and name of the image, and name of its depth, of each line of a list of pairs, in either order; raise
     InputError naming an invalid line. time: noun of the first column.
     """
-    expected = f"expected `{time} rgb/{time}.png {time} depth/{time}.png`"
     pairs = []
-    for number, line in enumerate(whole_text(file).splitlines(), start=1):
-        words = line.split("#", 1)[0].split()
-        if not words:
-            continue
-        try:
-            first, second = (float(words[0]), words[1]), (float(words[2]), words[3])
-        except (IndexError, ValueError):
-            raise InputError(f"`{file}`, line {number}: found {line!r}; {expected}") from None
-        (seconds, image), (_, depth) = (second, first) if "depth" in first[1] else (first, second)
-        pairs.append((seconds, image, depth))
-    if not pairs:
-        raise InputError(f"`{file}` lists nothing; {expected}")
+    for words in _rows(file, 4, f"{time} rgb/{time}.png {time} depth/{time}.png"):
+        seconds, image, _, depth = (*words[2:], *words[:2]) if "depth" in words[1] else words
+        pairs.append((float(seconds), image, depth))
     return pairs
 
 
@@ -168,29 +126,28 @@ def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
     """Return the entries by time; frames: whether each is a frame, which is counted if it is left out."""
     if not file.is_file():
         raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
-    entries = []
-    for number, line in enumerate(whole_text(file).splitlines(), start=1):
-        text = line.split("#", 1)[0].strip()
-        if text:
-            entries.append(_parse_entry(file, number, text))
-    if not entries:
-        raise InputError(f"`{file}` lists nothing; expected lines `timestamp file`")
+    entries = [(float(time), file.parent / name) for time, name in _rows(file, 2, "timestamp file")]
     return _in_order(file, entries, frames)
 
 
-def _parse_entry(file: Path, number: int, text: str) -> _Entry:
-    if _DECIMAL_COMMA.match(text):
-        raise InputError(f"`{file}`, line {number}: found {text!r}; write decimals with a point: `timestamp file`")
-    time, _, name = text.replace("\t", " ").replace(",", " ", 1).partition(" ")
-    try:
-        seconds = float(time)
-    except ValueError:
-        seconds = math.nan
-    if not name.strip() or not math.isfinite(seconds):
-        raise InputError(f"`{file}`, line {number}: found {text!r}; expected `timestamp file`")
-    if abs(seconds) > LATEST:
-        raise InputError(f"`{file}`, line {number}: the time {time[:30]} is beyond all clocks; it must be in seconds")
-    return seconds, file.parent / name.strip()
+def _rows(file: Path, columns: int, expected: str) -> list[list[str]]:
+    """Return the words of each line, of which every second, from the first on, is a time in seconds."""
+    rows = []
+    for number, line in enumerate(whole_text(file).splitlines(), start=1):
+        words = line.split("#", 1)[0].replace(",", " ").split(maxsplit=columns - 1)
+        if not words:
+            continue
+        try:
+            valid = len(words) == columns and all(abs(float(time)) <= LATEST for time in words[::2])
+        except ValueError:
+            valid = False
+        if not valid:
+            text = f"found {line[:MAX_LETTERS]!r}; expected `{expected}`, times in seconds"
+            raise InputError(f"`{file}`, line {number}: {text}")
+        rows.append([word.strip() for word in words])
+    if not rows:
+        raise InputError(f"`{file}` lists nothing; expected lines `{expected}`")
+    return rows
 
 
 def _in_order(file: Path, entries: list[_Entry], frames: bool) -> list[_Entry]:
@@ -201,9 +158,6 @@ def _in_order(file: Path, entries: list[_Entry], frames: bool) -> list[_Entry]:
     if len(unique) < len(ordered):
         text = f"`{file}`: {len(ordered) - len(unique)} lines repeat the time of another; the first was kept"
         _warn(LeftOutWarning(text, len(ordered) - len(unique)) if frames else text)
-    again = len(unique) - len({path for _, path in unique})
-    if again:
-        _warn(f"`{file}`: {again} of {len(unique)} lines name a file that another names, too")
     return unique
 
 

@@ -5,24 +5,27 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
+from vggtgeo.datasets.depth_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import MILLIMETRES, metres_of_codes
-from vggtgeo.datasets.intrinsics import MOST_ASPECT, camera_from_folder, guess_with_warning
+from vggtgeo.datasets.intrinsics import MAX_ASPECT, camera_from_folder, guess_with_warning
 from vggtgeo.datasets.video_stream import (
+    ChosenTracks,
     DepthStream,
+    Track,
     VideoStream,
+    choose_tracks,
     open_container,
     open_stream,
     shown_size,
     stands_alone,
+    tracks_of,
 )
-from vggtgeo.datasets.video_tracks import ChosenTracks, Track, choose_tracks, tracks_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
@@ -31,8 +34,6 @@ FASTEST = 1000
 """Frames a second that a header may state."""
 _FALLBACK_RATE = 30.0
 _HEAD = 4096
-_SAME_ASPECT = 0.01
-"""Relative difference of aspects: codecs need even sides."""
 _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 """Control characters other than those of text and terminals: every video has some."""
 Size = tuple[int, int]
@@ -81,11 +82,6 @@ class VideoFile:
         if not has_times:
             text = "is a stream without times: is its header damaged?"
             _warn(InputWarning(f"`{path}` {text} {rate:g} frames a second are assumed: give `--fps` if it has others"))
-        elif rate > FASTEST:
-            _warn(InputWarning(f"`{path}` states {rate:g} frames a second: give `--fps` if that is not its rate"))
-        if first.interlaced_frame:
-            text = "is interlaced: `ffmpeg -i FILE -vf yadif NEW.mp4` converts it to whole images"
-            _warn(InputWarning(f"`{path}` {text}"))
         has_depth = tracks is not None and tracks.depth is not None
         rate = rate if 0 < rate < FASTEST else _FALLBACK_RATE
         return cls(path, path.name, camera, rate, max(count, 1), has_depth, None, tracks)
@@ -96,7 +92,7 @@ class VideoFile:
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
         """See `Sequence.frames`; frames that are skipped are not converted.
 
-        Damaged frames, and those of another aspect than the first, are left out, with a LeftOutWarning. A stream that
+        Damaged frames, and those of another size than the first, are left out, with a LeftOutWarning. A stream that
         ends before its container says so ends with an InputWarning.
         """
         check_selection(self.name, self.count, start, end, stride)
@@ -107,9 +103,9 @@ class VideoFile:
         return None
 
     def _decode(self, selection: "_Selection") -> Iterator[Frame]:
-        index, time, jumped = 0, -math.inf, False
+        index, time = 0, -math.inf
         damaged: int | None = None  # the first of the frames that cannot be decoded, while they last
-        sizes = _Sizes(self.name, (self.camera.width, self.camera.height))
+        size, others = (self.camera.width, self.camera.height), []
         with self._streams() as (stream, depths):
             for failed, frame in stream.frames():
                 stated = stream.time(frame)
@@ -118,18 +114,22 @@ class VideoFile:
                     index += self._missed(failed, stated - time, index)
                 if selection.is_behind(index):
                     break
-                jumped = jumped or self._warn_of_jump(index, time, stated)
                 time = self._time(index, time, stated)
                 if damaged is not None and stands_alone(frame) and not frame.is_corrupt:
                     self._warn_of_damage(selection, damaged, index)
                     damaged = None
-                if damaged is None and selection.has(index) and sizes.fit(index, frame):
-                    depth = None if depths is None else self._depth(depths, stated)
-                    yield Frame(index, time, stream.rgb(frame, sizes.first), depth, f"{self.name}, frame {index}")
+                if damaged is None and selection.has(index):
+                    if shown_size(frame) != size:
+                        others.append(f"frame {index} is {shown_size(frame)[0]} x {shown_size(frame)[1]}")
+                    else:
+                        depth = None if depths is None else self._depth(depths, stated)
+                        yield Frame(index, time, stream.rgb(frame), depth, f"{self.name}, frame {index}")
                 index += 1
         if damaged is not None:
             self._warn_of_damage(selection, damaged, index)
-        sizes.warn()
+        if others:
+            text = f"{len(others)} frames are not {size[0]} x {size[1]} pixels as the first ({others[0]})"
+            _warn(LeftOutWarning(f"`{self.name}`: {text}; they are skipped", len(others)))
         wanted = self.count if selection.end is None else min(selection.end, self.count)
         if index < wanted:
             counts = f"ends after {index} frames; its header says {self.count}"
@@ -167,18 +167,6 @@ class VideoFile:
             return index / self.given_rate
         return stated if stated > previous else previous + 1.0 / self.rate
 
-    def _warn_of_jump(self, index: int, previous: float, stated: float) -> bool:
-        """Return whether the time goes back; 0 is that of frames without one."""
-        back = self.given_rate is None and 0 < stated < previous - 1.0 / self.rate
-        if back:
-            _warn(
-                InputWarning(
-                    f"`{self.name}`: the time goes back from {previous:.3f} to {stated:.3f} s at frame {index}: were "
-                    "recordings joined? Give each by itself"
-                )
-            )
-        return back
-
     def _warn_of_damage(self, selection: "_Selection", first: int, behind: int) -> None:
         if count := selection.count(first, behind):
             text = f"frames {first} to {behind - 1} cannot be decoded, or are predicted from such"
@@ -204,44 +192,10 @@ class _Selection:
         return sum(self.has(index) for index in range(first, behind))
 
 
-@dataclass
-class _Sizes:
-    """Frames of other sizes than the first: scaled to it if the aspect is the same, else left out."""
-
-    name: str
-    first: Size
-    others: dict[bool, list[tuple[int, Size]]] = field(default_factory=lambda: {True: [], False: []})
-
-    def fit(self, index: int, frame: Any) -> bool:
-        """Return whether a frame can be used."""
-        width, height = shown_size(frame)
-        if (width, height) == self.first:
-            return True
-        same = abs(width * self.first[1] / (self.first[0] * height) - 1) <= _SAME_ASPECT
-        self.others[same].append((index, (width, height)))
-        return same
-
-    def warn(self) -> None:
-        """Warn of the frames of other sizes."""
-        for same, others in self.others.items():
-            if not others:
-                continue
-            index, (width, height) = others[0]
-            text = (
-                f"`{self.name}` changes its size: {len(others)} frames, {index} first ({width} x {height} pixels), are "
-                f"not {self.first[0]} x {self.first[1]} as the first"
-            )
-            _warn(
-                InputWarning(f"{text}; they are scaled to it")
-                if same
-                else LeftOutWarning(f"{text}, and have another aspect; they are skipped", len(others))
-            )
-
-
 def _pixel_aspect(stream: VideoStream, frame: Any) -> float:
     """Return width of a shown pixel over its height (1440 x 1080 are shown as 16:9); 1 if not stated, or impossible."""
     aspect = stream.pixel_aspect
-    if not 1 / MOST_ASPECT <= aspect <= MOST_ASPECT:
+    if not 1 / MAX_ASPECT <= aspect <= MAX_ASPECT:
         return 1.0
     return 1 / aspect if shown_size(frame) != (frame.width, frame.height) else aspect
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.datasets.image_checks import image_header
+from vggtgeo.datasets.image_files import image_header
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import MASK, Scene
-from vggtgeo.results.summary_file import POSES
+from vggtgeo.results.summary import POSES
 
 
 class EmptyRunError(InputError):

@@ -21,9 +21,8 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from vggtgeo.export.contents import cloud_of, mesh_of
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path
-from vggtgeo.models.extras import install_hint
 
 UPRIGHT = np.array([1.0, -1.0, -1.0])
 """From y down, z forward (the first camera's axes) to glTF's y up, z backward."""

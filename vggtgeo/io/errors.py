@@ -1,6 +1,13 @@
-"""Exception and warnings about invalid input."""
+"""Exceptions, warnings and messages about invalid input."""
 
-from vggtgeo.io.one_line import shortened
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Lock
+from typing import Any
 
 
 class InputError(ValueError):
@@ -44,3 +51,74 @@ class LeftOutWarning(InputWarning):
     def __init__(self, message: str, frames: int = 1) -> None:
         super().__init__(message)
         self.frames = frames
+
+
+MOST = 1200
+"""Characters of a line; a message may quote a whole damaged file."""
+_LONG_WORD = re.compile(r"[^\s]{500,}")
+"""Longer words are no file names, which have at most 255 characters."""
+
+
+def shortened(message: str) -> str:
+    """Return `message` with the middle of very long words left out."""
+    return _LONG_WORD.sub(lambda word: f"{word[0][:60]}...{word[0][-60:]}", message)
+
+
+def one_line(message: str, most: int = MOST) -> str:
+    """Return `message` without line breaks and control characters (a file name may contain a code that clears the
+    screen), at most `most` characters, its middle left out.
+    """
+    words = shortened(" ".join(message.split()))
+    text = "".join(sign if sign.isprintable() else f"\\x{ord(sign):02x}" for sign in words)
+    half = most // 2
+    return text if len(text) <= most else f"{text[:half]} ... {text[-half:]}"
+
+
+_lock = Lock()
+
+
+class _Showing:
+    """Shows warnings, and adds those about the input to `lists`."""
+
+    def __init__(self, as_before: Callable[..., Any]) -> None:
+        self.as_before = as_before
+        self.lists: list[list[Warning | str]] = []
+
+    def __call__(self, message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if issubclass(category, InputWarning):
+            for collected in tuple(self.lists):
+                collected.append(message)
+        self.as_before(message, category, *rest, **more)
+
+
+@contextmanager
+def collected_warnings() -> Iterator[list[Warning | str]]:
+    """Yield a list of the warnings about the input, in order, while they are shown as usual.
+
+    Python has one function to show warnings for all threads: if several threads collect at the same time, each gets the
+    warnings of all, since a run that misses a warning would be trusted too much.
+    """
+    collected: list[Warning | str] = []
+    with _lock:
+        showing = warnings.showwarning
+        if not isinstance(showing, _Showing):
+            showing = warnings.showwarning = _Showing(showing)
+        showing.lists.append(collected)
+    try:
+        yield collected
+    finally:
+        with _lock:  # the first to begin may be the first to end
+            showing.lists[:] = [other for other in showing.lists if other is not collected]
+            if not showing.lists and warnings.showwarning is showing:
+                warnings.showwarning = showing.as_before
+
+
+def install_hint(extra: str) -> str:
+    """What to do to have the packages of an extra of `pyproject.toml`, in a clone and with a released package."""
+    clone, release = f"pip install -e '.[{extra}]'", f"pip install 'vggtgeo[{extra}]'"
+    return f"install the extra `{extra}`: `{clone}` in a clone, `{release}` elsewhere"
+
+
+def put_back_hint(package: str, version: str) -> str:
+    """Return how to restore a package whose files another package has overwritten."""
+    return f"`pip install --force-reinstall --no-deps {package}=={version}` puts them back"

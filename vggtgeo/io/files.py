@@ -5,14 +5,19 @@ flushed to the disk, and renamed in one step. After an exception or Ctrl-C the t
 file is unchanged.
 """
 
+from __future__ import annotations
+
 import errno
 import json
 import os
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
+
+import cv2
+import numpy as np
 
 from vggtgeo.io.given import path_of
 
@@ -82,3 +87,10 @@ def _flush_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_picture(path: Path, image: np.ndarray, options: Sequence[int] = ()) -> None:
+    """Write `image` [H, W] or [H, W, 3] (BGR) atomically, in the format of the suffix of `path`; options: of OpenCV."""
+    # Encoded first: OpenCV does not report a full disk, and leaves a part of an image.
+    with atomic_open(path, "wb") as file:
+        file.write(cv2.imencode(path.suffix, image, options)[1].tobytes())

@@ -21,16 +21,11 @@ def check_kind(name: str, given: Any, kind: Any, expected: str) -> None:
         raise InputError(f"`{name}` is of the type `{type(given).__name__}`; expected {expected}")
 
 
-_LONGEST_NAME, _LONGEST_PATH = 255, 4095
-"""Bytes; of Linux and its file systems."""
-
-
 def path_of(name: str, given: Any) -> Path:
     """Return the path of a text or an `os.PathLike`, with `~` expanded to the home folder; it need not exist.
 
     Raises:
-        InputError: another type (bytes, for example), an empty path, or one that no file system accepts (a zero byte,
-            or too long).
+        InputError: another type (bytes, for example), or an empty path.
 
     """
     found = os.fspath(given) if isinstance(given, str | os.PathLike) else given
@@ -38,16 +33,6 @@ def path_of(name: str, given: Any) -> Path:
         raise InputError(f"`{name}` is {given!r:.60}; expected a path: a text, or a `pathlib.Path`")
     if not found:
         raise InputError(f"`{name}` is empty, which would mean the working folder; give a path")
-    if "\0" in found:
-        raise InputError(f"`{name}` is {given!r:.60}, which has a zero byte in it; give a path")
-    try:
-        whole = os.fsencode(found)
-    except UnicodeEncodeError:
-        raise InputError(f"`{name}` is {given!r:.60}, which has a character that a file name cannot have") from None
-    longest = max(map(len, whole.split(os.fsencode(os.sep))))
-    if longest > _LONGEST_NAME or len(whole) > _LONGEST_PATH:
-        text = f"{len(whole)} bytes, {longest} between two slashes; there can be {_LONGEST_PATH}, and {_LONGEST_NAME}"
-        raise InputError(f"`{name}` is {given!r:.30}..., a path of {text}")
     return Path(os.path.expanduser(found))  # `Path.expanduser` fails for an unknown user
 
 

@@ -6,8 +6,8 @@ of all arrays. A value comes back exactly: floats, element types, memory order (
 share an array.
 
 Loading executes nothing: a file names classes, and the reader looks them up in its own list. Fields are set past
-constructors, so that a loaded value equals the saved one; their types are checked instead. The header is checked before
-any data are read, and zip's checksums detect damage. A file of another version is refused.
+constructors, so that a loaded value equals the saved one. The header is checked before any data are read, and zip's
+checksums detect damage. A file of another version is refused.
 
 In the tree, null, booleans, numbers and texts are themselves, and a list is a tuple. Everything else is an object:
 `l` a list, `d` a dictionary, `c` and `v` an object (number of its class, values of its fields), `k` a class, `t` an
@@ -21,12 +21,9 @@ import dataclasses
 import json
 import math
 import re
-import types
-import typing
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -290,11 +287,8 @@ class _Decoder:
 
     def _object(self, kind: type, values: Sequence[Tree]) -> Any:
         made: Any = object.__new__(kind)
-        for (name, (valid, words)), item in zip(_field_checks(kind).items(), values, strict=True):
-            value = self.value(item)
-            if not valid(value):
-                raise ValueError(f"`{name}` of `{kind.__name__}` must be {words}, got {value!r:.60}")
-            object.__setattr__(made, name, value)
+        for field, item in zip(dataclasses.fields(kind), values, strict=True):
+            object.__setattr__(made, field.name, self.value(item))
         return made
 
     def _values(self, name: str) -> np.ndarray:
@@ -356,55 +350,3 @@ def _write_bytes(archive: zipfile.ZipFile, name: str, blocks: list[np.ndarray]) 
         np.lib.format.write_array_header_1_0(member, {"descr": "|u1", "fortran_order": False, "shape": (size,)})
         for block in blocks:
             member.write(block.data)
-
-
-Check = Callable[[Any], bool]
-_NUMBERS: dict[Any, tuple[type, ...]] = {
-    bool: (bool, np.bool_),
-    int: (int, np.integer),
-    float: (float, int, np.floating, np.integer),
-}
-
-
-@cache
-def _field_checks(kind: type) -> Mapping[str, tuple[Check, str]]:
-    """Return, by field of a dataclass, a check of the annotated type and the type as text.
-
-    Array shapes, functions and protocols are not checked beyond their class.
-    """
-    try:
-        annotated = typing.get_type_hints(kind)
-    except (NameError, TypeError):  # a name that only type checkers see
-        annotated = {}
-    hints = {field.name: annotated.get(field.name, Any) for field in dataclasses.fields(kind)}
-    return {name: (_type_check(hint), getattr(hint, "__name__", str(hint))) for name, hint in hints.items()}
-
-
-def _type_check(hint: Any) -> Check:
-    origin, inside = typing.get_origin(hint), typing.get_args(hint)
-    if hint in _NUMBERS:
-        allowed, refused = _NUMBERS[hint], () if hint is bool else (bool, np.bool_)
-        return lambda value: isinstance(value, allowed) and not isinstance(value, refused)
-    if origin in (typing.Union, types.UnionType):
-        checks = [_type_check(one) for one in inside]
-        return lambda value: any(check(value) for check in checks)
-    if origin is tuple and len(inside) == 2 and inside[1] is ...:
-        each = _type_check(inside[0])
-        return lambda value: isinstance(value, tuple) and all(map(each, value))
-    if origin is tuple:
-        checks = [_type_check(one) for one in inside]
-        return lambda value: (
-            isinstance(value, tuple)
-            and len(value) == len(checks)
-            and all(check(item) for check, item in zip(checks, value, strict=True))
-        )
-    if origin is Mapping:
-        key, item = map(_type_check, inside)
-        return lambda value: isinstance(value, Mapping) and all(key(one) and item(two) for one, two in value.items())
-    kind = getattr(hint, "array_type", origin or hint)  # of jaxtyping's arrays the class alone
-    if kind is jax.Array:
-        return lambda value: isinstance(value, jax.Array | np.ndarray)
-    concrete = ("builtins", "numpy", "concurrent.futures._base")
-    if isinstance(kind, type) and (kind.__module__ in concrete or dataclasses.is_dataclass(kind)):
-        return lambda value: isinstance(value, kind)
-    return lambda value: True

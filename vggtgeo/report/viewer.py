@@ -15,9 +15,8 @@ from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import write_text
-from vggtgeo.models.extras import install_hint
 from vggtgeo.report.map_scene import MapScene
 from vggtgeo.report.templates import style, template
 

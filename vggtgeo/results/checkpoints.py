@@ -36,8 +36,8 @@ from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 from vggtgeo.slam.verdict.witness import EvidenceSoFar, FrameEvidence
 from vggtgeo.slam.window_recorder import WindowRecord
 
-_CONTEXT, _EXCERPT = 30, 110
-"""Characters of a long setting that an error shows, and how many of them lie before the first difference."""
+_EXCERPT = 110
+"""Characters of a long setting that an error shows."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
     differing = [name for name in {**saved, **identity} if saved.get(name) != identity.get(name)]
     if differing:  # report the shortest: a seed, for example, also appears in every role that samples
         name = min(differing, key=lambda one: len(saved.get(one, "")) + len(identity.get(one, "")))
-        before, now = _excerpts(saved.get(name), identity.get(name))
+        before, now = _excerpt(saved.get(name)), _excerpt(identity.get(name))
         raise InputError(
             f"`{name}` is {now}, but the run in `{asked.path}` had {before}: use the same, or start again with "
             "`--no-resume`"
@@ -195,17 +195,8 @@ def _header(path: Path) -> dict[str, Any]:
     return found
 
 
-def _excerpts(before: str | None, now: str | None) -> tuple[str, str]:
-    """Both texts, long ones shortened to the part around their first difference."""
-    same = next((at for at, (a, b) in enumerate(zip(before or "", now or "", strict=False)) if a != b), 0)
-    start = max(same - _CONTEXT, 0)
-    return _excerpt(before, start), _excerpt(now, start)
-
-
-def _excerpt(value: str | None, start: int) -> str:
-    if value is None or len(value) <= _EXCERPT:
-        return "nothing" if value is None else value
-    return f"{'...' * (start > 0)}{value[start : start + _EXCERPT]}{'...' * (start + _EXCERPT < len(value))}"
+def _excerpt(value: str | None) -> str:
+    return "nothing" if value is None else value if len(value) <= _EXCERPT else f"{value[:_EXCERPT]}..."
 
 
 def frames_kept(path: Path) -> str:

@@ -11,8 +11,7 @@ import numpy as np
 import tomli_w
 
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import write_text
-from vggtgeo.io.pictures import write_picture
+from vggtgeo.io.files import write_picture, write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory

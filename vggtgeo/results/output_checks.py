@@ -112,9 +112,7 @@ def _check_stage(stage: Path) -> None:
 def check_checkpoint_path(path: Path) -> None:
     """Raise InputError if `path` exists and is not a file."""
     if os.path.lexists(path) and not path.is_file():
-        found = "a broken link" if path.is_symlink() and not path.exists() else "not a file"
-        found = "a folder" if path.is_dir() else "a pipe" if path.is_fifo() else found
-        raise InputError(f"`{path}` is {found}, but the run writes its checkpoint there: remove it")
+        raise InputError(f"`{path}` is not a file, but the run writes its checkpoint there: remove it")
 
 
 def _inside(place: Path, source: Path) -> str | None:

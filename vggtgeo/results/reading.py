@@ -6,13 +6,13 @@ import os
 from typing import Any
 
 from vggtgeo.datasets import Sequence, open_sequence
-from vggtgeo.datasets.trajectory_files import load_trajectory
+from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, path_of
 from vggtgeo.results.result import Result
-from vggtgeo.results.summary_file import warn_if_truncated
+from vggtgeo.results.summary import warn_if_truncated
 
 
 def read(path: str | os.PathLike[str]) -> Result | Sequence:

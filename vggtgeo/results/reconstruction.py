@@ -10,26 +10,34 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from vggtgeo.datasets import Sequence
+from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, collected_warnings
 from vggtgeo.io.given import check_kind, check_plain, check_whole
 from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.process_settings import program_settings
-from vggtgeo.io.warned import collected_warnings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, load_checkpoint, run_identity
 from vggtgeo.results.result import Result, RunRecord
-from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source, open_source, reduction_summary
-from vggtgeo.results.static_overlay import StaticOverlaySearch
 from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
-from vggtgeo.results.tracking_loop import Tracked, TrackingLoop
+from vggtgeo.results.tracking_loop import RunCallbacks, Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
+from vggtgeo.slam.perception.still_parts import (
+    APART,
+    PICTURES,
+    StillParts,
+    find_still_parts,
+    small_grey,
+    still_parts_of,
+)
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
 from vggtgeo.slam.self_calibration import self_calibrate
@@ -37,8 +45,8 @@ from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.verdict.finding import Verdict
-from vggtgeo.slam.verdict.input import check_input, check_refusals
+from vggtgeo.slam.verdict.finding import Finding, Verdict
+from vggtgeo.slam.verdict.input import check_input, check_refusals, check_still_parts
 from vggtgeo.slam.verdict.judge import judge_or_report
 from vggtgeo.slam.verdict.witness import EvidenceRecorder
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
@@ -319,3 +327,50 @@ def _adjust(
     except KeyboardInterrupt:
         hooks.each("on_message", "interrupted: keeping the result without the last adjustment")
         return tracked.slam, True
+
+
+class StaticOverlaySearch(Callback):
+    """Finds the static overlay of a run's images, and gives the verdict its findings.
+
+    found: the mask to leave out of perception; None before `search`, and where no overlay is certain.
+    """
+
+    def __init__(self) -> None:
+        self.found: StillParts | None = None
+        self._overlay: StillParts | None = None
+        self._searched = False
+        self._images: list[np.ndarray] = []
+        self._size = (0, 0)
+        self._stride = 1
+        self._frames = 0
+
+    def search(self, source: Source, selection: tuple[int, int | None, int]) -> None:
+        """Search in a sample of the first frames, before the run; warn where an overlay is left out."""
+        self._searched = True
+        self._overlay = find_still_parts(source.sample_images(*selection, PICTURES, APART))
+        if self._overlay is None or not self._overlay.separable:
+            return
+        self.found = self._overlay
+        warnings.warn(
+            f"{100 * self.found.share:.1f} % of the image is a static overlay (bars, a watermark, something on the "
+            "lens?); features and depth there are ignored",
+            InputWarning,
+            stacklevel=4,
+        )
+
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
+        """Keep 20 to 40 images, evenly spread over at most the first `PICTURES * APART` frames."""
+        if self._searched or self._frames >= PICTURES * APART:
+            return
+        if self._frames % self._stride == 0:
+            self._size = frame.image.shape[1], frame.image.shape[0]
+            self._images.append(small_grey(frame.image))
+            if len(self._images) == 2 * PICTURES:
+                self._images, self._stride = self._images[::2], 2 * self._stride
+        self._frames += 1
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return the findings for the verdict, after the last frame."""
+        if not self._searched:
+            self._overlay = still_parts_of(self._images, self._size)
+        return check_still_parts(self._overlay, left_out=self.found is not None)

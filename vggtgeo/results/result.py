@@ -36,8 +36,14 @@ from vggtgeo.results.files import (
 from vggtgeo.results.reread_frames import depth_of_frames
 from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
 from vggtgeo.results.scene import write_scene
-from vggtgeo.results.summary import add_writing_time, compare_with_truth, summarise
-from vggtgeo.results.summary_file import load_poses, read_summary, summary_error
+from vggtgeo.results.summary import (
+    add_writing_time,
+    compare_with_truth,
+    load_poses,
+    read_summary,
+    summarise,
+    summary_error,
+)
 from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map

@@ -12,10 +12,8 @@ decides whether it is used or deleted, and is required.
 from __future__ import annotations
 
 import errno
-import glob
 import os
 import shutil
-import tomllib
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,12 +21,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import whole_path, write_text
+from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
-from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.checkpoints import frames_kept
-from vggtgeo.results.output_checks import NAMES, NOTE, check_output, is_known
+from vggtgeo.results.output_checks import NAMES, NOTE, check_output
 from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED
 
 RESERVE = 96 * 2**20
@@ -69,12 +66,11 @@ class RunFolder:
             self.release_reserve()
             if not self.keeps:
                 (self.stage / NOTE).unlink(missing_ok=True)
-            _move_foreign_files(self.stage)
             # File managers and network file systems leave hidden files.
             ours = (path for path in self.stage.iterdir() if not path.name.startswith("."))
             written = (path for path in ours if path.name not in (CHECKPOINT, NOTE))
             new = sorted(written, key=lambda path: path.name == SUMMARY)
-            for pattern in (*NAMES, *map(glob.escape, _old_recording(self.folder))):
+            for pattern in NAMES:
                 for path in sorted(self.folder.glob(pattern)):
                     _remove(path)
             for path in new:
@@ -133,13 +129,6 @@ def open_run_folder(
                 yield _prepare(RunFolder(place), reserve, bool(resume))
             finally:
                 _clean_up(place / UNFINISHED)
-    except (FileNotFoundError, NotADirectoryError) as error:
-        if (place / UNFINISHED).is_dir():
-            raise
-        raise InputError(
-            f"`{place}` was moved, removed or replaced during the run ({error.strerror}): the results are in "
-            f"`{UNFINISHED}` of the original folder, if that still exists"
-        ) from error
     finally:
         for path in created:
             if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
@@ -195,38 +184,7 @@ def _clean_up(stage: Path) -> None:
     if (stage / "trajectory.txt").is_file() or (stage / CHECKPOINT).is_file():
         (stage / _RESERVED).unlink(missing_ok=True)
     else:
-        _move_foreign_files(stage)
         _remove(stage)
-
-
-def _move_foreign_files(stage: Path) -> None:
-    """Move files that are not the run's out of the stage, with a warning, before it is removed.
-
-    All names that a run writes must be in `NAMES`.
-    """
-    inside = sorted(stage.iterdir()) if stage.is_dir() and not stage.is_symlink() else []
-    for path in inside:
-        if is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, NOTE):
-            continue
-        names = (path.name, *(f"{UNFINISHED}-{count}-{path.name}" for count in range(1, 1000)))
-        free = next(stage.parent / name for name in names if not os.path.lexists(stage.parent / name))
-        os.replace(path, free)
-        warnings.warn(
-            f"`{path}` is not a file of the run, and `{UNFINISHED}` is removed at its end: moved to `{free}`",
-            InputWarning,
-            stacklevel=2,
-        )
-
-
-def _old_recording(folder: Path) -> list[str]:
-    """Name of the recording that an earlier run made in `folder`, from its settings file."""
-    try:
-        target = tomllib.loads(whole_text(folder / "settings.toml", errors="strict")).get("rerun")
-    except (OSError, ValueError, RecursionError):
-        return []
-    path = Path(str(target))
-    inside = path.suffix == ".rrd" and whole_path(path.parent) == whole_path(folder)
-    return [path.name] if inside else []
 
 
 def _remove(path: Path) -> None:

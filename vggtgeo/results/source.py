@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence
 from vggtgeo.datasets.frame import check_selection
 from vggtgeo.datasets.in_memory import FrameStream, frame_stream
-from vggtgeo.datasets.reduced import reduced
+from vggtgeo.datasets.views import reduced
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning

@@ -1,4 +1,4 @@
-"""The loop over the frames of a run: track each, write checkpoints, stop after a whole frame on Ctrl-C."""
+"""The loop over the frames of a run and its callbacks: track, write checkpoints, stop after a whole frame."""
 
 from __future__ import annotations
 
@@ -7,19 +7,25 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
+from typing import Any
 
 from vggtgeo.datasets import Frame
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_kind
 from vggtgeo.io.interruption import Interruption
 from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, Notice, RunSoFar, check_same_frame
-from vggtgeo.results.run_callbacks import RunCallbacks
 from vggtgeo.results.source import Source
+from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
-from vggtgeo.slam.settings.slam_settings import SlamSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.window.sliding_window import warm_up
 
 
 class PendingFrames:
@@ -171,3 +177,47 @@ class TrackingLoop:
 
     def _message(self, text: str) -> None:
         self.hooks.each("on_message", text)
+
+
+@dataclass(frozen=True, eq=False)
+class RunCallbacks:
+    """All callbacks of a run; their time is measured as a stage of its own."""
+
+    members: tuple[Callback, ...]
+    clock: Clock
+
+    def __post_init__(self) -> None:
+        for member in self.members:
+            check_kind("callbacks", member, Callback, "instances of `vggtgeo.Callback`")
+
+    def warm_up(self, settings: SlamSettings, roles: Roles, camera: Camera) -> None:
+        """Compile the window adjustment, the RGB-D alignment, and what the callbacks compute from windows."""
+        self.each("on_stage", "compiling")
+        compiled = warm_up(settings, roles.metric)
+        if roles.alignment is not None and roles.metric:
+            compile_alignment(camera)
+        for member in self.members:
+            member.on_warm_up(*compiled)
+
+    def so_far(self) -> dict[str, Any]:
+        """Return the state of each callback that has one, by class name, for a checkpoint."""
+        found = {type(member).__name__: member.so_far() for member in self.members}
+        return {name: value for name, value in found.items() if value is not None}
+
+    def resume(self, before: RunSoFar) -> None:
+        """Restore each callback from a checkpoint; raise InputError for a state of another type."""
+        for member in self.members:
+            name = type(member).__name__
+            kept, fresh = before.callbacks.get(name), member.so_far()
+            if fresh is not None and not isinstance(kept, type(fresh)):
+                raise InputError(
+                    f"`{name}` in the checkpoint must be {type(fresh).__name__}, got {type(kept).__name__}: start "
+                    "again with `--no-resume`"
+                )
+            member.on_resume(kept, before.slam)
+
+    def each(self, hook: str, *arguments: Any) -> None:
+        """Call a hook of every callback."""
+        with self.clock.measure("record and draw"):
+            for member in self.members:
+                getattr(member, hook)(*arguments)

@@ -11,7 +11,7 @@ from vggtgeo.simulation.sensor import IDEAL as IDEAL
 from vggtgeo.simulation.sensor import Sensor as Sensor
 from vggtgeo.simulation.sequence import SyntheticSequence as SyntheticSequence
 from vggtgeo.simulation.sequence import simulate as simulate
+from vggtgeo.simulation.sequence import write_tum_folder as write_tum_folder
 from vggtgeo.simulation.small_window import SimulatedWindow as SimulatedWindow
 from vggtgeo.simulation.small_window import simulate_window as simulate_window
-from vggtgeo.simulation.tum_folder import write_tum_folder as write_tum_folder
 from vggtgeo.simulation.worlds import WORLDS as WORLDS

@@ -17,8 +17,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.simulation.degradations import Recording, with_images
-from vggtgeo.simulation.rolling_rows import camera_velocities
+from vggtgeo.simulation.degradations import Recording, camera_velocities, with_images
 
 INSTANTS = 5
 """Moments of an exposure whose mean is the image."""

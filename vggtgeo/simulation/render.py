@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.simulation.raster import EMPTY, View, inverse_depth_at, rasterise, view_from
+from vggtgeo.simulation.raster import EMPTY, View, inverse_depth_at, rasterise, shade, view_from
 from vggtgeo.simulation.scene import Scene
-from vggtgeo.simulation.shade import shade
 from vggtgeo.simulation.shapes import Surfaces
 
 _GLASS_TINT = np.array([0.86, 0.90, 0.88], np.float32)

@@ -8,9 +8,9 @@ import numpy as np
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_real, check_whole, real_numbers
-from vggtgeo.simulation.shade import encode
+from vggtgeo.simulation.raster import encode
 
-MOST_SAMPLES = 1000
+MAX_SAMPLES = 1000
 """Renderings for one image."""
 
 
@@ -40,7 +40,7 @@ class Sensor:
             check_real(name, getattr(self, name), "zero or a positive number")
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be zero or a positive number")
-        check_whole("blur_samples", self.blur_samples, 1, MOST_SAMPLES)
+        check_whole("blur_samples", self.blur_samples, 1, MAX_SAMPLES)
         given = real_numbers("depth_range", self.depth_range)
         if given.shape != (2,) or not 0 <= given[0] < given[1]:
             raise InputError(f"`depth_range` is {self.depth_range}; it must be (near, far) with 0 <= near < far")

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.files import write_picture, write_text
 from vggtgeo.io.given import check_kind, check_real, check_whole
 from vggtgeo.simulation.render import Picture, render
 from vggtgeo.simulation.scene import Scene
@@ -144,7 +148,7 @@ def simulate(
     return SyntheticSequence(build(seed), motion, camera_of(size), sensor or Sensor(), frames, rate, seed)
 
 
-MOST_FRAMES, MOST_SIDE = 1_000_000, 8192
+MAX_FRAMES, MAX_SIDE = 1_000_000, 8192
 """More would take all memory before the first frame."""
 
 
@@ -157,7 +161,7 @@ def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, spee
         raise InputError(f"`size` has {len(size)} numbers; expected (width, height), in pixels")
     for name, count in (("frames", frames), ("size", min(size)), ("size", max(size))):
         check_whole(name, count, 1)
-    for name, count, most in (("frames", frames, MOST_FRAMES), ("size", max(size), MOST_SIDE)):
+    for name, count, most in (("frames", frames, MAX_FRAMES), ("size", max(size), MAX_SIDE)):
         if count > most:
             raise InputError(f"`{name}` is {count}; it must be at most {most}")
     for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
@@ -183,3 +187,49 @@ def camera_of(size: tuple[int, int]) -> Camera:
     width, height = size
     focal = 0.832 * width
     return Camera((focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), width, height)
+
+
+_DEPTH_UNITS = 5000.0
+_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+
+
+def write_tum_folder(sequence: SyntheticSequence, folder: str | os.PathLike[str]) -> Iterator[Frame]:
+    """Render `sequence` into `folder`, giving each frame once it is written (for a progress bar).
+
+    Raises InputError if `folder` exists and is not empty, or is not writable.
+    """
+    target = Path(folder)
+    check_new(target)
+    for part in ("rgb", "depth"):
+        (target / part).mkdir(parents=True, exist_ok=True)
+    # Units and times first: without them an interrupted folder would be read with another unit of depth.
+    fx, fy, cx, cy = sequence.camera.intrinsics
+    write_text(target / "calibration.txt", f"{fx:.9g} {fy:.9g} {cx:.9g} {cy:.9g}\n")
+    sequence.ground_truth().save_tum(target / "groundtruth.txt")
+    times = [sequence.timestamp(index) for index in range(len(sequence))]
+    for part in ("rgb", "depth") if sequence.has_depth else ("rgb",):
+        lines = "".join(f"{time:.6f} {part}/{_name(time)}\n" for time in times)
+        write_text(target / f"{part}.txt", f"# {sequence.name} (simulated)\n# timestamp filename\n{lines}")
+    for frame in sequence.frames():
+        name = _name(frame.timestamp)
+        write_picture(target / "rgb" / name, np.ascontiguousarray(frame.image[..., ::-1]), _FAST)
+        if frame.depth is not None:
+            write_picture(target / "depth" / name, _depth_code(frame.depth), _FAST)
+        yield frame
+
+
+def _name(time: float) -> str:
+    return f"{time:.6f}.png"
+
+
+def check_new(folder: Path) -> None:
+    """Raise InputError if `folder` exists and is not an empty folder."""
+    if folder.is_symlink() and not folder.exists():
+        raise InputError(f"`{folder}` is a broken link; give the name of a new folder")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"`{folder}` exists and is not an empty folder; give the name of a new one")
+
+
+def _depth_code(depth: np.ndarray) -> np.ndarray:
+    code = np.nan_to_num(depth * _DEPTH_UNITS, nan=0.0, posinf=0.0)
+    return np.where(code < 65535, np.rint(code), 0).astype(np.uint16)

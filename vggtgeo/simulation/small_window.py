@@ -31,7 +31,7 @@ _SAMPLES = 4
 _DEPTHS = 1.5, 4.5
 """Metres."""
 
-_MOST_MATCHES = 5_000_000
+_MAX_MATCHES = 5_000_000
 """Of a window: 1 GB while it is made."""
 
 
@@ -154,10 +154,10 @@ def simulate_window(
                 f"`{name}` is {share}; it must be at least 0, and {'at most 1' if most == 1 else 'finite'}"
             )
     matches = keyframes * (keyframes - 1) * (points + _SAMPLES * lines)
-    if matches > _MOST_MATCHES:
+    if matches > _MAX_MATCHES:
         raise InputError(
             f"{keyframes} `keyframes` with {points} `points` and {lines} `lines` each make {matches} observations, as "
-            f"each sees those of all others; at most {_MOST_MATCHES} are made: give fewer"
+            f"each sees those of all others; at most {_MAX_MATCHES} are made: give fewer"
         )
     rng = np.random.default_rng(seed)
     poses = _arc(keyframes)

@@ -9,10 +9,9 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.simulation.raster import EMPTY, NEAR, View, inverse_depth_at
+from vggtgeo.simulation.raster import EMPTY, NEAR, View, encode, inverse_depth_at
 from vggtgeo.simulation.render import Picture
 from vggtgeo.simulation.scene import Scene
-from vggtgeo.simulation.shade import encode
 
 _HALF_STRENGTH = 6.0  # grey levels a pixel of gradient in the weaker direction that count as strength 0.5
 _DEPTH_TOLERANCE = 0.01  # relative; what is nearer by more hides a point

@@ -14,7 +14,7 @@ import numpy as np
 
 from vggtgeo.datasets.frame import Frame, Sequence, check_frame
 from vggtgeo.datasets.in_memory import FrameStream, frame_stream
-from vggtgeo.datasets.reduced import reduced
+from vggtgeo.datasets.views import reduced
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import expm
 from vggtgeo.models import roles
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry, TwoViewStart
-from vggtgeo.models.classical.pose_refinement import refine_pose
+from vggtgeo.models.classical.pnp import refine_pose
 from vggtgeo.models.roles import GeometryResult
 
 from vggtgeo.geometry import pinhole

@@ -6,8 +6,8 @@ import pytest
 from reported import raises
 from vggtgeo.models import roles
 from vggtgeo.models.classical import EpipolarVerifier, OrbMatcher, PatchAlignment, PatchFlow, SiftMatcher
-from vggtgeo.models.classical.key_points import spread
 from vggtgeo.models.classical.nearest import exclude_far, mutual_nearest
+from vggtgeo.models.classical.pixel_matcher import spread
 
 MATCHERS = {"sift": SiftMatcher(count=500), "orb": OrbMatcher(count=500)}
 MOTION = views.pose((3.0, -4.0, 6.0), (0.15, -0.1, 0.1))

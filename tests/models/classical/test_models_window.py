@@ -9,8 +9,7 @@ import pytest
 from vggtgeo.models import roles
 from vggtgeo.models.classical import PnpGeometry
 from vggtgeo.models.roles import GeometryResult
-from vggtgeo.models.window_alignment import align_window
-from vggtgeo.models.window_locator import WindowLocator
+from vggtgeo.models.window_locator import WindowLocator, align_window
 
 POSES = np.stack([views.pose((0, 3.0 * n, n), (-0.1 * n, 0.02 * n, 0.0)) for n in range(4)])
 IMAGES = tuple(np.full((4, 5, 3), n, np.uint8) for n in range(4))

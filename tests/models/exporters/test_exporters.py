@@ -12,12 +12,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from invoked import invoke
-from vggtgeo.models.exporters import packages
+from reported import raises
+from vggtgeo.models.exporters import request
+from vggtgeo.models.exporters.attention import angle_tables, grid
 from vggtgeo.models.exporters.checkout import Checkout, import_from, stand_in
 from vggtgeo.models.exporters.export import difference
 from vggtgeo.models.exporters.recipes import RECIPES, recipe_of
 from vggtgeo.models.exporters.request import ExportError
-from vggtgeo.models.exporters.rotary import angle_tables, grid
 from vggtgeo.models.exporters.weights import load_strictly, weights_of
 from vggtgeo.models.onnx.contracts import CONTRACTS
 
@@ -65,8 +66,8 @@ def test_a_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.M
     assert result.exit_code == 2
     assert "`torch`" in result.output
     assert "pip install -e '.[export]'" in result.output
-    with pytest.raises(ExportError, match="no_such_package"):
-        packages.load("no_such_package")
+    with raises("no_such_package", error=ExportError):
+        request.load("no_such_package")
 
 
 SLOW = """

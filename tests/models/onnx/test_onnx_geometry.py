@@ -14,7 +14,7 @@ from vggtgeo.models.onnx.moge2 import MogeDepth, recover_focal_shift
 from vggtgeo.models.onnx.session import open_session
 from vggtgeo.models.onnx.vggt import VggtWindow, decode_cameras, robust_mean, shared_intrinsics
 from vggtgeo.models.roles import GeometryResult, MetricDepth, WindowGeometry
-from vggtgeo.models.window_alignment import align_window
+from vggtgeo.models.window_locator import align_window
 
 SIZES = [((480, 640), (392, 518)), ((480, 640), (384, 512)), ((48, 96), (64, 64)), ((90, 30), (28, 42))]
 

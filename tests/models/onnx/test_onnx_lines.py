@@ -9,10 +9,16 @@ import tiny_networks as tiny
 from vggtgeo.models.classical import LsdDetector
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
-from vggtgeo.models.onnx.letr import LetrDetector, decode_lines
+from vggtgeo.models.onnx.line_detectors import (
+    LetrDetector,
+    MlsdDetector,
+    cut_off,
+    decode_lines,
+    decode_maps,
+    directed,
+    tidy,
+)
 from vggtgeo.models.onnx.line_matcher import DenseLineMatcher, segment_similarity
-from vggtgeo.models.onnx.mlsd import MlsdDetector, decode_maps
-from vggtgeo.models.onnx.segments import cut_off, directed, tidy
 from vggtgeo.models.onnx.session import open_session
 from vggtgeo.models.roles import LineDetector, LineMatcher, RelativeView, Segments
 

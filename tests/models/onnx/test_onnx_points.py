@@ -17,8 +17,7 @@ from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks, vectors_a
 from vggtgeo.models.onnx.dinov3 import DescriptorGrid, DinoFeatures, saliency
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.fit import Fit
-from vggtgeo.models.onnx.mast3r import Mast3rMatcher, confidence_of, corners
-from vggtgeo.models.onnx.reciprocal import nearest, reciprocal
+from vggtgeo.models.onnx.mast3r import Mast3rMatcher, confidence_of, corners, nearest, reciprocal
 from vggtgeo.models.onnx.session import NetworkValueError, Session, open_session
 from vggtgeo.models.roles import DenseConfidence, PointMatcher
 

@@ -15,9 +15,8 @@ import pytest
 import tiny_networks as tiny
 from onnx import TensorProto, helper
 from reported import raises
-from vggtgeo.models.onnx import contracts, patience, providers
-from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
-from vggtgeo.models.onnx.graph_bytes import external_files
+from vggtgeo.models.onnx import contracts, providers
+from vggtgeo.models.onnx.file_checks import NetworkFileError, external_files, recognise
 from vggtgeo.models.onnx.providers import choose_provider
 from vggtgeo.models.onnx.session import NetworkRunError, digest_of, open_session, read_signature
 
@@ -218,26 +217,9 @@ def test_a_wrong_input_is_an_error_of_the_network(files: dict[str, Path]) -> Non
         session.run({"image": np.zeros((1, 3, 28, 43))})
 
 
-def test_a_loop_without_end_is_ended_and_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    # Proves that a network that never answers ends with an error that names it, after it was told that it takes long,
-    # and that others go on answering. Oracle: a file whose loop has no end.
-    monkeypatch.setattr(patience, "TOLD", 0.1)
-    monkeypatch.setattr(patience, "LONGEST", 0.3)
-    monkeypatch.setattr(patience, "_EVERY", 0.05)
-    session = open_session(tiny.endless(tmp_path / "endless.onnx"), contracts.LETR)
-    with raises("endless.onnx", error=NetworkRunError):
-        session.run({"image": np.zeros((1, 3, 28, 42))})
-    assert "endless.onnx` has not answered for" in caplog.text
-    other = open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
-    assert other.run({"image": np.zeros((1, 3, 48, 64))})["pred_lines"].shape == (1, 3, 4)
-
-
-def test_ctrl_c_ends_a_network_while_it_computes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_ends_a_network_while_it_computes(tmp_path: Path) -> None:
     # Proves that Ctrl-C does not wait for an answer, and that others go on answering. Oracle: a file whose loop has no
     # end.
-    monkeypatch.setattr(patience, "LONGEST", 20.0)
     session = open_session(tiny.endless(tmp_path / "endless.onnx"), contracts.LETR)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs behind a shell ignores it
     threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
@@ -247,7 +229,7 @@ def test_ctrl_c_ends_a_network_while_it_computes(tmp_path: Path, monkeypatch: py
             session.run({"image": np.zeros((1, 3, 28, 42))})
     finally:
         signal.signal(signal.SIGINT, before)
-    assert time.monotonic() - began < patience.LONGEST / 2
+    assert time.monotonic() - began < 10.0
     other = open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
     assert other.run({"image": np.zeros((1, 3, 48, 64))})["pred_lines"].shape == (1, 3, 4)
 
@@ -310,7 +292,7 @@ def test_cuda_is_refused_where_there_is_none(monkeypatch: pytest.MonkeyPatch) ->
     available = "vggtgeo.models.onnx.providers.onnxruntime.get_available_providers"
     monkeypatch.setattr(available, lambda: ["CPUExecutionProvider"])
     assert choose_provider("auto") == "cpu"
-    with pytest.raises(NetworkFileError, match=r"pip install -e '\.\[gpu\]'"):
+    with raises("[gpu]", error=NetworkFileError):
         choose_provider("cuda")
     monkeypatch.setattr(available, lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     assert choose_provider("auto") == "cuda"

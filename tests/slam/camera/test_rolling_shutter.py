@@ -14,7 +14,7 @@ import vggtgeo as vg
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import lie, rigid
-from vggtgeo.simulation.rolling_rows import camera_velocities, rolled
+from vggtgeo.simulation.degradations import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
 from vggtgeo.slam.camera.calibration import keyframe_pairs
 from vggtgeo.slam.camera.camera_estimate import Readout

@@ -15,9 +15,9 @@ from vggtgeo.models.roles import Segments
 
 import vggtgeo as vg
 from vggtgeo.io.errors import InputWarning
+from vggtgeo.results.reconstruction import StaticOverlaySearch
 from vggtgeo.results.source import open_source
-from vggtgeo.results.static_overlay import StaticOverlaySearch
-from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.perception.still_parts import StillParts, find_still_parts
 from vggtgeo.slam.pipeline import begin

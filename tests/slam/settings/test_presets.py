@@ -23,8 +23,7 @@ from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.cli.main import make_app
 from vggtgeo.cli.models import FLAGS
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.simulation.sequence import SyntheticSequence, simulate
-from vggtgeo.simulation.tum_folder import write_tum_folder
+from vggtgeo.simulation.sequence import SyntheticSequence, simulate, write_tum_folder
 from vggtgeo.slam.run import frame_trajectory, run
 from vggtgeo.slam.settings.groups import RefinementSettings
 from vggtgeo.slam.settings.presets import CHOICES, NEEDED, Perception, perception

@@ -123,7 +123,7 @@ class CameraSettings(CheckedSettings):
 
     Fields:
         max_pixels: Larger images are reduced to about this many pixels when they are read, and the camera with them
-            (1920 x 1080 to 943 x 530), see `datasets/reduced.py`; 0 disables it. Dense maps and exports are of the
+            (1920 x 1080 to 943 x 530), see `datasets/views.py`; 0 disables it. Dense maps and exports are of the
             reduced images.
         calibration_frames: Number of frames used to calibrate an unknown camera before tracking; 0 disables it. A
             guessed camera is then estimated while tracking, as always where frames cannot be read twice (a live

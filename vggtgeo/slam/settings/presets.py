@@ -19,8 +19,7 @@ from typing import Any, get_args
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_positive, path_of
-from vggtgeo.io.network_errors import as_input_errors
-from vggtgeo.io.network_files import networks_folder
+from vggtgeo.io.network_files import as_input_errors, networks_folder
 from vggtgeo.models.classical import ConstantVelocity, OrbMatcher
 from vggtgeo.models.onnx.bounds import (
     BoundedConfidence,
@@ -35,10 +34,9 @@ from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
 from vggtgeo.models.onnx.dense_points import DensePointMatcher
 from vggtgeo.models.onnx.dinov3 import DinoFeatures
 from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
-from vggtgeo.models.onnx.letr import LetrDetector
+from vggtgeo.models.onnx.line_detectors import LetrDetector, MlsdDetector
 from vggtgeo.models.onnx.line_matcher import DenseLineMatcher
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
-from vggtgeo.models.onnx.mlsd import MlsdDetector
 from vggtgeo.models.onnx.moge2 import MogeDepth
 from vggtgeo.models.onnx.providers import Provider
 from vggtgeo.models.onnx.registry import NETWORKS, files_of, players

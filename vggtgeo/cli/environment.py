@@ -6,10 +6,13 @@ more addresses than memory: a limit well above the memory in use may still be to
 
 from __future__ import annotations
 
+import io
+import os
 import sys
 import warnings
 
 from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.jax_environment import jax_environment
 
 MIN_GB = {
     **dict.fromkeys(("run", "demo", "bench"), 3.0),
@@ -49,3 +52,16 @@ def _limit_gb() -> float | None:
 
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     return None if soft == resource.RLIM_INFINITY else soft * 1e-9
+
+
+def set_jax_flags() -> None:
+    """Set environment variables, which JAX reads on import; those of the user take precedence."""
+    for name, value in jax_environment().items():
+        os.environ.setdefault(name, value)
+
+
+def show_unknown_characters() -> None:
+    """Print `?` for characters that standard output or error cannot encode."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # not the stream of a notebook
+            stream.reconfigure(errors="replace")

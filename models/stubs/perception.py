@@ -1,0 +1,334 @@
+"""Simulated depth, confidence, point and line matches: the truth with errors as networks make them.
+
+Random numbers depend on the seed, the role and the frames, not on the order of calls.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from vggtgeo.models.roles import DepthEstimate, Features, PointMatches, Segments
+
+
+@dataclass(frozen=True)
+class SimulatedMoge:
+    """Error model: log depth = log truth + sigma(u) f(u, t) + wobble g, f a smooth field, g normal, one a frame.
+
+    sigma(u) = error (1 + weak w(u)), with w in [0, 1] the lack of texture, and `glass` times that behind glass.
+    error: relative deviation where texture is good. weak: how much larger it is without texture. cycles: waves of the
+    error across the picture. memory: seconds over which the error of neighbouring frames stays alike. wobble: relative
+    deviation of a frame's scale. The estimate states sqrt(sigma^2 + wobble^2) and a confidence error / sigma(u).
+    """
+
+    simulated: ClassVar[bool] = True
+
+    oracle: Oracle
+    seed: int = 0
+    error: float = 0.05
+    weak: float = 0.6
+    glass: float = 3.0
+    cycles: float = 1.2
+    memory: float = 1.0
+    wobble: float = 0.02
+
+    def __post_init__(self) -> None:
+        check_settings(self, error=0, weak=0, glass=1, cycles=0, memory=1e-3, wobble=0)
+
+    def estimate(
+        self, image: np.ndarray, sensor_depth: np.ndarray | None = None, intrinsics: Sequence[float] | None = None
+    ) -> DepthEstimate:
+        """Simulated depth of `image`; the sensor's depth is not looked at."""
+        index = self.oracle.index_of(image)
+        depth = self.oracle.depth(index)
+        sigma = self.error * (1 + self.weak * weakness(self.oracle, index))
+        sigma = sigma * np.where(self.oracle.glass(index), self.glass, 1.0)
+        field = SmoothField(self.seed, "moge", self.cycles, self.memory)
+        scale = self.wobble * stream(self.seed, "moge", index).standard_normal()
+        log_error = sigma * field.sample(depth.shape, self.oracle.timestamp(index)) + scale
+        confidence = np.where(np.isfinite(depth), self.error / np.maximum(sigma, 1e-12), 0.0)
+        stated = np.where(np.isfinite(depth), np.maximum(np.hypot(sigma, self.wobble), 1e-6), np.nan)
+        return DepthEstimate(
+            (depth * np.exp(log_error)).astype(np.float32), confidence.astype(np.float32), stated.astype(np.float32)
+        )
+
+
+@dataclass(frozen=True)
+class SimulatedDino:
+    """Error model: Omega = clip(floor + (1 - floor) (share s + (1 - share) e) + noise), made on patches of 16 px.
+
+    s: strength of texture around the pixel, 0 to 1. e: nearness of a straight edge, exp(-distance / reach). noise:
+    normal, one draw a patch, deviation `noise`. blind: factor behind glass, where attention is drawn by reflections.
+    floor: least saliency. share: weight of texture against structure. reach: pixels. patch: side of a patch, pixels.
+    """
+
+    simulated: ClassVar[bool] = True
+
+    oracle: Oracle
+    seed: int = 0
+    noise: float = 0.08
+    floor: float = 0.10
+    share: float = 0.65
+    reach: float = 12.0
+    blind: float = 0.7
+    patch: int = 16
+
+    def __post_init__(self) -> None:
+        check_settings(self, noise=0, floor=0, share=0, reach=1e-3, blind=0, patch=1)
+
+    def confidence(self, image: np.ndarray) -> np.ndarray:
+        """Simulated Omega of `image`, float32 [H, W] in [0, 1]."""
+        index = self.oracle.index_of(image)
+        strength = 1.0 - weakness(self.oracle, index)
+        height, width = strength.shape
+        saliency = self.share * strength + (1 - self.share) * self._structure(index, (height, width))
+        saliency = self.floor + (1 - self.floor) * saliency
+        saliency = saliency * np.where(self.oracle.glass(index), self.blind, 1.0)
+        grid = (-(-width // self.patch), -(-height // self.patch))
+        coarse = cv2.resize(saliency.astype(np.float32), grid, interpolation=cv2.INTER_AREA)
+        coarse += self.noise * stream(self.seed, "dino", index).standard_normal(coarse.shape, dtype=np.float32)
+        smooth = cv2.resize(np.clip(coarse, 0, 1), (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.clip(smooth, 0.0, 1.0).astype(np.float32)
+
+    def _structure(self, index: int, shape: tuple[int, int]) -> np.ndarray:
+        canvas = np.full(shape, 255, np.uint8)
+        for start, end in np.rint(self.oracle.edges(index).pixels).astype(int).tolist():
+            cv2.line(canvas, tuple(start), tuple(end), 0, 1)
+        distance = cv2.distanceTransform(canvas, cv2.DIST_L2, 3)
+        return np.exp(-distance / self.reach)
+
+
+_WAVES = 24
+_FULL_TEXTURE = 0.25  # strength from which a region counts as well textured
+
+
+def stream(seed: int, role: str, *indices: int) -> np.random.Generator:
+    """Return the random stream of one answer."""
+    return np.random.default_rng([seed, zlib.crc32(role.encode()), *indices])
+
+
+@dataclass(frozen=True)
+class SmoothField:
+    """A Gaussian-like field over the picture that drifts with time: mean 0, variance 1 at every place and time.
+
+    f(x, y, t) = sqrt(2 / K) sum_k cos(2 pi (a_k x + b_k y) + c_k t + phase_k), x and y in [0, 1]; a, b normal with
+    deviation `cycles` waves a picture, c normal with deviation 1 / `memory` (seconds).
+    """
+
+    seed: int
+    role: str
+    cycles: float
+    memory: float
+
+    def sample(self, shape: tuple[int, int], time: float) -> np.ndarray:
+        """Return the field at `time` (seconds) for a picture of `shape` (H, W), float32 [H, W]."""
+        rng = stream(self.seed, self.role)
+        across, down = rng.normal(0, self.cycles, (2, _WAVES))
+        phase = rng.uniform(0, 2 * np.pi, _WAVES) + time * rng.normal(0, 1 / self.memory, _WAVES)
+        y, x = np.mgrid[0:49, 0:65]
+        angle = 2 * np.pi * (across * (x / 64)[..., None] + down * (y / 48)[..., None]) + phase
+        coarse = np.sqrt(2 / _WAVES) * np.cos(angle).sum(axis=-1)
+        return cv2.resize(coarse.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+
+
+def weakness(oracle: Oracle, index: int) -> np.ndarray:
+    """Lack of texture around each pixel, float32 [H, W] in [0, 1]: 1 on a plain wall, 0 from a strength of 0.25."""
+    texture = oracle.texture(index).astype(np.float32)
+    around = cv2.GaussianBlur(texture, (0, 0), max(1.0, texture.shape[1] / 53))
+    return np.clip(1.0 - around / _FULL_TEXTURE, 0.0, 1.0)
+
+
+def at_pixels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return values of `image` [H, W] at the pixels nearest to `pixels` [n, 2] (x, y), clipped to the picture."""
+    height, width = image.shape
+    columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
+    rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
+    return image[rows, columns]
+
+
+def check_settings(stub: object, **lowest: float) -> None:
+    """Raise ValueError for the first setting of `stub` that is not finite or below its `lowest` value."""
+    for name, low in lowest.items():
+        value = getattr(stub, name)
+        if not np.isfinite(value) or value < low:
+            raise ValueError(f"`{name}` is {value}; it must be at least {low}: correct the error model")
+
+
+@dataclass(frozen=True)
+class SimulatedMast3r:
+    """Error model, with w in [0, 1] the lack of texture at the key point and g = 1 behind glass, else 0.
+
+    Key points: `count` a frame, drawn with weight spread + strength of texture. A key point that is seen in the other
+    view is missed with probability missed (1 + 3 w). A match that is made is an outlier with probability
+    outliers (1 + 9 w) + behind_glass g: its target lies `outlier_shift` pixels off (deviation of a normal). Other
+    targets have normal noise of noise (1 + w) pixels an axis. Of key points that are not seen in the other view a
+    share `imagined` is matched all the same, as an outlier. Confidence = clip(1 - 0.7 w - 0.3 outlier + 0.1 normal):
+    it knows weak texture well and outliers a little.
+    """
+
+    simulated: ClassVar[bool] = True
+
+    oracle: Oracle
+    seed: int = 0
+    count: int = 1500
+    spread: float = 0.10
+    noise: float = 0.5
+    missed: float = 0.10
+    outliers: float = 0.02
+    behind_glass: float = 0.35
+    outlier_shift: float = 25.0
+    imagined: float = 0.02
+
+    def __post_init__(self) -> None:
+        check_settings(
+            self, count=1, spread=1e-6, noise=0, missed=0, outliers=0, behind_glass=0, outlier_shift=0, imagined=0
+        )
+
+    def describe(self, image: np.ndarray) -> Features:
+        """Simulated key points of `image`; the descriptor is the frame's number."""
+        index = self.oracle.index_of(image)
+        rng = stream(self.seed, "mast3r", index)
+        texture = self.oracle.texture(index)[::2, ::2]
+        weight = self.spread + texture.ravel()
+        chosen = np.argsort(rng.exponential(size=weight.size) / weight)[: self.count]
+        rows, columns = np.divmod(chosen, texture.shape[1])
+        pixels = 2.0 * np.stack([columns, rows], axis=1) + rng.uniform(-0.5, 0.5, (len(chosen), 2))
+        height, width = image.shape[:2]
+        return Features(np.clip(pixels, 0, [width - 1, height - 1]), texture.ravel()[chosen], index)
+
+    def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
+        """Simulated matches from view i to view j; `index_j` is -1: targets are no key points."""
+        index_i, index_j = int(features_i.descriptors), int(features_j.descriptors)
+        rng = stream(self.seed, "mast3r", index_i, index_j)
+        pixels = features_i.pixels
+        target, seen = self.oracle.correspond(index_i, index_j, pixels)
+        weak = at_pixels(weakness(self.oracle, index_i), pixels)
+        glass = at_pixels(self.oracle.glass(index_i), pixels)
+        draw = rng.uniform(size=(3, len(pixels)))
+        made = np.where(seen, draw[0] >= self.missed * (1 + 3 * weak), draw[0] < self.imagined)
+        wrong = ~seen | (draw[1] < self.outliers * (1 + 9 * weak) + self.behind_glass * glass)
+        blur = self.noise * (1 + weak[:, None]) * rng.standard_normal(pixels.shape)
+        height, width = self.oracle.depth(index_j).shape
+        anywhere = rng.uniform(size=pixels.shape) * [width - 1, height - 1]
+        start = np.where(seen[:, None], target, anywhere)
+        answer = start + np.where(wrong[:, None], self.outlier_shift * rng.standard_normal(pixels.shape), blur)
+        made &= np.all((answer >= 0) & (answer <= [width - 1, height - 1]), axis=1)
+        confidence = np.clip(1 - 0.7 * weak - 0.3 * wrong + 0.1 * rng.standard_normal(len(pixels)), 0, 1)
+        rows = np.nonzero(made)[0]
+        return PointMatches(rows, np.full(len(rows), -1), pixels[rows], answer[rows], confidence[rows])
+
+
+@dataclass(frozen=True)
+class SimulatedLetr:
+    """Error model: an edge of contrast c (grey levels a pixel) is found with probability found c / (c + half).
+
+    across, along: deviation of each end across and along its segment, pixels. false: mean number of false segments a
+    frame (Poisson). shortest: pixels; shorter segments are not found. Scores are uniform in [0.7, 1] for true and in
+    [0.7, 0.85] for false ones (LETR's own threshold is 0.7), so that a score tells a little and no more.
+    """
+
+    simulated: ClassVar[bool] = True
+
+    oracle: Oracle
+    seed: int = 0
+    across: float = 0.7
+    along: float = 3.0
+    found: float = 0.9
+    half: float = 2.0
+    false: float = 6.0
+    shortest: float = 20.0
+
+    def __post_init__(self) -> None:
+        check_settings(self, across=0, along=0, found=0, half=0, false=0, shortest=0)
+
+    def detect(self, image: np.ndarray) -> Segments:
+        """Simulated segments of `image`, best first."""
+        index = self.oracle.index_of(image)
+        rng = stream(self.seed, "letr", index)
+        edges = self.oracle.edges(index)
+        ends = np.asarray(edges.pixels, float).reshape(-1, 2, 2)
+        contrast = np.asarray(edges.contrast)
+        chance = self.found * contrast / (contrast + self.half + 1e-12)
+        length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        kept = (rng.uniform(size=len(ends)) < chance) & (length >= self.shortest)
+        true = _noisy(ends[kept], self.across, self.along, rng)
+        false = self._false_segments(image.shape[1], image.shape[0], rng)
+        scores = np.concatenate([rng.uniform(0.7, 1.0, len(true)), rng.uniform(0.7, 0.85, len(false))])
+        order = np.argsort(-scores, kind="stable")
+        return Segments(np.concatenate([true, false])[order], scores[order])
+
+    def _false_segments(self, width: int, height: int, rng: np.random.Generator) -> np.ndarray:
+        count = int(rng.poisson(self.false))
+        middle = rng.uniform(0, 1, (count, 2)) * [width - 1, height - 1]
+        angle = rng.uniform(0, np.pi, count)
+        half = 0.5 * rng.uniform(max(self.shortest, 1.0), 0.25 * width, count)
+        way = half[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        ends = np.stack([middle - way, middle + way], axis=1)
+        return np.clip(ends, 0, [width - 1, height - 1])
+
+
+def _noisy(ends: np.ndarray, across: float, along: float, rng: np.random.Generator) -> np.ndarray:
+    """Return segments [L, 2, 2] with independent normal errors of their ends."""
+    way = ends[:, 1] - ends[:, 0]
+    way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+    normal = np.stack([-way[:, 1], way[:, 0]], axis=1)
+    shift = rng.standard_normal((len(ends), 2, 2))
+    return ends + along * shift[..., :1] * way[:, None] + across * shift[..., 1:] * normal[:, None]
+
+
+class VisibleSegments(Protocol):
+    """Visible straight edges. pixels: float [L, 2, 2] (segment, end, xy). contrast: float [L], grey levels a pixel."""
+
+    @property
+    def pixels(self) -> np.ndarray: ...
+
+    @property
+    def contrast(self) -> np.ndarray: ...
+
+
+@runtime_checkable
+class Oracle(Protocol):
+    """Knows each image that its scene has given. `index` is the frame's number."""
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """fx, fy, cx, cy, float [4], pixels."""
+        ...
+
+    def index_of(self, image: np.ndarray) -> int:
+        """Return the frame whose image this is; raises ValueError for any other image."""
+        ...
+
+    def timestamp(self, index: int) -> float:
+        """Seconds."""
+        ...
+
+    def pose(self, index: int) -> np.ndarray:
+        """Return world -> camera, float [4, 4]."""
+        ...
+
+    def depth(self, index: int) -> np.ndarray:
+        """Return float [H, W], metres, NaN = none."""
+        ...
+
+    def glass(self, index: int) -> np.ndarray:
+        """Return bool [H, W], pixels seen through glass."""
+        ...
+
+    def texture(self, index: int) -> np.ndarray:
+        """Return float [H, W] in [0, 1), strength of texture."""
+        ...
+
+    def edges(self, index: int) -> Any:
+        """`VisibleSegments` of the frame."""
+        ...
+
+    def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where pixels [n, 2] of frame i are in frame j, float [n, 2], and whether they are seen there, bool
+        [n].
+        """
+        ...
