@@ -49,6 +49,16 @@ def test_distance_angle_and_inliers_decide_each_alone(
         assert found == expected, view_change(frame, reference, SETTINGS)
 
 
+def test_in_a_map_of_free_scale_parallax_decides() -> None:
+    """A map in another unit has the same keyframes: distances and what stands for a metre grow alike. Oracle: the
+    decision in metres.
+    """
+    for metres in (0.19, 0.21):
+        for unit in (0.1, 1.0, 7.0):
+            found = needs_keyframe(pose(unit * metres), pose(), ENOUGH, SETTINGS, unit)
+            assert found == needs_keyframe(pose(metres), pose(), ENOUGH, SETTINGS)
+
+
 def test_view_change_is_the_larger_share() -> None:
     """The change of a view is the larger of distance and angle as shares of their limits. Oracle: the shares."""
     assert view_change(pose(0.1, 2.0), pose(), SETTINGS) == pytest.approx(0.5)

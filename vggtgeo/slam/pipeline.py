@@ -378,7 +378,7 @@ def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settin
     What the two keyframes know of each other by this frame ties them.
     """
     others = (keyframe for keyframe in slam.keyframes if keyframe.number != found.keyframe.number)
-    near = nearest_keyframe(found.pose, others, settings.keyframes)
+    near = nearest_keyframe(found.pose, others, settings.keyframes, found.evidence.metre)
     again = None
     if near is not None:
         prior = MotionPrior(found.pose, slam.tracker.velocity)
@@ -399,4 +399,5 @@ def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settin
 
 def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
     own, reference = found.pose, found.keyframe.pose
-    return found.evidence.by_rays or needs_keyframe(own, reference, found.evidence.inliers, settings.keyframes)
+    seen = found.evidence
+    return seen.by_rays or needs_keyframe(own, reference, seen.inliers, settings.keyframes, seen.metre)
