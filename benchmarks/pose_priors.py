@@ -2,7 +2,7 @@
 phone's poses are, and with poses of another recording.
 
     .venv/bin/python benchmarks/pose_priors.py ../shared/data/building-walk [--black 10 2] [--priors none own other]
-        [--other ../shared/data/corridor-office] [--depth] [--seed 0]
+        [--other ../shared/data/corridor-office] [--frames 0 240] [--depth] [--seed 0]
 
 own: the truth in another world, with 2 % of the path drift, 1 degree a minute, and 5 % too long. other: the poses of
 another clip at the times of this one. ATE after Sim(3), cm, over the frames that have a pose in the largest piece.
@@ -48,7 +48,7 @@ def main() -> None:
     for name in options.priors:
         roles = replace(default_roles(options.depth).seeded(options.seed), recorded=priors[name])
         began = time.monotonic()
-        frames = _frames(sequence, options.black, options.depth)
+        frames = _frames(sequence, options)
         slam = finish(deque(run(frames, roles, camera=sequence.camera), maxlen=1).pop(), roles)
         used = prior_summary(slam, roles).get("pose_prior", {}).get("used", "")
         estimate = frame_trajectory(slam)
@@ -73,16 +73,16 @@ def _at_times(other: Trajectory, times: np.ndarray) -> Trajectory:
     return Trajectory(times[:count], other.poses[:count])
 
 
-def _frames(sequence: Sequence, black: tuple[float, float] | None, depth: bool) -> Iterator[Frame]:
-    first = None
-    for frame in sequence.frames():
+def _frames(sequence: Sequence, options: argparse.Namespace) -> Iterator[Frame]:
+    first, black = None, options.black
+    for frame in sequence.frames(*options.frames):
         first = frame.timestamp if first is None else first
         since = frame.timestamp - first
         dark = black is not None and black[0] <= since < black[0] + black[1]
         image = np.zeros_like(frame.image) if dark else frame.image
         unknown = dark and frame.depth is not None
         known = np.full_like(frame.depth, np.nan) if unknown else frame.depth
-        yield replace(frame, image=image, depth=known if depth else None)
+        yield replace(frame, image=image, depth=known if options.depth else None)
 
 
 def _options() -> argparse.Namespace:
@@ -91,6 +91,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--black", type=float, nargs=2, metavar=("FROM", "SECONDS"), help="black frames, seconds")
     parser.add_argument("--priors", nargs="+", choices=("none", "own", "other"), default=["none", "own"])
     parser.add_argument("--other", type=Path, help="another clip, for its poses")
+    parser.add_argument("--frames", type=int, nargs=2, default=(0, None), metavar=("FIRST", "PAST"))
     parser.add_argument("--depth", action="store_true", help="with the clip's depth")
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args()

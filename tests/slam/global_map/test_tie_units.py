@@ -32,7 +32,9 @@ def _walk() -> tuple[list[Keyframe], list[MeasuredRelativePose]]:
 
 
 def test_a_unit_that_drifts_is_taken_out() -> None:
-    """Motions tracked in a unit that shrinks by 40 % on the way are as long as the poses have them. Oracle: the poses."""
+    """Motions tracked in a unit that shrinks by 40 % on the way are as long as the poses have them. Oracle: the
+    poses.
+    """
     keyframes, ties = _walk()
     units = np.exp(-0.5 * np.arange(COUNT - 1) / COUNT)
     drifted = [replace(tie, pose=longer(tie.pose, unit)) for tie, unit in zip(ties, units, strict=True)]
@@ -42,7 +44,9 @@ def test_a_unit_that_drifts_is_taken_out() -> None:
 
 
 def test_one_length_that_is_wrong_stays_wrong() -> None:
-    """What one keyframe's poses say against all others is no unit: its motion still pulls it back. Oracle: the length."""
+    """What one keyframe's poses say against all others is no unit: its motion still pulls it back. Oracle: the
+    length.
+    """
     keyframes, ties = _walk()
     ties[30] = replace(ties[30], pose=longer(ties[30].pose, 1.5))
     assert abs(local_units(ties, keyframes)[30]) < 0.1
