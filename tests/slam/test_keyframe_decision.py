@@ -10,11 +10,10 @@ from bad_rows_maps import keyframe
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.keyframe_decision import FREE_SPAN, Limits, nearest_keyframe, needs_keyframe, view_change
+from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe, view_change
 from vggtgeo.slam.settings.groups import KeyframeSettings
 
 SETTINGS = KeyframeSettings(keyframe_distance=0.2, keyframe_angle=float(np.deg2rad(10.0)))
-LIMITS = Limits.of(SETTINGS)
 ENOUGH = 50
 
 
@@ -46,24 +45,14 @@ def test_distance_angle_and_inliers_decide_each_alone(
     """
     for world in (np.eye(4), rigid.invert(pose(3.0, 70.0))):
         frame, reference = pose(metres, degrees) @ world, world
-        found = needs_keyframe(frame, reference, inliers, LIMITS, ENOUGH)
-        assert found == expected, view_change(frame, reference, LIMITS)
-
-
-def test_in_a_map_of_free_scale_parallax_decides() -> None:
-    """A map in another unit has the same keyframes: distances and what stands for a metre grow alike. Oracle: the
-    limit in metres.
-    """
-    for metres in (0.39, 0.41):
-        for unit in (0.1, 1.0, 7.0):
-            found = needs_keyframe(pose(unit * metres), pose(), ENOUGH, Limits.of(SETTINGS, unit), ENOUGH)
-            assert found == (metres > FREE_SPAN * SETTINGS.keyframe_distance)
+        found = needs_keyframe(frame, reference, inliers, SETTINGS)
+        assert found == expected, view_change(frame, reference, SETTINGS)
 
 
 def test_view_change_is_the_larger_share() -> None:
     """The change of a view is the larger of distance and angle as shares of their limits. Oracle: the shares."""
-    assert view_change(pose(0.1, 2.0), pose(), LIMITS) == pytest.approx(0.5)
-    assert view_change(pose(0.1, 8.0), pose(), LIMITS) == pytest.approx(0.8)
+    assert view_change(pose(0.1, 2.0), pose(), SETTINGS) == pytest.approx(0.5)
+    assert view_change(pose(0.1, 8.0), pose(), SETTINGS) == pytest.approx(0.8)
 
 
 def test_the_nearest_keyframe_is_one_that_spares_another() -> None:
@@ -71,9 +60,9 @@ def test_the_nearest_keyframe_is_one_that_spares_another() -> None:
     Oracle: the shares of the limits.
     """
     near = [replace(keyframe(k), number=k, pose=pose(*at)) for k, at in enumerate([(0.15, 0), (0.01, 9), (0.1, 1)])]
-    best = nearest_keyframe(pose(), near, LIMITS)
+    best = nearest_keyframe(pose(), near, SETTINGS)
     assert best is not None
     assert best.number == 2
     away = [replace(keyframe(k), number=k, pose=pose(*at)) for k, at in enumerate([(0.25, 0), (0.01, 12)])]
-    assert nearest_keyframe(pose(), away, LIMITS) is None
-    assert nearest_keyframe(pose(), [], LIMITS) is None
+    assert nearest_keyframe(pose(), away, SETTINGS) is None
+    assert nearest_keyframe(pose(), [], SETTINGS) is None

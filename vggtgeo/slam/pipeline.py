@@ -13,7 +13,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.join_submaps import join_pieces
-from vggtgeo.slam.keyframe_decision import Limits, nearest_keyframe, needs_keyframe
+from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pending_window import begin_window, is_due, settled
 from vggtgeo.slam.perception.description import Description
@@ -152,7 +152,7 @@ def _track(
         slam = _settled(slam, clock)
         with clock.measure("track"):
             found = _find(slam, data, roles, settings)
-    if slam.pending is not None and found is not None and _needs_keyframe(slam, found, settings):
+    if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
         slam = _settled(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if (slam.tracker.lost or not slam.metric) and (found is None or not found.accepted):
@@ -186,11 +186,11 @@ def _decide(
     slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
 ) -> tuple[Slam, Track, bool]:
     """Whether a tracked frame becomes a keyframe; not where an old one shows it as well, which is then its keyframe."""
-    if _needs_keyframe(slam, found, settings):
+    if _needs_keyframe(found, settings):
         with clock.measure("track"):
             tied, found = _seen_before(slam, data, found, roles, settings)
             slam = slam if settings.keyframes.localise_only else tied
-    return slam, found, not settings.keyframes.localise_only and _needs_keyframe(slam, found, settings)
+    return slam, found, not settings.keyframes.localise_only and _needs_keyframe(found, settings)
 
 
 def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Track:
@@ -378,18 +378,18 @@ def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settin
     What the two keyframes know of each other by this frame ties them.
     """
     others = (keyframe for keyframe in slam.keyframes if keyframe.number != found.keyframe.number)
-    near = nearest_keyframe(found.pose, others, _limits(slam, found, settings))
+    near = nearest_keyframe(found.pose, others, settings.keyframes)
     again = None
     if near is not None:
         prior = MotionPrior(found.pose, slam.tracker.velocity)
         given = TrackingInput(data, slam.intrinsics, roles, prior)
         again = track(given, near, view_of(near, slam.tracker, slam.intrinsics, roles))
-        if not (again.accepted and again.evidence.certain) or _needs_keyframe(slam, again, settings):
+        if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
             again = None  # drift may have put another keyframe there
     if again is None:
         given = TrackingInput(data, slam.intrinsics, roles)
         again = revisit(given, found, slam.map, slam.tracker, slam.window.members)
-    if again is None or _needs_keyframe(slam, again, settings) or not again.evidence.shows_as_well(found.evidence):
+    if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
         return slam, found
     near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):
@@ -397,11 +397,6 @@ def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settin
     return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie_between(found, again)))), again
 
 
-def _needs_keyframe(slam: Slam, found: Track, settings: SlamSettings) -> bool:
-    limits, least = _limits(slam, found, settings), settings.keyframes.min_inliers
-    seen = found.evidence
-    return seen.by_rays or needs_keyframe(found.pose, found.keyframe.pose, seen.inliers, limits, least)
-
-
-def _limits(slam: Slam, found: Track, settings: SlamSettings) -> Limits:
-    return Limits.of(settings.keyframes, None if slam.metric else found.evidence.metre)
+def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
+    own, reference = found.pose, found.keyframe.pose
+    return found.evidence.by_rays or needs_keyframe(own, reference, found.evidence.inliers, settings.keyframes)

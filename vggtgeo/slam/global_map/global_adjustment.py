@@ -21,7 +21,6 @@ from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS, GlobalShape, global_solver, shape_of
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
-from vggtgeo.slam.global_map.tie_units import in_local_units
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
 from vggtgeo.slam.sparse_map.factors import Factor, factor_terms
@@ -86,7 +85,6 @@ class _Whole:
         camera of that moment, the tracked motions and the surfaces.
         """
         factors = _of_any_camera(slam) if finds_camera else slam.map.factors
-        factors = factors if slam.metric else in_local_units(factors, slam.keyframes)
         adjustment = build(
             slam.keyframes,
             self.edges,
