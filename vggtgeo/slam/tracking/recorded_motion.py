@@ -101,7 +101,6 @@ def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, u
     relative = rigid.orthonormal(longer(motion, unit) @ last.relative)
     noise = recorded.covariance(relative, time - keyframe.timestamp)
     information = np.linalg.inv(noise)
-    evidence = Evidence(recorded=True)
     sigma_translation, sigma_rotation = worst_sigma(information)
     evidence = Evidence(sigma_translation=sigma_translation, sigma_rotation=sigma_rotation, recorded=True)
     return Track(keyframe, relative @ keyframe.pose, information, evidence, GeometryResult.SUCCESS)
