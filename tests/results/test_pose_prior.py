@@ -52,7 +52,7 @@ def test_a_prior_that_is_none_is_named(source: Source) -> None:
     hidden, _ = with_pose_prior(source, "recorded")
     with pytest.raises(InputError, match=r"`pose_prior`.*recorded"):
         with_pose_prior(hidden, "recorded")
-    with pytest.raises(InputError, match="none-such.txt"):
+    with pytest.raises(InputError, match=r"none-such\.txt"):
         with_pose_prior(source, "none-such.txt")
 
 
