@@ -35,7 +35,7 @@ SLAM_STAIR = (
     ("sparse_map",),
     ("camera", "tracking", "window"),
     ("state",),
-    ("callback", "keyframe_decision", "pending_window", "submaps", "window_steps"),
+    ("callback", "keyframe_decision", "pending_window", "recorded_prior", "submaps", "window_steps"),
     ("state_checks", "window_recorder"),
     ("global_map",),
     ("manhattan", "start"),

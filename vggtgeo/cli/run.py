@@ -101,6 +101,7 @@ def run(
             dense=options.dense,
             warned=warned,
             known_map=None if options.map_file is None else load_map(options.map_file),
+            pose_prior=options.pose_prior,
         ),
     )
 

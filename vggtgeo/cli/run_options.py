@@ -169,6 +169,14 @@ class RunOptions:
     save_map: Annotated[
         Path | None, typer.Option("--save-map", help="File for the map, so that another run can go on in it.")
     ] = None
+    pose_prior: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|recorded",
+            help="Poses as a prior of the motion: those that came with the recording (then no ground truth), or a "
+            "file's.",
+        ),
+    ] = None
     resume: ResumeOption = None
     checkpoint_every: Annotated[
         float,

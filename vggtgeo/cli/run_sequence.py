@@ -72,6 +72,7 @@ class RunArguments:
     facts: Mapping[str, Any] | None = None
     warned: Iterable[Warning | str] = ()
     known_map: Slam | None = None
+    pose_prior: str | None = None
 
 
 def run_and_write(
@@ -112,6 +113,7 @@ def run_and_write(
                 warned=arguments.warned,
                 checkpoints=checkpoints,
                 known_map=arguments.known_map,
+                pose_prior=arguments.pose_prior,
             )
             bar.on_stage("writing")
             frames = _reopen(sequence, roles, settings) if output.save_depth == "every" else None

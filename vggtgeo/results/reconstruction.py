@@ -22,6 +22,7 @@ from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, load_checkpoint, run_identity
+from vggtgeo.results.pose_prior import PosePrior, with_pose_prior
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.source import Source, open_source, reduction_summary
 from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
@@ -30,6 +31,7 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
+from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.perception.still_parts import (
     APART,
     PICTURES,
@@ -39,6 +41,7 @@ from vggtgeo.slam.perception.still_parts import (
     still_parts_of,
 )
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
 from vggtgeo.slam.self_calibration import self_calibrate
 from vggtgeo.slam.settings.presets import Perception
@@ -75,6 +78,7 @@ def reconstruct(
     warned: Iterable[Warning | str] = (),
     checkpoints: Checkpoints | None = None,
     known_map: Slam | None = None,
+    pose_prior: PosePrior = None,
 ) -> Result:
     """Track all frames, map them, adjust the whole map, and judge the result.
 
@@ -105,6 +109,9 @@ def reconstruct(
         checkpoints: where to write checkpoints, and whether to resume from an existing one.
         known_map: map of `vggtgeo.load_map` to localise in and extend; with the setting `keyframes.localise_only` it
             is not changed.
+        pose_prior: poses that came with the frames, camera -> world at their times, as a prior of the motion:
+            "recorded" for those that the reader knows (they are then no ground truth), a file of poses, or a
+            `Trajectory`. Of another recording, they are noticed and not used.
 
     Raises:
         InputError: an argument is invalid, no frame is usable, or the checkpoint belongs to another run.
@@ -125,9 +132,9 @@ def reconstruct(
     settings = settings or SlamSettings()
     with program_settings(), interruption() as stop, collected_warnings() as collected:
         with stop.at_once():  # a live camera may not deliver any frame
-            source = open_source(frames, camera, settings)
+            source, recorded = with_pose_prior(open_source(frames, camera, settings), pose_prior)
         source.check(start, end, stride)
-        perception = _perception(roles, source.has_depth, seed)
+        perception = _perception(roles, source.has_depth, seed, recorded)
         check_dense(dense, perception.roles.metric, perception.roles.depth)
         selection = (start, end, stride)
         first = _first_state(known_map, source, settings, perception.roles)
@@ -160,6 +167,7 @@ def reconstruct(
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
             **reduction_summary(source, slam),
+            **prior_summary(slam, perception.roles),
             **({} if overlay.found is None else {"static_overlay": round(overlay.found.share, 4)}),
         }
         finished = _FinishedRun(
@@ -308,8 +316,11 @@ def _without_overlay(
     return replace(perception, roles=replace(perception.roles, static_overlay=overlay.found))
 
 
-def _perception(roles: Roles | Perception | None, has_depth: bool, seed: int) -> Perception:
+def _perception(
+    roles: Roles | Perception | None, has_depth: bool, seed: int, recorded: RecordedPoses | None
+) -> Perception:
     found = roles if isinstance(roles, Perception) else Perception(roles or default_roles(has_depth), {})
+    found = found if recorded is None else replace(found, roles=replace(found.roles, recorded=recorded))
     return replace(found, roles=found.roles.seeded(seed)) if seed else found
 
 

@@ -48,7 +48,7 @@ RESERVED_KEYS = frozenset(
         *("verdict", "settings", "versions", "frames", "frames_tracked", "keyframes", "pairs", "pieces"),
         *("peak_memory_gb", "scale", "scale_basis", "pose_sigma", "intrinsics", "lens", "rolling_shutter"),
         *("seconds_by_stage", "notes", "map_points", "dense", "frames_per_second", "interrupted", "images_reduced"),
-        *("static_overlay", "truth", "frames_per_second_whole_run"),
+        *("static_overlay", "truth", "frames_per_second_whole_run", "pose_prior"),
     }
 )
 """Keys of every summary, which `facts` of `vggtgeo.reconstruct` must not use."""

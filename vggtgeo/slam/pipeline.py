@@ -19,6 +19,7 @@ from vggtgeo.slam.pending_window import begin_window, is_due, settled
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.recorded_prior import recorded_prior
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import without_matches
@@ -91,7 +92,7 @@ def step(
 
     slam, data, found = _track(slam, frame, description, roles, settings, clock)
     if found is None or not found.accepted:
-        return _missed(slam, data, Evidence() if found is None else found.evidence, roles, settings)
+        return _missed(slam, data, Evidence() if found is None else found.evidence, roles, settings, clock)
     was_lost = bool(slam.tracker.lost)
     slam = _moved(slam, frame, found)
 
@@ -163,8 +164,10 @@ def _track(
     if grows and not slam.metric and doubtful:
         with clock.measure("track"):
             newest = slam.keyframes[slam.window.members[-1]]
-            given = TrackingInput(data, slam.intrinsics, roles, _prior(slam))
-            by_rays = track_by_rays(given, newest, usual_step(slam.keyframes, frame.index))
+            given = TrackingInput(data, slam.intrinsics, roles, _prior(slam, frame, roles))
+            recorded = recorded_prior(slam, roles)
+            length = None if recorded is None else recorded.length(newest, frame.timestamp)
+            by_rays = track_by_rays(given, newest, length or usual_step(slam.keyframes, frame.index))
             found = by_rays if by_rays is not None and by_rays.accepted else found
     return slam, data, found
 
@@ -192,7 +195,7 @@ def _decide(
 
 def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Track:
     """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
-    prior = _prior(slam)
+    prior = _prior(slam, data.frame, roles)
     first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
     others = [number for number in reversed(slam.window.members) if number != first][:2]
     window = tuple(slam.keyframes[number] for number in (first, *others))
@@ -216,10 +219,13 @@ def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> 
     return refined_by_map(best, given, piece)
 
 
-def _prior(slam: Slam) -> MotionPrior:
-    """Where the next frame is, if the camera goes on as it did."""
-    predicted = rigid.orthonormal(slam.tracker.velocity @ slam.last_pose)
-    return MotionPrior(predicted, slam.tracker.velocity, slam.tracker.lost)
+def _prior(slam: Slam, frame: Frame, roles: Roles) -> MotionPrior:
+    """Where a frame is, as recorded, or if the camera goes on as it did."""
+    recorded = recorded_prior(slam, roles)
+    step = None if recorded is None else recorded.step(slam, frame.timestamp)
+    velocity = slam.tracker.velocity if step is None else step
+    predicted = rigid.orthonormal(velocity @ slam.last_pose)
+    return MotionPrior(predicted, velocity, slam.tracker.lost)
 
 
 def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameData:
@@ -255,7 +261,7 @@ def _insert_and_adjust(
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
             entered = insert_keyframe(slam, keyframe, roles, settings, tied_to=odometry.first)
-            entered = _with_odometry(entered, odometry)
+            entered = _with_recorded(_with_odometry(entered, odometry), roles)
             entered = constrain_rotation(entered, settings)
         with clock.measure("place frames" + own):
             entered = replace(entered, tracker=against_reference(entered.map, entered.tracker))
@@ -287,6 +293,14 @@ def _with_odometry(slam: Slam, odometry: MeasuredRelativePose) -> Slam:
     if all(pair.key != odometry.keyframes for pair in known.pairs):
         known = replace(known, pairs=(*known.pairs, without_matches(*odometry.keyframes)))
     return replace(slam, map=known)
+
+
+def _with_recorded(slam: Slam, roles: Roles) -> Slam:
+    """The state with the recorded motion to the newest keyframe, where the images agree with recorded poses."""
+    recorded, (before, newest) = recorded_prior(slam, roles), slam.keyframes[-2:]
+    if recorded is None or any(tie.keyframes == (before.number, newest.number) for tie in slam.map.recorded_factors):
+        return slam
+    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, *recorded.tie(before, newest))))
 
 
 def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
@@ -324,9 +338,20 @@ def _noted_found(slam: Slam, frame: Frame) -> Slam:
     return replace(slam, notes=(*slam.notes, note))
 
 
-def _missed(slam: Slam, data: FrameData, evidence: Evidence, roles: Roles, settings: SlamSettings) -> Slam:
-    """No pose; after too many such frames begin a piece of map of its own."""
+def _missed(
+    slam: Slam, data: FrameData, evidence: Evidence, roles: Roles, settings: SlamSettings, clock: Clock
+) -> Slam:
+    """No pose by images: that of the recording, if it is known; else after too many such frames begin a piece of map of
+    its own.
+    """
     frame, features = data.frame, data.features
+    recorded = recorded_prior(slam, roles)
+    carried = None if recorded is None else recorded.carried(slam, frame.timestamp)
+    if carried is not None:
+        slam = _moved(slam, frame, carried)
+        if settings.keyframes.localise_only or len(features) <= settings.keyframes.min_inliers:
+            return _with_record(slam, record_of(frame, carried))
+        return _insert_and_adjust(slam, data, carried, roles, settings, clock)
     if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))

@@ -34,6 +34,7 @@ from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.recorded_prior import with_recorded_ties
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import pieces_by_size
@@ -160,7 +161,7 @@ def finish(
     with clock.measure("place frames"):
         slam = replace(slam, tracker=against_nearest(slam.map, slam.tracker, slam.intrinsics, roles))
     with clock.measure("loops"):
-        slam = close_loops(join_at_end(slam, roles), roles, settings)
+        slam = close_loops(with_recorded_ties(join_at_end(slam, roles), roles), roles, settings)
     with clock.measure("global adjustment"):
         return adjust_all(slam, settings)
 

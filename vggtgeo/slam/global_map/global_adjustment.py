@@ -23,7 +23,7 @@ from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS, GlobalShape, gl
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
-from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose, factor_terms
+from vggtgeo.slam.sparse_map.factors import Factor, factor_terms
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
@@ -292,8 +292,8 @@ def _of_any_camera(slam: Slam) -> tuple[Factor, ...]:
     are what keeps a map without depth together where it is seen least: corridor-office 4.2 -> 3.1 cm.
     """
     matched = {pair.key for pair in slam.map.pairs if len(pair.points)}
-    tied = lambda factor: isinstance(factor, MeasuredRelativePose) and tuple(sorted(factor.keyframes)) in matched
-    return tuple(factor for factor in slam.map.factors if not tied(factor))
+    tracked = {id(factor) for factor in slam.map.odometry_factors if tuple(sorted(factor.keyframes)) in matched}
+    return tuple(factor for factor in slam.map.factors if id(factor) not in tracked)
 
 
 def _thin(edges: list[Directed], keyframes: int) -> list[Directed]:

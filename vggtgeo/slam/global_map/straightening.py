@@ -89,6 +89,8 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
             tree[tie.second] = tie
         else:
             others.append(tie)
+    for tie in slam.map.recorded_factors:
+        tree.setdefault(tie.second, tie)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     between = lambda first, second: rigid.orthonormal(poses[second] @ rigid.invert(poses[first]))
     loose = np.diag(1.0 / np.repeat(UNTRACKED, 3) ** 2)

@@ -22,6 +22,7 @@ from vggtgeo.models.classical import (
     in_order,
 )
 from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector, LineMatcher, MetricDepth, PointMatcher
+from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.perception.still_parts import StillParts
 from vggtgeo.slam.settings.groups import (
@@ -63,6 +64,7 @@ class Roles:
             descriptors; None describes and matches every frame.
         static_overlay: Mask of the parts of the images, as they are read, that do not move with the scene; no
             features are detected there. `vggtgeo.reconstruct` finds it.
+        recorded: Poses that came with the recording, as a prior of the motion; None without.
 
     Example:
         >>> import vggtgeo as vg
@@ -82,6 +84,7 @@ class Roles:
     flow: PatchFlow | None = field(default_factory=PatchFlow)
 
     static_overlay: StillParts | None = None
+    recorded: RecordedPoses | None = None
 
     def __post_init__(self) -> None:
         """InputError for what plays no role, which would be found in the middle of a run."""
@@ -92,7 +95,10 @@ class Roles:
                     f"`{role}` is {given!r:.60}; expected an object with the methods {', '.join(methods)}, such as "
                     f"`vggtgeo.Roles().{role}`"
                 )
-        for role, kind in (("alignment", RgbdAlignment), ("flow", PatchFlow), ("static_overlay", StillParts)):
+        for role, kind in (
+            *(("alignment", RgbdAlignment), ("flow", PatchFlow)),
+            *(("static_overlay", StillParts), ("recorded", RecordedPoses)),
+        ):
             check_kind(role, getattr(self, role), kind | None, f"a `{kind.__name__}`, or None")
 
     def seeded(self, seed: int) -> Roles:

@@ -52,7 +52,8 @@ class MeasuredRelativePose:
     """Camera `first` -> camera `second`, float64 [4, 4], and its information float64 [6, 6], translation first.
 
     by_rays: whether no known depth took part, so that the length is little more than a guess, and with it the scale of
-    what comes after, see `tracking/two_view_motion.py`.
+    what comes after, see `tracking/two_view_motion.py`. recorded: whether no image took part: the motion is one of
+    recorded poses (`tracking/recorded_motion.py`).
     """
 
     first: int
@@ -60,6 +61,7 @@ class MeasuredRelativePose:
     pose: np.ndarray
     information: np.ndarray
     by_rays: bool = False
+    recorded: bool = False
 
     @property
     def keyframes(self) -> tuple[int, int]:
@@ -67,8 +69,10 @@ class MeasuredRelativePose:
 
     def of_free_length(self) -> Self:
         """The same without measured depth: how far the camera went is known in the unit of the map that it was tracked
-        against, and that unit is itself an estimate.
+        against, and that unit is itself an estimate. The length of a recorded motion is known.
         """
+        if self.recorded:
+            return self
         length = np.append(FREE_LENGTH * self.pose[:3, 3], np.zeros(3))
         noise = np.linalg.inv(self.information) + np.outer(length, length)
         return replace(self, information=np.linalg.inv(noise))

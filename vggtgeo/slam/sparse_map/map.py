@@ -40,6 +40,15 @@ class Map:
     @property
     def odometry_factors(self) -> tuple[MeasuredRelativePose, ...]:
         """The tracked motions between keyframes."""
+        return tuple(factor for factor in self._motions if not factor.recorded)
+
+    @property
+    def recorded_factors(self) -> tuple[MeasuredRelativePose, ...]:
+        """The recorded motions between keyframes, which no image has measured."""
+        return tuple(factor for factor in self._motions if factor.recorded)
+
+    @property
+    def _motions(self) -> tuple[MeasuredRelativePose, ...]:
         return tuple(factor for factor in self.factors if isinstance(factor, MeasuredRelativePose))
 
     @property

@@ -61,7 +61,8 @@ class Evidence:
     segments of the keyframe whose match in the frame agrees with the pose, and all that the frame should show.
     map_points: key points of other keyframes that were found where the pose says. metre: what stands for a metre in a
     map of free scale, in its unit: `fusion.metre_of`. by_rays: whether the pose is by key points without known depth,
-    so that its distance from the keyframe is little more than a guess: `two_view_motion.py`.
+    so that its distance from the keyframe is little more than a guess: `two_view_motion.py`. recorded: whether it is a
+    recorded pose, which no image has measured.
     """
 
     matches: int = 0
@@ -80,6 +81,7 @@ class Evidence:
     map_points: int = 0
     metre: float = 1.0
     by_rays: bool = False
+    recorded: bool = False
 
     @property
     def share(self) -> float:
@@ -143,8 +145,8 @@ class Evidence:
     @property
     def accepted(self) -> bool:
         """Whether the pose is to be believed."""
-        if self.by_rays:
-            return self.points_strong
+        if self.by_rays or self.recorded:
+            return self.recorded or self.points_strong
         if self.sigma_translation > LARGEST_SIGMA * self.metre or self.correlation < CONTRADICTION:
             return False
         if not self.plausible:

@@ -252,7 +252,11 @@ def tie_to(found: Track, number: int) -> MeasuredRelativePose:
     What other keyframes know of it enters by their own edges: in the tie it would count twice.
     """
     own = found.alone or found
-    return MeasuredRelativePose(own.keyframe.number, number, own.relative, own.information, own.evidence.by_rays)
+    return MeasuredRelativePose(
+        *(own.keyframe.number, number, own.relative, own.information),
+        by_rays=own.evidence.by_rays,
+        recorded=own.evidence.recorded,
+    )
 
 
 def tie_between(first: Track, second: Track) -> MeasuredRelativePose:

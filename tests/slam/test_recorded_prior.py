@@ -1,0 +1,168 @@
+"""Recorded poses as a prior: carried over black frames, compared with the images, and dropped where they are others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.posed_keyframes import keyframe_of, slots_of
+from scipy.spatial.transform import Rotation
+from vggtgeo.models.classical import NoDepth, SiftMatcher
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry import rigid
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.simulation import simulate
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.perception.recorded_poses import RecordedPoses
+from vggtgeo.slam.recorded_prior import prior_summary, with_recorded_ties
+from vggtgeo.slam.run import finish, frame_trajectory, run_frames
+from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.recorded_motion import compare
+
+SIZE = (320, 240)
+# The window of test_pipeline.py, so that the solver is compiled once.
+SETTINGS = SlamSettings(
+    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    refinement=RefinementSettings(global_adjustment=False),
+)
+ROLES = Roles(points=SiftMatcher(count=500))
+DARK = range(16, 26)
+"""Frames of the walk in which the camera turns by 97 degrees: what is seen before is not seen after."""
+Walk = tuple[list[Frame], Camera, Trajectory]
+
+
+@pytest.fixture(scope="module")
+def walk() -> Walk:
+    """Frames 18 to 53 of a walk through an office, black while the camera turns."""
+    sequence = simulate("office", 60, 0, SIZE, rate=5.0)
+    truth = sequence.ground_truth()
+    assert truth is not None
+    frames = list(sequence.frames(18, 54))
+    dark = [_black(frame) if row in DARK else frame for row, frame in enumerate(frames)]
+    return dark, sequence.camera, truth.select(slice(18, 54))
+
+
+def _black(frame: Frame) -> Frame:
+    return replace(frame, image=np.zeros_like(frame.image), depth=np.full(frame.image.shape[:2], np.nan, np.float32))
+
+
+def _run(walk: Walk, roles: Roles) -> Slam:
+    frames, camera, _ = walk
+    if not roles.metric:
+        frames = [replace(frame, depth=None) for frame in frames]
+    return settled(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
+
+
+def _disturbed(truth: Trajectory, drift: float = 0.02, scale: float = 1.05) -> Trajectory:
+    """The truth as a phone records it: another world, another unit, drift along the way and about the vertical."""
+    poses = truth.poses.copy()
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))])
+    turned = Rotation.from_rotvec(np.outer(np.deg2rad(1.0) / 60 * (truth.timestamps - truth.timestamps[0]), [0, 0, 1]))
+    poses[:, :3, :3] = turned.as_matrix() @ poses[:, :3, :3]
+    poses[:, :3, 3] = scale * (poses[:, :3, 3] + np.outer(drift * way, [0.6, 0.8, 0.0]))
+    world = rigid.exponential(np.array([3.0, -2.0, 1.0, 0.4, -0.9, 2.0]))
+    return Trajectory(truth.timestamps, world @ poses)
+
+
+def _other(truth: Trajectory) -> Trajectory:
+    """A recording of another walk at the same times."""
+    other = simulate("corridor", 60, 3, SIZE, rate=5.0).ground_truth()
+    assert other is not None
+    return Trajectory(truth.timestamps, other.poses[: len(truth)])
+
+
+def _ties(truth: Trajectory, noise: float, rng: np.random.Generator) -> Map:
+    """Keyframes at the poses of the truth, tied by motions that images measured to within some noise."""
+    poses = rigid.invert(truth.poses)
+    nothing, image = slots_of(np.zeros((0, 2)), np.zeros(0)), np.zeros((1, 1, 3), np.uint8)
+    keyframes = tuple(
+        replace(keyframe_of(number, image, pose, nothing, np.ones((1, 1))), timestamp=float(time))
+        for number, (pose, time) in enumerate(zip(poses, truth.timestamps, strict=True))
+    )
+    sigma = np.repeat([noise, noise / 3], 3)
+    ties = tuple(
+        MeasuredRelativePose(
+            *(row, row + 1, rigid.exponential(rng.normal(size=6) * sigma) @ poses[row + 1] @ rigid.invert(poses[row])),
+            information=np.diag(1 / sigma**2),
+        )
+        for row in range(len(poses) - 1)
+    )
+    return Map(metric=True, keyframes=keyframes, factors=ties, roots=(0,))
+
+
+def test_a_pose_between_two_recorded_ones_is_on_the_way() -> None:
+    """Half way of a turn about a fixed axis is half of its angle; a time in a gap, or outside, has none."""
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    for row in range(5):
+        poses[row, :3, :3] = Rotation.from_rotvec([0, 0.1 * row, 0]).as_matrix()
+    times = np.array([0.0, 1.0, 2.0, 3.0, 9.0])
+    recorded = RecordedPoses(Trajectory(times, poses))
+    found = recorded.pose(1.5)
+    assert found is not None
+    np.testing.assert_allclose(Rotation.from_matrix(found[:3, :3]).as_rotvec(), [0, -0.15, 0], atol=1e-12)
+    assert recorded.pose(5.0) is None
+    assert recorded.pose(-0.1) is None
+    assert recorded.motion(0.0, 9.5) is None
+
+
+def test_the_unit_of_a_recording_is_found(walk: Walk) -> None:
+    """Its lengths are 1.05 of the map's: the unit is the inverse; oracle: the scale that the recording was given."""
+    truth = walk[2]
+    found = compare(RecordedPoses(_disturbed(truth)), _ties(truth, 0.003, np.random.default_rng(0)))
+    assert found.believed
+    assert abs(found.unit * 1.05 - 1) < 0.02
+
+
+def test_another_recording_is_contradicted(walk: Walk) -> None:
+    """Poses of another walk, and those of this one a second late, agree with few motions of the images."""
+    truth = walk[2]
+    known = _ties(truth, 0.003, np.random.default_rng(0))
+    late = Trajectory(truth.timestamps + 1.0, truth.poses)
+    assert compare(RecordedPoses(_other(truth)), known).contradicted
+    assert compare(RecordedPoses(late), known).contradicted
+
+
+def test_black_frames_are_bridged(walk: Walk) -> None:
+    """The camera turns in the dark, and the map stays in one piece; without recorded poses it falls apart. Oracle: the
+    renderer's poses.
+    """
+    truth = walk[2]
+    torn = _run(walk, ROLES)
+    assert not all(record.tracked for record in torn.frames)
+    slam = _run(walk, replace(ROLES, recorded=RecordedPoses(_disturbed(truth))))
+    assert piece_of(slam.map).max() == 0
+    assert all(record.tracked for record in slam.frames)
+    assert evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse < 0.03
+    assert prior_summary(slam, replace(ROLES, recorded=RecordedPoses(_disturbed(truth))))["pose_prior"]["used"]
+
+
+@pytest.mark.long
+def test_black_frames_are_bridged_without_depth(walk: Walk) -> None:
+    """The same where nothing but the recording tells the scale behind the dark."""
+    truth = walk[2]
+    roles = replace(ROLES, depth=NoDepth(), recorded=RecordedPoses(_disturbed(truth)))
+    slam = finish(_run(walk, roles), roles, replace(SETTINGS, refinement=RefinementSettings(rolling_shutter=False)))
+    assert piece_of(slam.map).max() == 0
+    assert evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse < 0.04
+
+
+def test_another_recording_changes_nothing(walk: Walk) -> None:
+    """With poses of another walk the run is that without, bit for bit, and says that they are not of these images."""
+    frames, camera, truth = walk
+    bright = frames[: DARK.start], camera, truth
+    roles = replace(ROLES, recorded=RecordedPoses(_other(truth)))
+    slam, plain = _run(bright, roles), _run(bright, ROLES)
+    np.testing.assert_array_equal(frame_trajectory(slam).poses, frame_trajectory(plain).poses)
+    ended = with_recorded_ties(slam, roles)
+    assert ended.map.factors == plain.map.factors or len(ended.map.factors) == len(plain.map.factors)
+    assert "not of these images" in ended.notes[-1]
