@@ -1,1 +1,1 @@
-"""Structured nonlinear least squares on optimistix. Knows nothing of cameras."""
+"""Structured nonlinear least squares on optimistix, independent of cameras."""

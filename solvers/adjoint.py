@@ -4,24 +4,24 @@ At an optimum `y*(theta)` the gradient `g(y, theta)` in tangent coordinates vani
 
     dy* = -H^-1 (dg/dtheta) dtheta,      H = exact Hessian, with the same arrow structure as the normal equations:
 
-one reduction and one factorisation, whatever the number of iterations; nothing of the iteration is stored. Forward and
+one reduction and one factorisation, independent of the number of iterations; the iterates are not stored. Forward and
 reverse mode are both exact, because the solve with the symmetric `H` is its own transpose.
 
-The formula holds at a stationary point, and the optimum must be tighter for it than a solve needs: so, only when
-differentiated, it is polished first by chord steps, `y <- y - H0^-1 g(y)` with the exact Hessian where the iteration
-ended. One costs a gradient and a back-substitution, and so near the optimum gains almost the digits of a Newton step.
-Then the Hessian is taken once more. Cost: two exact Hessians, their factorisations, and a gradient for each step.
+The formula holds at a stationary point, which it needs to a higher accuracy than a solve. The optimum is therefore
+refined before differentiation by chord steps, `y <- y - H0^-1 g(y)`, with the exact Hessian at the final iterate. A
+step costs a gradient and a back-substitution, and near the optimum it is almost as accurate as a Newton step. Then the
+Hessian is computed again. Cost: two exact Hessians, their factorisations, and a gradient for each step.
 
-The linear algebra is that of the solver's own `reduced_solver`: a dense factor, a band, or minimum residuals, where no
-matrix over all nodes is formed. The exact Hessian need not be definite (at a saddle, or under a redescending kernel):
-the dense factor and the band take pivots of either sign, and minimum residuals, unlike conjugate gradients, do not ask
-for a definite matrix; their preconditioner is made of the reweighted Hessian, which is. A band's groups are eliminated
-in their order, so it also asks that no leading part of the graph is singular alone, which holds at every minimum.
+The linear algebra is that of the solver's `reduced_solver`: a dense factor, a band, or minimum residuals, which form no
+matrix over all nodes. The exact Hessian need not be definite (at a saddle, or under a redescending kernel): the dense
+factor and the band allow pivots of either sign, and minimum residuals, unlike conjugate gradients, need no definite
+matrix; their preconditioner is built from the reweighted Hessian, which is definite. A band's groups are eliminated in
+order, so no leading part of the graph may be singular alone, which holds at every minimum.
 
-Second derivatives: the rule differentiates what it returns. `y*` in it is the differentiable optimum again, and the
-linear solve knows its operator as the derivative of `g`, so `jax.grad` of `jax.grad` and `jax.hessian` work.
+Second derivatives: the rule is itself differentiable. `y*` in it is again the differentiable optimum, and the operator
+of the linear solve is the derivative of `g`, so `jax.grad` of `jax.grad` and `jax.hessian` work.
 
-A landmark on its bound that the energy presses against it is held: its multiplier is not zero, and it does not move.
+A landmark at an active bound is fixed: its multiplier is not zero.
 """
 
 from __future__ import annotations
@@ -49,31 +49,30 @@ from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced import AbstractReducedSolver
 
 STATIONARY = 1e-6
-"""Gradient left after the polish, each entry in units of the root of its curvature (the unit of `sqrt(energy)`), above
-which a point is no optimum: its derivative is then wrong by about as much, relatively (measured: 1e-9 after a solve
-that converged)."""
+"""Gradient after the refinement, scaled by the root of the curvature (the unit of `sqrt(energy)`), above which a point
+is not stationary: the relative error of its derivative is of that size (measured: 1e-9 after a converged solve)."""
 
 
 class ArrowAdjoint(optx.AbstractAdjoint):
-    """Use as `optimistix.least_squares(energy_of, solver, y0, args=problem, adjoint=ArrowAdjoint())` with
-    `SchurLevenbergMarquardt`.
+    """Implicit differentiation of the optimum of an arrow problem.
 
-    Where the Hessian at the optimum is singular beyond the gauge (nothing determines some coordinate), the derivative
-    is that of the coordinates that are determined; where no finite answer exists it is zero.
+    Use as `optimistix.least_squares(energy_of, solver, y0, args=problem, adjoint=ArrowAdjoint())` with
+    `SchurLevenbergMarquardt`. If the Hessian at the optimum is singular beyond the gauge (a coordinate is
+    undetermined), the derivative is that of the determined coordinates; if no finite solution exists it is zero.
 
     Fields:
-        polish: Chord steps before differentiating, at most: they end when the gradient no longer shrinks.
-        not_stationary: What to do with a derivative at a point that the polish did not bring to rest: keep it
-            (`gradient_residual` of the solution says how far it is off), make it NaN, or raise an error. The same
-            is done where the derivative's own linear system was not solved: minimum residuals (of
-            `ConjugateGradients`) end after `exact_iterations`. To differentiate the iterations themselves take
+        polish: Maximum number of chord steps before differentiation; they end when the gradient no longer decreases.
+        not_stationary: Treatment of a derivative at a point that is not stationary after the chord steps: keep it
+            (`gradient_residual` of the solution has the error), set it to NaN, or raise an error. The same applies if
+            the linear system of the derivative was not solved: minimum residuals (of `ConjugateGradients`) end after
+            `exact_iterations`. To differentiate the iterations themselves, use
             `optimistix.RecursiveCheckpointAdjoint()` instead of this class.
 
     Example:
         >>> import jax, vggtgeo as vg
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
         >>> depth = lambda start: vg.solve(problem, start, adjoint=vg.ArrowAdjoint()).state.inverse_depth.sum()
-        >>> gradient = jax.grad(depth)(initial)  # the optimum forgets where the iteration began
+        >>> gradient = jax.grad(depth)(initial)  # the optimum does not depend on the initial state
         >>> float(abs(gradient.inverse_depth).max())
         0.0
 
@@ -85,9 +84,9 @@ class ArrowAdjoint(optx.AbstractAdjoint):
     def __check_init__(self) -> None:
         given: Any = self.polish
         if not isinstance(given, numbers.Integral) or given < 0:
-            raise ValueError(f"`polish` is {given!r:.60}; it must be a whole number, at least 0")
+            raise ValueError(f"`polish` must be a whole number, at least 0, got {given!r:.60}")
         if self.not_stationary not in ("keep", "nan", "error"):
-            raise ValueError(f"`not_stationary` is {self.not_stationary!r}; it must be 'keep', 'nan' or 'error'")
+            raise ValueError(f"`not_stationary` must be 'keep', 'nan' or 'error', got {self.not_stationary!r}")
 
     def apply(self, primal_fn: Any, rewrite_fn: Any, inputs: Any, tags: Any) -> Any:
         del rewrite_fn, tags
@@ -102,38 +101,38 @@ class ArrowAdjoint(optx.AbstractAdjoint):
         reduced_solver = _only(SchurLevenbergMarquardt, detached).reduced_solver
         start = Polish(jnp.asarray(False), state.gradient_norm)
         point, polish = _attach_derivative(problem, point, start, self, reduced_solver)
-        told = eqx.tree_at(
+        reported = eqx.tree_at(
             lambda s: (s.polished, s.gradient_residual), state, (polish.polished, polish.gradient_residual)
         )
         is_state = lambda node: isinstance(node, LevenbergMarquardtState)
-        return point, jax.tree.map(lambda node: told if is_state(node) else node, rest, is_leaf=is_state)
+        return point, jax.tree.map(lambda node: reported if is_state(node) else node, rest, is_leaf=is_state)
 
 
 def _only(kind: type, tree: Any) -> Any:
-    """The one node of a type in a pytree."""
+    """Return the one node of a type in a pytree."""
     is_kind = lambda node: isinstance(node, kind)
     found = [node for node in jax.tree.leaves(tree, is_leaf=is_kind) if is_kind(node)]
     if len(found) != 1:
         raise ValueError(
-            f"`ArrowAdjoint` found {len(found)} objects of type `{kind.__name__}` where it needs one; call "
+            f"`ArrowAdjoint` needs one object of type `{kind.__name__}`, got {len(found)}; call "
             "`optimistix.least_squares(energy_of, SchurLevenbergMarquardt(), y0, args=problem, adjoint=ArrowAdjoint())`"
         )
     return found[0]
 
 
 class Polish(eqx.Module):
-    """What differentiation did to a point before it took its derivative."""
+    """Result of the refinement of a point before differentiation."""
 
     polished: Bool[Array, ""]
     gradient_residual: Float[Array, ""]
-    """Largest gradient entry, each in units of the root of its curvature."""
+    """Largest gradient entry, each scaled by the root of its curvature."""
 
 
 @eqx.filter_custom_jvp
 def _attach_derivative(
     problem: AbstractArrowProblem, point: Point, polish: Polish, options: ArrowAdjoint, solver: AbstractReducedSolver
 ) -> tuple[Point, Polish]:
-    """`point`, differentiable as the optimum of `problem`."""
+    """Return `point`, differentiable as the optimum of `problem`."""
     del problem, options, solver
     return point, polish
 
@@ -145,9 +144,9 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     absent = jax.tree.map(lambda leaf: leaf is None, moved, is_leaf=lambda leaf: leaf is None)
     fixed, moving = eqx.partition(problem, absent, is_leaf=lambda leaf: leaf is None)
     optimum, model, left = _polish(_detached(problem), _detached(point), options.polish, solver)
-    told = _detached(Polish(jnp.asarray(True), left))
-    # The optimum as a function of the problem once more, for derivatives of this derivative.
-    at, _ = _attach_derivative(problem, _detached(optimum), told, options, solver)
+    reported = _detached(Polish(jnp.asarray(True), left))
+    # The optimum again as a function of the problem, for higher derivatives.
+    at, _ = _attach_derivative(problem, _detached(optimum), reported, options, solver)
     system = _detached(model.system)
 
     def stationarity(moving: Any, point: Point) -> ArrowVector:
@@ -155,10 +154,10 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
         return _gradient(shifted, shifted.restore_fixed(point), system)
 
     _, right_hand_side = jax.jvp(lambda moving: stationarity(moving, at), (moving,), (moved,))
-    trusted = _trusted(left, options)
+    trusted = _derivative_factor(left, options)
     flat, unflatten = ravel_pytree(
         _times(right_hand_side, trusted)
-    )  # one leaf: JAX wants all to depend on what is differentiated
+    )  # one leaf, since JAX requires that all leaves depend on the differentiated input
 
     def operator(vector: Array) -> Array:
         along = _expanded(system, _free(unflatten(vector), system))
@@ -183,32 +182,32 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     value, tangent = jax.jvp(found, (moving, zero), (moved, solved))
     if options.not_stationary == "error":
         value = eqx.error_if(value, ~(left <= STATIONARY), _NOT_STATIONARY)
-    return (value, told), (
+    return (value, reported), (
         _times(tangent, trusted),
-        jax.tree.map(jnp.zeros_like, eqx.filter(told, eqx.is_inexact_array)),
+        jax.tree.map(jnp.zeros_like, eqx.filter(reported, eqx.is_inexact_array)),
     )
 
 
 _NOT_STATIONARY = (
-    "The point is no optimum, so it has no derivative as one: the solve did not converge, and the polish did not bring "
-    "it to rest. Raise `max_iterations`, or differentiate the iterations with "
+    "The point is not stationary, so the derivative of an optimum is undefined: neither the solve nor the chord steps "
+    "converged. Raise `max_iterations`, or differentiate the iterations with "
     "`adjoint=optimistix.RecursiveCheckpointAdjoint()`."
 )
 
 _NOT_SOLVED = (
-    "The linear system of the derivative was not solved: minimum residuals ended before. Raise `exact_iterations` of "
-    "`ConjugateGradients`, give it a better preconditioner, or take another `reduced_solver`."
+    "The linear system of the derivative was not solved: minimum residuals did not converge. Raise `exact_iterations` "
+    "of `ConjugateGradients`, use a better preconditioner, or another `reduced_solver`."
 )
 
 
-def _trusted(left: Float[Array, ""], options: ArrowAdjoint) -> Float[Array, ""]:
-    """1, or NaN where the point is not at rest and derivatives are to be NaN there, or has no derivative at all."""
+def _derivative_factor(left: Float[Array, ""], options: ArrowAdjoint) -> Float[Array, ""]:
+    """Return 1, or NaN if the derivative is undefined, or the point not stationary with the option `nan`."""
     doubtful = ((left > STATIONARY) & (options.not_stationary == "nan")) | ~jnp.isfinite(left)
     return jnp.where(doubtful, jnp.nan, 1.0)
 
 
 def _times(tree: Any, factor: Float[Array, ""]) -> Any:
-    """Before and after the linear solve, which lets no NaN through: so it reaches the result in both modes."""
+    """Scale a tree before and after the linear solve, which drops NaN, so that NaN reaches the result in both modes."""
     return jax.tree.map(lambda leaf: leaf * factor.astype(leaf.dtype), tree)
 
 
@@ -217,15 +216,16 @@ def _detached(tree: Any) -> Any:
 
 
 def _gradient(problem: AbstractArrowProblem, point: Any, system: ArrowSystem) -> ArrowVector:
-    """Gradient by what moves, in the coordinates of `system`."""
+    """Return the gradient by the free coordinates, in the coordinates of `system`."""
     return _free(_restricted(_along(system, problem), problem.gradient(point)), system)
 
 
 def _polish(
     problem: AbstractArrowProblem, point: Point, steps: int, solver: AbstractReducedSolver
 ) -> tuple[Point, ExactModel, Float[Array, ""]]:
-    """The optimum near `point`, the exact model there (of the point before the last, negligible, chord steps), and the
-    largest entry of the gradient that is left.
+    """Return the optimum near `point`, the exact model there, and the largest entry of the remaining gradient.
+
+    The model is that of the point before the last, negligible, chord steps.
     """
 
     def model_at(point: Point) -> ExactModel:
@@ -240,7 +240,7 @@ def _polish(
         moved, gradient = _chord_steps(problem, model, carry[0], steps)
         return moved, eqx.filter(model, eqx.is_array), model.largest(gradient)
 
-    # A loop, not two calls: the Hessian is compiled once.
+    # A loop instead of two calls, so that the Hessian is compiled once.
     largest = jnp.zeros((), jnp.result_type(*jax.tree.leaves(eqx.filter(point, eqx.is_inexact_array))))
     polished, arrays, left = jax.lax.fori_loop(0, 2, turn, (point, empty, largest))
     return polished, eqx.combine(arrays, rest), left
@@ -249,7 +249,7 @@ def _polish(
 def _chord_steps(
     problem: AbstractArrowProblem, model: ExactModel, point: Point, steps: int
 ) -> tuple[Point, ArrowVector]:
-    """Move by `-H^-1 g`, the Hessian kept, as long as the gradient shrinks; with the gradient that is left."""
+    """Move by `-H^-1 g` with a constant Hessian while the gradient decreases; return point and remaining gradient."""
 
     def body(carry: Any) -> Any:
         point, gradient, size, number, _ = carry
@@ -261,7 +261,7 @@ def _chord_steps(
         kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), (moved, new, new_size), (point, gradient, size))
         return *kept, number + 1, new_size < 0.1 * size
 
-    # The Hessian's system holds the gradient as well.
+    # The system of the Hessian also has the gradient.
     gradient = ArrowVector(dense_gradient(model.system)[0], model.system.landmark_gradient)
     gradient = _free(gradient, model.system)
     first = (point, gradient, model.size(gradient), jnp.asarray(0), jnp.asarray(True))
@@ -271,7 +271,7 @@ def _chord_steps(
 
 
 def _along(system: ArrowSystem, problem: AbstractArrowProblem) -> ArrowSystem:
-    """`system` with the fractions of `problem`, the same numbers, which carry their derivative."""
+    """Return `system` with the fractions of `problem`: equal values, but with a derivative."""
     fractions = problem.fractions()
     if system.segments is None or fractions is None:
         return system

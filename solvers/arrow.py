@@ -1,24 +1,24 @@
 """Arrow-shaped normal equations of an edge-factored least-squares problem, and their Schur complement.
 
 Unknowns: `n` nodes of `b` coordinates each, `q` shared coordinates (together `c = n b + q`: the dense part `x`), and
-`h` rows of `s` scalar landmarks `z`. A node hosts one row or several: so rows stay short where one node hosts most
-landmarks. An edge belongs to a row. A residual lives on a directed edge `(i, j)` and sees the nodes only
-through the relative coordinates `eta = x_j - A x_i`, one shared block and one landmark of its host i. So
+`h` rows of `s` scalar landmarks `z`. A node hosts one row or several, so that rows are short even if one node hosts
+most landmarks. An edge belongs to a row. A residual on a directed edge `(i, j)` depends on the nodes only through the
+relative coordinates `eta = x_j - A x_i`, on one shared block and on one landmark of its host i. So
 
     [ H   W ] [x]     [g]          H = sum_e P_e' G_e P_e + priors,     W = sum_e P_e' C_e,
     [ W'  V ] [z] = - [h]          P_e = [-A_e  I  .; . . I],           V diagonal,
 
 where `G_e` (Gram matrix) and `C_e` (cross terms with the host's landmarks) are kept in relative coordinates: forming
 them costs `b + q` columns a residual instead of `2 b + q`, and the Schur complement `W V^-1 W'` is one symmetric
-product of `[b k + q + 2, s]` a row, carried to node coordinates as a small matrix afterwards.
+product of `[b k + q + 2, s]` a row, transformed to node coordinates as a small matrix afterwards.
 
-The shared coordinates `y` may come in groups of `v`, of which a node sees one, `u_i = E_i y`, and an edge those of its
-two ends. Its local coordinates are then `(eta, u_j, u_i)`, `b + 2 v` of them however many groups there are, and
+The shared coordinates `y` may be in groups of `v`: a node depends on one, `u_i = E_i y`, and an edge on those of its
+two ends. Its local coordinates are then `(eta, u_j, u_i)`, `b + 2 v` for any number of groups, and
 
     P_e = [-A_e  I  .; . . E_j; . . E_i],
 
-so that ends of one group add up. A host's cross terms have the rows `(eta of each edge, u of each edge's target, u of
-the host)`. In what follows, `p` rows of a host are about shared coordinates: `q`, or `v (k + 1)` in groups.
+so that ends of one group are added. A host's cross terms have the rows `(eta of each edge, u of each edge's target, u
+of the host)`. Below, `p` is the number of rows of a host for shared coordinates: `q`, or `v (k + 1)` in groups.
 
 Levenberg-Marquardt damping multiplies the diagonal: `V (1 + l)`, `H + l diag(H)`. Hence the Schur complement at damping
 `l` is the undamped one divided by `1 + l`: a rejected step costs a factorisation and a back-substitution only.
@@ -41,15 +41,15 @@ Assembled = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
 class EdgeGraph(eqx.Module):
-    """Directed edges between nodes; `of_host[i, r]` is the r-th edge of row i of landmarks (`e`: there is none)."""
+    """Directed edges between nodes; `of_host[i, r]` is the r-th edge of row i of landmarks (`e`: no edge)."""
 
     source: Int[Array, " e"]
     target: Int[Array, " e"]
     of_host: Int[Array, "h k"]
     group: Int[Array, " n"] | None = None
-    """Group of shared coordinates that each node sees; None: every node sees all of them."""
+    """Group of shared coordinates of each node; None: every node depends on all of them."""
     host: Int[Array, " h"] | None = None
-    """Node that hosts each row; None: row i is that of node i, and `h = n`."""
+    """Node that hosts each row; None: row i belongs to node i, and `h = n`."""
 
     @property
     def host_of_row(self) -> Int[Array, " h"]:
@@ -61,9 +61,9 @@ class EdgeGraph(eqx.Module):
         return jnp.stack([self.target, self.source], 1)
 
     def seen(self, nodes: Int[Array, "*t m"], size: int) -> Int[Array, "*t p"] | None:
-        """Which shared coordinates nodes see, in groups of `size`, one node after the other; None: all of them, once.
+        """Return the shared coordinates of nodes, in groups of `size`, one node after the other; None: all, once.
 
-        A node index equal to the number of nodes, which means no node, gives some group: what is added there is zero.
+        A node index equal to the number of nodes (no node) gives an arbitrary group, where only zeros are added.
         """
         if self.group is None:
             return None
@@ -86,7 +86,7 @@ class SegmentLandmarks(eqx.Module):
     ratio: Float[Array, "h g"]
     """`l`, which makes the landmark block diagonal."""
     determined: Bool[Array, "h g"]
-    """Whether the samples determine `y_b` at all."""
+    """Whether the samples determine `y_b`."""
 
     @property
     def basis(self) -> Float[Array, "h g q 2"]:
@@ -97,21 +97,21 @@ class SegmentLandmarks(eqx.Module):
 
 
 class LandmarkBasis(NamedTuple):
-    """The coordinates in which a system holds landmarks that depend on each other, see `landmark_basis.py`."""
+    """The coordinates of coupled landmarks in a system, see `landmark_basis.py`."""
 
     segments: SegmentLandmarks | None
     triples: TripleLandmarks | None
 
 
 class NodeFactors(eqx.Module):
-    """Second-order models of what touches one node or two, and the shared coordinates, but no landmark.
+    """Second-order models of terms on one or two nodes and the shared coordinates, without landmarks.
 
-    Local coordinates: `(x of first, x of second, what first sees of the shared)`, `2 b + q` or `2 b + v` of them.
+    Local coordinates: `(x of first, x of second, shared coordinates of first)`, `2 b + q` or `2 b + v`.
     """
 
     first: Int[Array, " m"]
     second: Int[Array, " m"]
-    """`n` where a factor touches one node only."""
+    """`n` if a factor has only one node."""
     hessian: Float[Array, "m l l"]
     gradient: Float[Array, "m l"]
 
@@ -132,23 +132,23 @@ class ArrowSystem(eqx.Module):
     lie_curvature: Float[Array, "e b b"]
     """Curvature of `eta` itself, `x_j' lie_curvature (-A x_i)`; zero in a Gauss-Newton model."""
     prior_hessian: Float[Array, "p p"]
-    """Over the last `p` dense coordinates: `p = q` when only the shared ones have a prior, `p = c` when all may. It is
-    the only dense matrix here, so a system without a prior on the nodes grows linearly with its edges."""
+    """Over the last `p` dense coordinates: `p = q` if only the shared ones have a prior, else `p = c`. It is the only
+    dense matrix here, so the size of a system without a prior on the nodes is linear in its edges."""
     prior_gradient: Float[Array, " c"]
     free: Bool[Array, " c"]
-    """False for coordinates that are held."""
+    """False for fixed coordinates."""
     gauge: Float[Array, "c g"]
-    """Directions along which the energy may be flat for a known reason (a free scale): unit columns, or zero."""
+    """Known directions along which the energy may be flat (a free scale): unit columns, or zero."""
     factors: NodeFactors | None = None
-    """Terms on nodes and pairs of nodes: blocks of the matrix, however many there are."""
+    """Terms on nodes and pairs of nodes: blocks of the matrix."""
     held: Bool[Array, "h s"] | None = None
-    """Landmarks that stay where they are, at a bound that they press against; None = none."""
+    """Landmarks fixed at an active bound; None: no landmark."""
     segments: SegmentLandmarks | None = None
-    """Where the last `2 g` landmarks are coordinates of segments of `q` samples."""
+    """If given, the last `2 g` landmarks are coordinates of segments of `q` samples."""
     blocks: Float[Array, "h 3 t"] | None = None
-    """Where the first `3 t` landmarks are `t` of three unknowns, all `u`, all `v`, all `d`: second derivatives
-    `uu, vv, uv`. The last row of `cross` then holds `ud, vd` for `u` and `v`. None once `join_triples` has factored
-    them."""
+    """If given, the first `3 t` landmarks are `t` of three unknowns, all `u`, all `v`, all `d`, and these are the
+    second derivatives `uu, vv, uv`. The last row of `cross` then has `ud, vd` for `u` and `v`. None after
+    `join_triples`."""
     triples: TripleLandmarks | None = None
     """The factors of those blocks. `cross` stays by `u, v, d`; all else is in the coordinates of the factors."""
 
@@ -164,7 +164,7 @@ class ArrowSystem(eqx.Module):
 
     @property
     def seen(self) -> int:
-        """Number of shared coordinates that a node sees: `q`, or `v` in groups."""
+        """Number of shared coordinates of a node: `q`, or `v` in groups."""
         local = self.gram.shape[-1] - self.source_adjoint.shape[-1] - 1
         return local if self.graph.group is None else local // 2
 
@@ -188,11 +188,11 @@ class ArrowSystem(eqx.Module):
         return (len(self.free) - self.gram.shape[-1] + block + 1) // block
 
     def neighbours(self) -> Int[Array, "h k"]:
-        """Target node of each edge of each row; `n` where there is no edge."""
+        """Return the target node of each edge of each row; `n` for a missing edge."""
         return jnp.append(self.graph.target, self.num_nodes)[self.graph.of_host]
 
     def around(self) -> Int[Array, "h m"]:
-        """Neighbours of each row, then its host."""
+        """Return the neighbours of each row, then its host."""
         return jnp.concatenate([self.neighbours(), self.graph.host_of_row[:, None]], 1)
 
 
@@ -208,18 +208,18 @@ class Reduced(eqx.Module):
 
 
 def restricted(triples: TripleLandmarks | None, values: Float[Array, "h *rows s"]) -> Float[Array, "h *rows s"]:
-    """Values by the landmarks of the cross terms as those by the coordinates of the system."""
+    """Transform values by the landmarks of the cross terms to the coordinates of the system."""
     return values if triples is None else restrict_triples(triples, values)
 
 
 def moving_landmarks(system: ArrowSystem) -> Bool[Array, "h s"]:
-    """Landmarks that something determines and that no bound holds."""
+    """Return the landmarks that are determined and not at an active bound."""
     determined = system.landmark_hessian != 0
     return determined if system.held is None else determined & ~system.held
 
 
 def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "h s"]:
-    """`V^-1`, zero for landmarks that stay where they are: nothing determines them, or they are held."""
+    """Return `V^-1`, zero for landmarks that are undetermined or at an active bound."""
     determined = moving_landmarks(system)
     return jnp.where(determined, 1 / jnp.where(determined, system.landmark_hessian, 1.0), 0.0)
 
@@ -241,9 +241,9 @@ def reduce(system: ArrowSystem) -> Reduced:
 
 
 def host_products(system: ArrowSystem) -> Float[Array, "h t t"]:
-    """`C V^-1 C'` of each row in relative coordinates; `t = b k + p + 1`, the gradient comes last."""
+    """Return `C V^-1 C'` of each row in relative coordinates; `t = b k + p + 1`, the gradient comes last."""
     inverse = inverse_landmark_hessian(system)
-    # A loop over rows: twice as fast on a CPU as one batched product (the scaled rows stay in the cache).
+    # A loop over rows is twice as fast on a CPU as one batched product (the scaled rows stay in the cache).
     if system.triples is None:
         product = lambda host: (host[0] * host[1]) @ host[0].T
         products = jax.lax.map(product, (system.cross, inverse))
@@ -253,13 +253,13 @@ def host_products(system: ArrowSystem) -> Float[Array, "h t t"]:
 
 
 def _each_part(cross: Float[Array, "h r s"]) -> tuple[Array, Array, Array, Array]:
-    """The same array four times: read as one, XLA copies a row of it as a whole before it takes the parts out."""
+    """Return the same array four times: otherwise XLA copies a whole row before slicing its parts."""
     four: tuple[Array, Array, Array, Array] = jax.lax.optimization_barrier((cross, cross, cross, cross))
     return four
 
 
 def _product_of_parts(host: tuple[tuple[Array, ...], Array, TripleLandmarks]) -> Float[Array, "r r"]:
-    """`C V^-1 C'` of one row whose cross terms are by the unknowns of triples."""
+    """Return `C V^-1 C'` of one row whose cross terms are by the unknowns of triples."""
     cross, inverse, triples = host
     count = triples.ratio_u.shape[-1]
     u, v, d, others = (split_triples(whole, count)[k] for k, whole in enumerate(cross))
@@ -269,7 +269,7 @@ def _product_of_parts(host: tuple[tuple[Array, ...], Array, TripleLandmarks]) ->
 
 
 def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "h relative"]:
-    """Dense step in the coordinates of each row's cross terms: `(eta of each edge, shared)`."""
+    """Return a dense step in the coordinates of each row's cross terms: `(eta of each edge, shared)`."""
     rows, degree = system.graph.of_host.shape
     count, block = system.num_nodes, system.source_adjoint.shape[-1]
     nodes, shared = dense[: count * block].reshape(count, block), dense[count * block :]
@@ -280,7 +280,7 @@ def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, 
 
 
 def seen_by_hosts(system: ArrowSystem) -> Int[Array, "h p"] | None:
-    """Which shared coordinates the cross terms of each row see; None: all."""
+    """Return the shared coordinates of the cross terms of each row; None: all."""
     return system.graph.seen(system.around(), system.seen)
 
 
@@ -289,12 +289,12 @@ def _seen_of(shared: Float[Array, " q"], count: int, seen: Int[Array, "t p"] | N
 
 
 def add_shared(values: Float[Array, "t p"], seen: Int[Array, "t p"] | None, count: int) -> Float[Array, " q"]:
-    """Values of what is seen added up at the `count` shared coordinates."""
+    """Add values by the coordinates `seen` to the `count` shared coordinates."""
     return values.sum(0) if seen is None else jnp.zeros(count, values.dtype).at[seen].add(values)
 
 
 def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> Float[Array, "h s"]:
-    """`W' dense + gradient * h`, in one pass over the cross terms."""
+    """Return `W' dense + gradient * h`, in one pass over the cross terms."""
     relative = to_relative(system, dense)
     tail = jnp.broadcast_to(jnp.asarray([gradient, 0.0], dense.dtype), (len(relative), 2))
     coupled = jnp.einsum("nrs,nr->ns", system.cross, jnp.concatenate([relative, tail], 1))
@@ -302,12 +302,12 @@ def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> F
 
 
 def back_substitute(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, "h s"]:
-    """`-V^-1 (h + W' dense)`: the landmarks that minimise the undamped model at a given dense step."""
+    """Return `-V^-1 (h + W' dense)`: the landmarks that minimise the undamped model at a given dense step."""
     return -inverse_landmark_hessian(system) * couple(system, dense, 1.0)
 
 
 def multiply(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
-    """The undamped matrix times a vector (held coordinates as if free)."""
+    """Return the undamped matrix times a vector (fixed coordinates as if free)."""
     return ArrowVector(
         dense=hessian_times(system, vector.dense) + carry_to_nodes(system, vector.landmarks),
         landmarks=couple(system, vector.dense, 0.0) + system.landmark_hessian * vector.landmarks,
@@ -315,7 +315,7 @@ def multiply(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
 
 
 def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, " c"]:
-    """`H dense`, edge by edge: no matrix over all nodes is formed."""
+    """Return `H dense`, edge by edge, without a matrix over all nodes."""
     hosts, block = system.num_nodes, system.source_adjoint.shape[-1]
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
     at_target = nodes[system.graph.target]
@@ -345,7 +345,7 @@ def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array
 
 
 def _factors_gathered(system: ArrowSystem, factors: NodeFactors, local: Float[Array, "m l"]) -> Float[Array, " c"]:
-    """Values in the factors' local coordinates added up at the nodes and the shared coordinates."""
+    """Add values in the factors' local coordinates to the nodes and the shared coordinates."""
     hosts, block = system.num_nodes, system.source_adjoint.shape[-1]
     nodes = jnp.zeros((hosts + 1, block), local.dtype)
     nodes = nodes.at[factors.first].add(local[:, :block]).at[factors.second].add(local[:, block : 2 * block])
@@ -358,14 +358,14 @@ def _seen_by_factors(system: ArrowSystem, factors: NodeFactors) -> Int[Array, "m
 
 
 def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "h s"]) -> Float[Array, " c"]:
-    """`W z`: landmark values carried to the dense coordinates."""
+    """Return `W z`: landmark values transformed to the dense coordinates."""
     if system.triples is not None:
         landmarks = expand_triples(system.triples, landmarks)
     return from_relative(system, jnp.einsum("nrs,ns->nr", system.cross, landmarks)[:, :-2])
 
 
 def from_relative(system: ArrowSystem, relative: Float[Array, "h relative"]) -> Float[Array, " c"]:
-    """The transpose of `to_relative`: forces on each row's relative coordinates, added up at the nodes."""
+    """Return the transpose of `to_relative`: forces on each row's relative coordinates, summed at the nodes."""
     rows, degree = system.graph.of_host.shape
     block = system.source_adjoint.shape[-1]
     eta = relative[:, : degree * block].reshape(rows, degree, block)
@@ -378,7 +378,7 @@ def from_relative(system: ArrowSystem, relative: Float[Array, "h relative"]) -> 
 
 
 def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-    """Gradient of the dense coordinates and the diagonal of their Hessian (no landmark eliminated)."""
+    """Return the gradient of the dense coordinates and the diagonal of their Hessian (before elimination)."""
     block = system.source_adjoint.shape[-1]
     eta = system.gram[:, :block, :block]
     gradients = _gather_at_nodes(system, system.gram[:, :block, -1], system.gram[:, :block, -1])
@@ -402,18 +402,18 @@ def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array
 def _gather_at_nodes(
     system: ArrowSystem, at_target: Float[Array, "e b"], at_source: Float[Array, "e b"]
 ) -> Float[Array, "n b"]:
-    """Add forces on relative coordinates up at the nodes: `at_target` at targets, `-A' at_source` at sources."""
+    """Sum forces on relative coordinates at the nodes: `at_target` at targets, `-A' at_source` at sources."""
     nodes = jnp.zeros((system.num_nodes, at_target.shape[1]), at_target.dtype)
     carried = jnp.einsum("eba,eb->ea", system.source_adjoint, at_source)
     return nodes.at[system.graph.target].add(at_target).at[system.graph.source].add(-carried)
 
 
 class AbstractLayout(eqx.Module):
-    """Where the blocks of a matrix over the nodes are stored: one storage a class."""
+    """Storage of the blocks of a matrix over the nodes; each subclass is one format."""
 
     @abc.abstractmethod
     def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
-        """Storage of zeros."""
+        """Return a storage of zeros."""
 
     @abc.abstractmethod
     def add(
@@ -423,7 +423,7 @@ class AbstractLayout(eqx.Module):
 
 
 class DenseLayout(AbstractLayout):
-    """All blocks, `[n + 1, n + 1, b, b]`; the last row and column take what belongs nowhere."""
+    """All blocks, `[n + 1, n + 1, b, b]`; the last row and column collect blocks of missing nodes."""
 
     def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
         return jnp.zeros((nodes + 1, nodes + 1, block, block), dtype)
@@ -438,20 +438,20 @@ class Blocks(eqx.Module):
     """A symmetric matrix over nodes and shared coordinates, with a gradient as its last shared coordinate."""
 
     nodes: Array
-    """As the layout stores it."""
+    """In the storage of the layout."""
     border: Float[Array, "n b o"]
     """`o = q + 1`."""
     corner: Float[Array, "o o"]
 
 
 def padded_transports(system: ArrowSystem) -> Float[Array, "h k b b"]:
-    """`A` of each edge of each row, zero where there is no edge."""
+    """Return `A` of each edge of each row, zero for a missing edge."""
     padded = jnp.concatenate([system.source_adjoint, jnp.zeros_like(system.source_adjoint[:1])])
     return padded[system.graph.of_host]
 
 
 def assemble_hosts(system: ArrowSystem, products: Float[Array, "h t t"], layout: AbstractLayout) -> Blocks:
-    """Carry each row's matrix from relative to node and shared coordinates and add them all up."""
+    """Transform each row's matrix from relative to node and shared coordinates, and sum over rows."""
     hosts, degree = system.graph.of_host.shape
     nodes, block = system.num_nodes, system.source_adjoint.shape[-1]
     wide = degree * block
@@ -480,7 +480,7 @@ def _add_border(
     value: Float[Array, "t *d b l"],
     seen: Int[Array, "t p"] | None,
 ) -> Float[Array, "m b o"]:
-    """Rows of nodes over what is seen and the gradient (`l = p + 1`), added up over all shared coordinates."""
+    """Add rows of nodes over their shared coordinates and the gradient (`l = p + 1`) to all shared coordinates."""
     if seen is None:
         return stored.at[node].add(value)
     block, shared = stored.shape[1], stored.shape[2] - 1
@@ -490,7 +490,7 @@ def _add_border(
 
 
 def _corner(system: ArrowSystem, value: Float[Array, "t l l"], seen: Int[Array, "t p"] | None) -> Float[Array, "o o"]:
-    """Matrices over what is seen and the gradient, added up over all shared coordinates (`o = q + 1`)."""
+    """Sum matrices over local shared coordinates and the gradient to all shared coordinates (`o = q + 1`)."""
     if seen is None:
         return value.sum(0)
     columns = jnp.pad(seen, ((0, 0), (0, 1)), constant_values=system.shared)
@@ -499,7 +499,7 @@ def _corner(system: ArrowSystem, value: Float[Array, "t l l"], seen: Int[Array, 
 
 
 def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
-    """Hessian and gradient of all edges in node and shared coordinates."""
+    """Return Hessian and gradient of all edges in node and shared coordinates."""
     hosts, block = system.num_nodes, system.source_adjoint.shape[-1]
     source, target = system.graph.source, system.graph.target
     eta, border = system.gram[:, :block, :block], system.gram[:, :block, block:]
@@ -526,7 +526,7 @@ def _add_factors(system: ArrowSystem, whole: Blocks, factors: NodeFactors, layou
         *((first, first, cut(0, 0)), (second, second, cut(1, 1))),
         *((first, second, cut(0, 1)), (second, first, cut(1, 0))),
     ):
-        # What touches no second node must not touch the first one's row either.
+        # A block with a missing second node must not be added to the first node's row either.
         absent = (row == hosts) | (column == hosts)
         nodes = layout.add(nodes, jnp.where(absent, hosts, row), jnp.where(absent, hosts, column), value)
     tail = jnp.concatenate([factors.hessian[:, :, 2 * block :], factors.gradient[..., None]], 2)
@@ -541,7 +541,7 @@ def _add_factors(system: ArrowSystem, whole: Blocks, factors: NodeFactors, layou
 
 
 def add_prior_blocks(blocks: Blocks, system: ArrowSystem, layout: AbstractLayout) -> Blocks:
-    """The prior on the shared coordinates; of one that couples all nodes, the blocks of the nodes as well."""
+    """Return the blocks plus the prior on the shared coordinates, and on the nodes if it couples them."""
     hosts, block = blocks.border.shape[:2]
     shared, prior = blocks.corner.shape[0] - 1, system.prior_hessian
     corner = blocks.corner.at[:shared, :shared].add(prior[-shared:, -shared:])
@@ -554,7 +554,7 @@ def add_prior_blocks(blocks: Blocks, system: ArrowSystem, layout: AbstractLayout
 
 
 def _dense(blocks: Blocks) -> Assembled:
-    """Lay dense blocks out as one matrix; the last shared coordinate is the gradient, returned apart."""
+    """Convert dense blocks to one matrix; the last shared coordinate is the gradient, returned separately."""
     inner = blocks.nodes[:-1, :-1]
     nodes = inner.shape[0] * inner.shape[2]
     square = inner.transpose(0, 2, 1, 3).reshape(nodes, nodes)

@@ -1,4 +1,4 @@
-"""Reduced system of a sequence by block-banded Cholesky."""
+"""Block-banded Cholesky for the reduced system of a sequence."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from vggtgeo.solvers.reduced import AbstractReducedSolver, predicted_decrease
 
 
 class BandCholesky(AbstractReducedSolver[Bands]):
-    """Exact where every edge joins nodes at most `reach` places apart; cost linear in their number.
+    """Exact if every edge joins nodes at most `reach` positions apart; the cost is linear in the number of nodes.
 
-    Longer edges enter as if their far end were held: the step is then a descent direction, not the exact one. Use
+    Longer edges are included as if their far end were fixed: the step is then a descent direction, but not exact. Use
     `ConjugateGradients(BandPreconditioner(reach))` for them.
     """
 
     reach: int = eqx.field(static=True)
-    """Largest distance of the places of an edge's nodes; `|i - j|` in the order of the nodes themselves."""
+    """Maximum distance in position of an edge's nodes; `|i - j|` in the order of the nodes."""
     place: Int[Array, " n"] | None = None
-    """Place of each node in an order that keeps the band narrow; None = its own."""
+    """Position of each node in an order with a narrow band; None = its index."""
 
     def __check_init__(self) -> None:
         if self.reach < 1:
-            raise ValueError(f"`reach` is {self.reach}; it must be at least 1, the largest |i - j| over the edges")
+            raise ValueError(f"`reach` must be at least 1, the largest |i - j| over the edges, got {self.reach}")
 
     def prepare(self, system: ArrowSystem) -> Bands:
         if len(system.prior_hessian) > system.shared:
             raise ValueError(
-                "`system.prior_hessian` couples all nodes (a marginalisation prior), so the reduced system has no "
-                "band; use `DenseCholesky` or `ConjugateGradients`"
+                "`system.prior_hessian` must not couple all nodes (a marginalisation prior), since the reduced system "
+                "is then not banded; use `DenseCholesky` or `ConjugateGradients`"
             )
         return prepare_bands(system, band_layout(system, self.reach, self.place))
 

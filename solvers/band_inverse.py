@@ -27,7 +27,7 @@ from vggtgeo.solvers.reduced import AbstractFactor
 
 
 class BandElimination(AbstractFactor):
-    """By block elimination: pivots of either sign, groups in their order, so exact where leading blocks are regular."""
+    """Block elimination with pivots of either sign and groups in order: exact if all leading blocks are regular."""
 
     layout: BandLayout
     elimination: Elimination
@@ -38,7 +38,7 @@ class BandElimination(AbstractFactor):
         return solve_pinned(self.updates, self.weights, self.pinned_inverse, jnp.where(system.free, rhs, 0.0))
 
     def pinned_inverse(self, columns: Float[Array, "c m"]) -> Float[Array, "c m"]:
-        """The inverse with flat directions pinned instead of held."""
+        """Return the inverse with flat directions pinned instead of held."""
         laid = self.layout.columns(columns, len(self.elimination.corner))
         return self.layout.flat(solve_eliminated(self.elimination, laid))
 
@@ -56,7 +56,7 @@ def band_elimination(system: ArrowSystem, bands: Bands) -> BandElimination:
 
 
 def band_inverse(system: ArrowSystem, bands: Bands, rows: Int[Array, " h"]) -> LocalInverse:
-    """The blocks of the inverse that the band has, of each host; held along flat directions by low-rank corrections."""
+    """Return the blocks of the inverse inside the band around each host, conditional on flat directions."""
     factor = band_elimination(system, bands)
     known, unknown = (_local(system, factor.layout, part, rows) for part in selected_inverse(factor.elimination))
     index = local_coordinates(system, rows)
@@ -77,8 +77,9 @@ def band_inverse(system: ArrowSystem, bands: Bands, rows: Int[Array, " h"]) -> L
 
 
 def _scale(system: ArrowSystem) -> Float[Array, " c"]:
-    """Root of the Hessian's diagonal, without its sign: of an indefinite one it is negative in places, and a pivot
-    whose rows differ in size by orders of magnitude loses as many digits.
+    """Return the square root of the absolute Hessian diagonal, which may be negative if indefinite.
+
+    A pivot whose rows differ by orders of magnitude would lose as many digits.
     """
     return balance(system, jnp.abs(dense_gradient(system)[1]))
 
@@ -86,9 +87,9 @@ def _scale(system: ArrowSystem) -> Float[Array, " c"]:
 def _held_correction(
     system: ArrowSystem, factor: BandElimination, stiffness: Float[Array, " g"]
 ) -> tuple[Float[Array, "c u"], Float[Array, "u u"]]:
-    """`Y, N`: the covariance held along flat directions is that of the pinned matrix less `Y N Y'`.
+    """Return `Y, N`: the covariance conditional on flat directions is that of the pinned matrix minus `Y N Y'`.
 
-    First Woodbury's identity from pins to the gauge's stiffness, then `C a (a' C a)^-1 a' C` along each direction.
+    First the Woodbury identity from pins to the gauge's stiffness, then `C a (a' C a)^-1 a' C` along each direction.
     """
     gauge, count = free_gauge(system), system.gauge.shape[1]
     solved = factor.pinned_inverse(factor.updates)
@@ -105,7 +106,7 @@ def _held_correction(
 def _local(
     system: ArrowSystem, layout: BandLayout, found: SelectedInverse, rows: Int[Array, " h"]
 ) -> Float[Array, "h l l"]:
-    """Blocks of the local coordinates of each host, in balanced units."""
+    """Return the blocks of the local coordinates of each host, in balanced units."""
     nodes, block = local_nodes(system, rows), system.source_adjoint.shape[-1]
     rows, columns = jnp.broadcast_arrays(nodes[:, :, None], nodes[:, None, :])
     inner = layout.gather(found.groups, rows, columns).transpose(0, 1, 3, 2, 4)

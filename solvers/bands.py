@@ -1,4 +1,4 @@
-"""The damped Schur complement of a sequence as a banded matrix: what its Cholesky factor and its inverse begin with."""
+"""The damped Schur complement of a sequence as a banded matrix, for its Cholesky factor and its inverse."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, pins
 
 
 class Bands(eqx.Module):
-    """What the band solvers prepare once a linearisation."""
+    """Data of the band solvers for one linearisation."""
 
     layout: BandLayout
     hessian: BandMatrix
@@ -30,7 +30,7 @@ class Bands(eqx.Module):
 
 
 def prepare_bands(system: ArrowSystem, layout: BandLayout) -> Bands:
-    """Both matrices as far as the edges go that the layout holds, and the right-hand side."""
+    """Assemble both matrices for the edges inside the band, and the right-hand side."""
     hessian, schur = assemble_bands(system, layout)
     gradient, diagonal = dense_gradient(system)
     schur_gradient = carry_to_nodes(system, inverse_landmark_hessian(system) * system.landmark_gradient)
@@ -38,7 +38,7 @@ def prepare_bands(system: ArrowSystem, layout: BandLayout) -> Bands:
 
 
 def damped_band(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandMatrix:
-    """The damped Schur complement, flat directions pinned."""
+    """Return the damped Schur complement, flat directions pinned."""
     shrink, shared = 1 / (1 + damping), len(bands.hessian.corner)
     matrix: BandMatrix = jax.tree.map(lambda whole, taken: whole - shrink * taken, bands.hessian, bands.schur)
     added = damping * bands.diagonal + pins(system, bands.stiffness, bands.diagonal).sum(1)
@@ -46,6 +46,6 @@ def damped_band(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) ->
 
 
 def factorise_bands(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandFactor:
-    """Factor of `damped_band` over the free coordinates."""
+    """Factorise `damped_band` over the free coordinates."""
     moves = bands.layout.columns(system.free[:, None], len(bands.hessian.corner))
     return factorise(damped_band(system, bands, damping), moves)

@@ -1,14 +1,14 @@
 """Block-banded symmetric matrices with a border, their storage and their Cholesky factor.
 
-Nodes in the order of a sequence see their near neighbours only: an edge of reach `r = |i - j|` and the elimination of
-the landmarks couple nodes at most `2 r` apart. A closed loop is a sequence too, once it is folded: in the order
-`0, n - 1, 1, n - 2, ...` no edge reaches more than twice as far. Groups of `2 r` nodes (`w` coordinates) make the
-matrix block tridiagonal, with the few shared coordinates as a border:
+Nodes in the order of a sequence are coupled to near neighbours only: an edge of reach `r = |i - j|` and the elimination
+of the landmarks couple nodes at most `2 r` apart. A closed loop is also a sequence after folding: in the order
+`0, n - 1, 1, n - 2, ...` the reach of an edge at most doubles. Groups of `2 r` nodes (`w` coordinates) make the matrix
+block tridiagonal, with the few shared coordinates as a border:
 
     M = [ T   F ]     T_kk = L_k L_k' + Y_{k-1} Y_{k-1}',     Y_k = T_{k+1,k} L_k^-T,
         [ F'  K ]     Z_k = L_k^-1 (F_k - Y_{k-1} Z_{k-1}),   K - Z' Z = C C'.
 
-Cost: `7/3 w^3` operations a group, so linear in the number of nodes, against `c^3 / 3` for a dense factor
+Cost: `7/3 w^3` operations a group, so linear in the number of nodes, compared with `c^3 / 3` for a dense factor
 (Golub and Van Loan, Matrix Computations, 4.3 and 4.5).
 """
 
@@ -35,13 +35,13 @@ from vggtgeo.solvers.arrow import (
 
 
 class BandLayout(AbstractLayout):
-    """Blocks at most one group away from the diagonal, lower half, `[groups, 2, size, b, size, b]`; others are left."""
+    """Blocks at most one group from the diagonal, lower half, `[groups, 2, size, b, size, b]`; others are dropped."""
 
     nodes: int = eqx.field(static=True)
     group: int = eqx.field(static=True)
     """Nodes a group."""
     place: Int[Array, " n"] | None = None
-    """Place of each node in the band's order; None = that of the nodes themselves."""
+    """Position of each node in the band's order; None = its index."""
 
     def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
         return jnp.zeros((math.ceil(nodes / self.group), 2, *(self.group, block) * 2), dtype)
@@ -57,12 +57,12 @@ class BandLayout(AbstractLayout):
         return stored.at[at, below, row % self.group, :, column % self.group, :].add(value, mode="drop")
 
     def columns(self, columns: Shaped[Array, "c o"], shared: int) -> BandVector:
-        """Columns over the dense coordinates, `shared` of them the last, group by group; zero beyond the last node."""
+        """Arrange columns over the dense coordinates (the last `shared` are shared) by groups, padded with zeros."""
         nodes = columns[:-shared]
         return BandVector(self.rows(nodes.reshape(self.nodes, -1, nodes.shape[1])), columns[-shared:])
 
     def rows(self, nodes: Shaped[Array, "n b o"]) -> Shaped[Array, "k w o"]:
-        """Rows of each node, group by group."""
+        """Arrange the rows of the nodes by groups."""
         if self.place is not None:
             nodes = jnp.zeros_like(nodes).at[self.place].set(nodes)
         groups = math.ceil(self.nodes / self.group)
@@ -72,7 +72,7 @@ class BandLayout(AbstractLayout):
     def gather(
         self, stored: Float[Array, "k 2 w w"], row: Int[Array, "*t"], column: Int[Array, "*t"]
     ) -> Float[Array, "*t b b"]:
-        """Blocks of a symmetric matrix whose lower half is stored as `add` stores it; zero outside the band."""
+        """Return blocks of a symmetric matrix whose lower half is stored as by `add`; zero outside the band."""
         row, column = self._placed(row), self._placed(column)
         below = row // self.group - column // self.group
         above = below < 0
@@ -84,17 +84,17 @@ class BandLayout(AbstractLayout):
         return jnp.where((jnp.abs(below) <= 1)[..., None, None], found, 0.0)
 
     def flat(self, vector: BandVector) -> Float[Array, "c o"]:
-        """The inverse of `columns`."""
+        """Return the inverse of `columns`."""
         nodes = self.nodes_of(vector.nodes)
         return jnp.concatenate([nodes.reshape(-1, nodes.shape[-1]), vector.shared])
 
     def nodes_of(self, rows: Shaped[Array, "k w o"]) -> Shaped[Array, "n b o"]:
-        """The inverse of `rows`."""
+        """Return the inverse of `rows`."""
         nodes = rows.reshape(-1, rows.shape[1] // self.group, rows.shape[-1])
         return nodes[: self.nodes] if self.place is None else nodes[self.place]
 
     def near(self, system: ArrowSystem, reach: int) -> Bool[Array, " e"]:
-        """Edges whose ends are at most so many places apart."""
+        """Return which edges have ends at most `reach` positions apart."""
         return jnp.abs(self._placed(system.graph.source) - self._placed(system.graph.target)) <= reach
 
     def _placed(self, index: Int[Array, "*t"]) -> Int[Array, "*t"]:
@@ -102,12 +102,12 @@ class BandLayout(AbstractLayout):
 
 
 def band_layout(system: ArrowSystem, reach: int, place: Int[Array, " n"] | None) -> BandLayout:
-    """The layout that holds every edge that reaches over at most `reach` places."""
+    """Return the layout for all edges of a reach of at most `reach`."""
     return BandLayout(system.num_nodes, max(2 * reach, 1), place)
 
 
 class BandMatrix(eqx.Module):
-    """`M` of the head of this file; coordinates beyond the last node are zero."""
+    """`M` of the module docstring; padding after the last node is zero."""
 
     groups: Float[Array, "k 2 w w"]
     """`T_kk` and `T_{k+1,k}`."""
@@ -141,11 +141,11 @@ class BandFactor(eqx.Module):
 
 
 def assemble_bands(system: ArrowSystem, layout: BandLayout) -> tuple[BandMatrix, BandMatrix]:
-    """`H` and `W V^-1 W'`, as far as edges go whose ends are at most half a group apart.
+    """Return `H` and `W V^-1 W'` for the edges whose ends are at most half a group apart.
 
-    Of a longer edge the block of its far node and its share of the host's own block are kept, and what couples the two
-    (or the far node to anything else) is dropped, in both matrices alike: each host's part of the Schur complement
-    stays positive semi-definite (a block diagonal of one that is), so the band can precondition.
+    For a longer edge the diagonal blocks of the far node and the host are kept, and the coupling of the far node is
+    dropped, in both matrices. Each host's part of the Schur complement stays positive semidefinite (it is the block
+    diagonal of a positive semidefinite matrix), so the band is a valid preconditioner.
     """
     near = layout.near(system, layout.group // 2)
     block = system.source_adjoint.shape[-1]
@@ -157,7 +157,7 @@ def assemble_bands(system: ArrowSystem, layout: BandLayout) -> tuple[BandMatrix,
 
 
 def add_to_diagonal(matrix: BandMatrix, added: BandVector) -> BandMatrix:
-    """The matrix with a diagonal added, given as one column."""
+    """Return the matrix with a diagonal added, given as one column."""
     eye = jnp.eye(matrix.groups.shape[-1], dtype=matrix.groups.dtype)
     return BandMatrix(
         matrix.groups.at[:, 0].add(added.nodes * eye), matrix.border, matrix.corner + jnp.diag(added.shared[:, 0])
@@ -165,7 +165,7 @@ def add_to_diagonal(matrix: BandMatrix, added: BandVector) -> BandMatrix:
 
 
 def factorise(matrix: BandMatrix, moves: BandVector) -> BandFactor:
-    """Cholesky factor over the coordinates that move (the others get a unit diagonal). NaN where not definite."""
+    """Return the Cholesky factor over the free coordinates (others get a unit diagonal); NaN if not definite."""
     matrix = held(matrix, moves)
     nodes, shared = matrix.diagonal()
     scale = BandVector(_positive_root(nodes)[..., None], _positive_root(shared)[..., None])
@@ -189,7 +189,7 @@ def factorise(matrix: BandMatrix, moves: BandVector) -> BandFactor:
 
 
 def solve_band(factor: BandFactor, columns: BandVector) -> BandVector:
-    """`M^-1 columns`: one pass over the groups forward and one back."""
+    """Return `M^-1 columns` by one forward and one backward pass over the groups."""
     nodes, shared = columns.nodes / factor.scale.nodes, columns.shared / factor.scale.shared
 
     def forward(carry: Array, group: Any) -> tuple[Array, Array]:
@@ -212,7 +212,7 @@ def solve_band(factor: BandFactor, columns: BandVector) -> BandVector:
 
 
 def balanced(matrix: BandMatrix, scale: BandVector) -> BandMatrix:
-    """The matrix divided by a scale, one column, from both sides."""
+    """Return the matrix divided by a scale, one column, from both sides."""
     after = jnp.concatenate([scale.nodes[1:], jnp.ones_like(scale.nodes[:1])])
     return BandMatrix(
         matrix.groups / jnp.stack([scale.nodes, after], 1) / scale.nodes[:, None, None, :, 0],
@@ -222,7 +222,7 @@ def balanced(matrix: BandMatrix, scale: BandVector) -> BandMatrix:
 
 
 def _band(blocks: Blocks, layout: BandLayout) -> BandMatrix:
-    """Blocks as groups, without the gradient."""
+    """Convert blocks to groups, without the gradient."""
     groups, _, size, block, _, _ = blocks.nodes.shape
     return BandMatrix(
         blocks.nodes.reshape(groups, 2, size * block, size * block),
@@ -232,19 +232,19 @@ def _band(blocks: Blocks, layout: BandLayout) -> BandMatrix:
 
 
 def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "h t t"]:
-    """Which entries of the hosts' products couple no far edge with anything else."""
+    """Return the entries of the hosts' products that do not couple a far edge with other coordinates."""
     hosts, degree = system.graph.of_host.shape
     block = system.source_adjoint.shape[-1]
     tail = system.cross.shape[1] - 1 - degree * block
     far = jnp.append(~near, False)[system.graph.of_host]
-    # A far edge is a class of its own (1 + its index); near edges, shared coordinates and the gradient are class 0.
+    # Each far edge is a separate class (1 + its index); near edges, shared coordinates and the gradient are class 0.
     classes = jnp.repeat(jnp.where(far, 1 + jnp.arange(degree), 0), block, axis=1)
     classes = jnp.concatenate([classes, jnp.zeros((hosts, tail), classes.dtype)], 1)
     return classes[:, :, None] == classes[:, None, :]
 
 
 def held(matrix: BandMatrix, moves: BandVector) -> BandMatrix:
-    """The matrix with unit rows and columns for coordinates that do not move."""
+    """Return the matrix with unit rows and columns for fixed coordinates."""
     nodes, shared = moves.nodes[..., 0], moves.shared[..., 0]
     after = jnp.concatenate([nodes[1:], jnp.zeros_like(nodes[:1])])
     rows = jnp.stack([nodes, after], 1)

@@ -5,15 +5,15 @@ Of `M = [T F; F' K]` of `block_band.py`, group after group,
     D_k = T_kk - T_{k,k-1} D_{k-1}^+ T_{k-1,k},    G_k = F_k - T_{k,k-1} D_{k-1}^+ G_{k-1},
     U_k = D_k^+ [T_{k,k+1}  G_k],
 
-with the pseudo-inverse of each pivot by its eigenvectors: a saddle has pivots of both signs, and directions that
-nothing determines show as pivots without size. Exact where the leading blocks are regular, as they are at a minimum.
-The inverse `Z` follows from the last group to the first, only where the band has blocks (Takahashi, Fagan and Chen
-1973; Erisman and Tinney 1975), with `L` the next group and the shared coordinates:
+with the pseudo-inverse of each pivot by its eigenvectors: a saddle has pivots of both signs, and undetermined
+directions have zero pivots. Exact if the leading blocks are regular, as at a minimum. The inverse `Z` is computed from
+the last group to the first, only for the blocks of the band (Takahashi, Fagan and Chen 1973; Erisman and Tinney 1975),
+with `L` the next group and the shared coordinates:
 
     Z_kL = - U_k Z_LL,        Z_kk = D_k^+ + U_k Z_LL U_k'.
 
-The same recursion with the projectors on the pivots' undetermined directions in place of `D_k^+` gives what grows
-without bound where those are unknown. Cost of both: some `30 w^3` operations a group, linear in the number of nodes.
+The same recursion with the projectors on the pivots' undetermined directions in place of `D_k^+` gives the unbounded
+part of the covariance. Cost of both: about `30 w^3` operations a group, linear in the number of nodes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.solvers.block_band import BandMatrix, BandVector, balanced, held
 
 REFINEMENTS = 4
-"""Steps of iterative refinement in a solve; each costs a solve more, a few percent of the elimination."""
+"""Number of steps of iterative refinement in a solve; each costs one solve, a few percent of the elimination."""
 
 
 class Elimination(eqx.Module):
@@ -36,22 +36,22 @@ class Elimination(eqx.Module):
     inverse: Float[Array, "k w w"]
     """`D_k^+`."""
     null: Float[Array, "k w w"]
-    """Projectors on what they do not determine."""
+    """Projectors on the undetermined directions of the pivots."""
     update: Float[Array, "k w v"]
     """`U_k`."""
     corner: Float[Array, "q q"]
     """`(K - F' T^+ F)^+`."""
     corner_null: Float[Array, "q q"]
     matrix: BandMatrix
-    """What was eliminated, balanced, with unit rows for held coordinates."""
+    """The eliminated matrix, balanced, with unit rows for fixed coordinates."""
     scale: BandVector
     """One column; the matrix was divided by it from both sides."""
     rank: Int[Array, ""]
-    """Pivots with size, held coordinates and those beyond the last node included."""
+    """Number of nonzero pivots, including fixed coordinates and padding."""
 
 
 class SelectedInverse(eqx.Module):
-    """The blocks of an inverse that its matrix has, lower half, in balanced units."""
+    """The blocks of an inverse in the pattern of its matrix, lower half, in balanced units."""
 
     groups: Float[Array, "k 2 w w"]
     """`Z_kk` and `Z_{k+1,k}`."""
@@ -60,13 +60,13 @@ class SelectedInverse(eqx.Module):
 
 
 def eliminate(matrix: BandMatrix, moves: BandVector, scale: BandVector, tolerance: float) -> Elimination:
-    """Eliminate all groups over the coordinates that move.
+    """Eliminate all groups over the free coordinates.
 
     Args:
         matrix: `M`.
-        moves: one boolean column; False where a coordinate is held.
+        moves: one boolean column; False for fixed coordinates.
         scale: one positive column, the root of a diagonal.
-        tolerance: size of a balanced pivot below which nothing determines its direction.
+        tolerance: size of a balanced pivot below which its direction is undetermined.
 
     """
     unit = lambda size, moving: jnp.where(moving, size, 1.0)
@@ -89,11 +89,10 @@ def eliminate(matrix: BandMatrix, moves: BandVector, scale: BandVector, toleranc
 
 
 def solve_eliminated(found: Elimination, columns: BandVector) -> BandVector:
-    """`M^+ columns`; zero where pivots determine nothing.
+    """Return `M^+ columns`; zero along undetermined directions.
 
-    Groups are eliminated in their order, without a choice of pivots: of a saddle, a leading part may be almost singular
-    where the whole is not, which costs digits (five of a loop of 30 keyframes with 10 cm of drift). Steps of iterative
-    refinement bring them back (Higham 2002, chapter 12).
+    Groups are eliminated in order, without pivoting. At a saddle a leading part may be almost singular although the
+    whole matrix is not, which costs digits. Iterative refinement restores them (Higham 2002, chapter 12).
     """
     rhs = BandVector(columns.nodes / found.scale.nodes, columns.shared / found.scale.shared)
 
@@ -106,7 +105,7 @@ def solve_eliminated(found: Elimination, columns: BandVector) -> BandVector:
 
 
 def _times(matrix: BandMatrix, columns: BandVector) -> BandVector:
-    """`M columns`."""
+    """Return `M columns`."""
     diagonal, below = matrix.groups[:, 0], matrix.groups[:-1, 1]
     nodes = diagonal @ columns.nodes + matrix.border @ columns.shared
     nodes = nodes.at[1:].add(below @ columns.nodes[:-1]).at[:-1].add(jnp.swapaxes(below, 1, 2) @ columns.nodes[1:])
@@ -115,7 +114,7 @@ def _times(matrix: BandMatrix, columns: BandVector) -> BandVector:
 
 
 def _by_pivots(found: Elimination, columns: BandVector) -> BandVector:
-    """One pass over the groups forward and one back, in balanced units."""
+    """Return the solution by one forward and one backward pass over the groups, in balanced units."""
     nodes, shared = columns.nodes, columns.shared
     width = nodes.shape[1]
 
@@ -138,7 +137,7 @@ def _by_pivots(found: Elimination, columns: BandVector) -> BandVector:
 
 
 def selected_inverse(found: Elimination) -> tuple[SelectedInverse, SelectedInverse]:
-    """The inverse's blocks, and those of what grows without bound (zero where everything is determined)."""
+    """Return the blocks of the inverse, and those of its unbounded part (zero if everything is determined)."""
     width, shared = found.update.shape[1], len(found.corner)
 
     def recursion(pivots: Float[Array, "k w w"], corner: Float[Array, "q q"]) -> SelectedInverse:
@@ -159,7 +158,7 @@ def selected_inverse(found: Elimination) -> tuple[SelectedInverse, SelectedInver
 def _pseudo_inverse(
     matrix: Float[Array, "w w"], tolerance: float
 ) -> tuple[Float[Array, "w w"], Float[Array, "w w"], Int[Array, ""]]:
-    """Inverse of what has size, projector on the rest, and the dimension of the former."""
+    """Return the pseudo-inverse, the projector on its null space, and the rank."""
     values, vectors = jnp.linalg.eigh((matrix + matrix.T) / 2)
     kept = jnp.abs(values) > tolerance
     inverse = (vectors * jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)) @ vectors.T

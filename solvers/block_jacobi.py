@@ -1,4 +1,4 @@
-"""Diagonal blocks of the Schur complement: the cheapest preconditioner that knows about coordinates of one node."""
+"""Diagonal blocks of the Schur complement: a cheap preconditioner (Schur-Jacobi)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vggtgeo.solvers.flat_directions import at_least
 
 
 class DiagonalLayout(AbstractLayout):
-    """The blocks of the diagonal, `[n, b, b]`; others are left."""
+    """The blocks of the diagonal, `[n, b, b]`; others are dropped."""
 
     def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
         return jnp.zeros((nodes, block, block), dtype)
@@ -49,7 +49,7 @@ class JacobiBlocks(eqx.Module):
 
 
 def prepare_blocks(system: ArrowSystem) -> JacobiBlocks:
-    """Both sets of blocks."""
+    """Assemble both sets of blocks."""
     _, diagonal = dense_gradient(system)
     hessian = add_prior_blocks(assemble_edges(system, DiagonalLayout()), system, DiagonalLayout())
     schur = assemble_hosts(system, host_products(system), DiagonalLayout())
@@ -57,7 +57,7 @@ def prepare_blocks(system: ArrowSystem) -> JacobiBlocks:
 
 
 def invert_blocks(system: ArrowSystem, blocks: JacobiBlocks, damping: Float[Array, ""]) -> DiagonalBlocks:
-    """Inverses of the damped blocks; unit rows for held coordinates. NaN where not definite."""
+    """Return the inverses of the damped blocks; unit rows for fixed coordinates, NaN if not definite."""
     hosts, block = blocks.hessian.nodes.shape[:2]
     split = lambda values: (values[: hosts * block].reshape(hosts, block), values[hosts * block :])
     (free_nodes, free_shared), (nodes, shared) = split(system.free), split(damping * blocks.diagonal)
@@ -74,12 +74,12 @@ def invert_blocks(system: ArrowSystem, blocks: JacobiBlocks, damping: Float[Arra
 
 
 def apply_blocks(blocks: DiagonalBlocks, vector: Float[Array, " c"]) -> Float[Array, " c"]:
-    """Each block times its part of the vector."""
+    """Return each block times its part of the vector."""
     hosts, block = blocks.nodes.shape[:2]
     nodes = jnp.einsum("nab,nb->na", blocks.nodes, vector[: hosts * block].reshape(hosts, block))
     return jnp.concatenate([nodes.reshape(-1), blocks.shared @ vector[hosts * block :]])
 
 
 def _diagonal(blocks: Blocks) -> DiagonalBlocks:
-    """Without the border and the gradient."""
+    """Return the diagonal blocks without the border and the gradient."""
     return DiagonalBlocks(blocks.nodes, blocks.corner[:-1, :-1])

@@ -1,7 +1,7 @@
-"""A Schur complement of any graph as sparse blocks: those of an edge or a common host, and no others.
+"""A Schur complement of any graph as sparse blocks: only those of an edge or a common host.
 
 A host's landmarks couple it with its neighbours and these with each other, so a node has as many blocks in its row as
-there are nodes at most two edges away. Assembly costs what the edges and the hosts cost, whatever the size of the map.
+there are nodes at most two edges away. The cost of assembly is linear in edges and hosts.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vggtgeo.solvers.arrow import (
 
 
 class SparseLayout(AbstractLayout):
-    """The blocks that a graph may fill, row by row, `[p, b, b]`; others are left."""
+    """The blocks that a graph may fill, row by row, `[p, b, b]`; others are dropped."""
 
     place: Int[Array, " p"]
     """`row * nodes + column` of each block, ascending."""
@@ -50,7 +50,7 @@ class SparseLayout(AbstractLayout):
 
 
 def sparse_layout(system: ArrowSystem) -> SparseLayout:
-    """The layout that holds all that `system` couples; outside `jit`. Needs integers that hold the square of `n`."""
+    """Return the layout of all coupled pairs of `system`; outside `jit`. Integers must be able to represent `n^2`."""
     nodes = system.num_nodes
     around = np.concatenate([np.asarray(system.neighbours()), np.asarray(system.graph.host_of_row)[:, None]], 1)
     pairs = [tuple(np.broadcast_arrays(around[:, :, None], around[:, None, :]))]
@@ -63,9 +63,9 @@ def sparse_layout(system: ArrowSystem) -> SparseLayout:
 
 
 def reduced_blocks(system: ArrowSystem, layout: SparseLayout) -> Blocks:
-    """The Schur complement `H - W V^-1 W'`, with the reduced gradient as the last shared coordinate.
+    """Return the Schur complement `H - W V^-1 W'`, with the reduced gradient as the last shared coordinate.
 
-    The prior must be one on the shared coordinates: one that couples all nodes has no sparse blocks.
+    The prior must be on the shared coordinates only: one that couples all nodes is not sparse.
     """
     hessian = add_prior_blocks(assemble_edges(system, layout), system, layout)
     schur = assemble_hosts(system, host_products(system), layout)

@@ -1,8 +1,8 @@
-"""Reduced system by preconditioned conjugate gradients: no matrix over all nodes is ever formed.
+"""Preconditioned conjugate gradients for the reduced system, without a matrix over all nodes.
 
 The damped Schur complement is applied as `S x = H x + l D x - W V^-1 W' x / (1 + l)`: `H` edge by edge, the rest host
-by host. Cost of a product: linear in the edges. The iteration stops where the residual, in the norm of the
-preconditioner, has fallen by the forcing term of an inexact Newton method (Dembo, Eisenstat and Steihaug 1982).
+by host. The cost of a product is linear in the edges. The iteration stops when the residual, in the norm of the
+preconditioner, has decreased by the forcing term of an inexact Newton method (Dembo, Eisenstat and Steihaug 1982).
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ Prepared = TypeVar("Prepared")
 
 
 class AbstractProduct(eqx.Module):
-    """How `W V^-1 W'` is applied: one way a class."""
+    """Application of `W V^-1 W'`; each subclass is one method."""
 
     @abc.abstractmethod
     def prepare(self, system: ArrowSystem) -> Array:
-        """Work shared by all products at one linearisation."""
+        """Compute the part shared by all products at one linearisation."""
 
     @abc.abstractmethod
     def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
-        """`W V^-1 W' dense`."""
+        """Return `W V^-1 W' dense`."""
 
 
 class HostProduct(AbstractProduct):
-    """Through one matrix `[b k + q, b k + q]` a host, formed once: pays from about five products on."""
+    """Use one matrix `[b k + q, b k + q]` for each host, formed once: faster from about five products."""
 
     def prepare(self, system: ArrowSystem) -> Array:
         return host_products(system)
@@ -67,11 +67,11 @@ class AbstractPreconditioner(eqx.Module, Generic[Prepared]):
 
     @abc.abstractmethod
     def prepare(self, system: ArrowSystem) -> Prepared:
-        """Work shared by all dampings."""
+        """Compute the part shared by all dampings."""
 
     @abc.abstractmethod
     def inverse(self, system: ArrowSystem, prepared: Prepared, damping: Float[Array, ""]) -> Apply:
-        """The approximate inverse at one damping; held coordinates pass through."""
+        """Return the approximate inverse at one damping; fixed coordinates are passed through."""
 
 
 class BlockJacobi(AbstractPreconditioner[JacobiBlocks]):
@@ -86,7 +86,7 @@ class BlockJacobi(AbstractPreconditioner[JacobiBlocks]):
 
 
 class BandPreconditioner(AbstractPreconditioner[Bands]):
-    """Block-banded Cholesky of what edges of a reach up to `reach` couple: exact but for the longer edges."""
+    """Block-banded Cholesky for the edges of a reach of at most `reach`; longer edges are approximated."""
 
     reach: int = eqx.field(static=True)
 
@@ -104,7 +104,7 @@ class BandPreconditioner(AbstractPreconditioner[Bands]):
 
 
 class IterativeFactor(AbstractFactor):
-    """By minimum residuals: products with the exact Hessian, a preconditioner made from a definite one."""
+    """Minimum residuals: products with the exact Hessian, and a preconditioner from a definite one."""
 
     solver: ConjugateGradients
     product: Array
@@ -119,7 +119,7 @@ class IterativeFactor(AbstractFactor):
         return found.solution, found.converged
 
     def solved(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> MinresSolved:
-        """The same, and how it was found."""
+        """Return the solution with the status of the iteration."""
         gauge, zero = free_gauge(system), jnp.zeros((), rhs.dtype)
 
         def apply(dense: Array) -> Array:
@@ -133,7 +133,7 @@ class IterativeFactor(AbstractFactor):
 
 
 _LIFT = 1e-8
-"""Damping of a preconditioner of undamped systems: what nothing determines must not stop its factorisation."""
+"""Damping of the preconditioner of undamped systems, so that it is definite despite undetermined directions."""
 
 
 class _Prepared(eqx.Module):
@@ -146,15 +146,15 @@ class _Prepared(eqx.Module):
 
 
 class ConjugateGradients(AbstractReducedSolver[_Prepared]):
-    """Inexact Newton steps by preconditioned conjugate gradients; right for thousands of nodes and any graph."""
+    """Inexact Newton steps by preconditioned conjugate gradients, for thousands of nodes and any graph."""
 
     preconditioner: AbstractPreconditioner = BlockJacobi()
     product: AbstractProduct = HostProduct()
     rtol: float = 1e-2
-    """Largest forcing term: fall of the residual that ends the iteration."""
+    """Largest forcing term: relative residual that ends the iteration."""
     max_iterations: int = eqx.field(static=True, default=200)
     exact_rtol: float = 1e-12
-    """Fall of the residual that ends a solve for a derivative or a covariance."""
+    """Relative residual that ends a solve for a derivative or a covariance."""
     exact_iterations: int = eqx.field(static=True, default=2000)
 
     def prepare(self, system: ArrowSystem) -> _Prepared:
@@ -176,7 +176,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         landmarks = back_substitute(system, solved.solution) / (1 + damping)
         step = ArrowVector(solved.solution, landmarks)
         predicted = predicted_decrease(system, prepared.gradient, prepared.diagonal, step, damping)
-        # The formula is that of the exact minimiser; the residual of an inexact one corrects it.
+        # The formula is that of the exact minimiser; the residual term corrects for an inexact one.
         return step, predicted + solved.solution @ solved.residual / 2
 
     def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> IterativeFactor:
@@ -184,7 +184,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         return IterativeFactor(self, product, preconditioner, flat_stiffness(system))
 
     def inverse(self, system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
-        """Column by column, host after host: ask for few of them. All that converges counts as determined."""
+        """Compute the inverse column by column, host by host, so for few hosts; converged columns are determined."""
         factor = self.factor(system, lambda: system)
         gauge = free_gauge(system)
         along = jax.vmap(lambda column: factor.solve(system, column), 1, 1)(gauge)
@@ -207,7 +207,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         )
 
     def solve(self, system: ArrowSystem, prepared: _Prepared, damping: Float[Array, ""]) -> Solved:
-        """The dense part of the step, and how it was found."""
+        """Return the dense part of the step, with residual and number of iterations."""
         shrink, gauge = 1 / (1 + damping), free_gauge(system)
 
         def apply(dense: Array) -> Array:
@@ -221,7 +221,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
 
 
 class Solved(NamedTuple):
-    """Outcome of `conjugate_gradients`."""
+    """Result of `conjugate_gradients`."""
 
     solution: Float[Array, " c"]
     residual: Float[Array, " c"]
@@ -241,8 +241,8 @@ def conjugate_gradients(
 ) -> Solved:
     """Solve `A x = rhs` from zero until `sqrt(r' P r)` falls below the forcing term times its first value.
 
-    The forcing term is `min(rtol, sqrt(r0' P r0))`: residuals are in units of their standard deviation, so near the
-    optimum, where the whole decrease to be had is a fraction of one, steps become as exact as they matter.
+    The forcing term is `min(rtol, sqrt(r0' P r0))`: residuals are in standard deviations, so near the optimum, where
+    the remaining decrease is a fraction of one, steps become more accurate.
     """
     first = inverse(rhs)
     start = rhs @ first
@@ -263,6 +263,6 @@ def conjugate_gradients(
         return _Loop(solution, residual, direction, squared, loop.iterations + 1)
 
     last = jax.lax.while_loop(go_on, body, _Loop(jnp.zeros_like(rhs), rhs, first, start, jnp.asarray(0)))
-    # A preconditioner that is not definite (NaN) must not pass for a zero step.
+    # A preconditioner that is not definite (NaN) must not result in a zero step.
     solution = jnp.where(jnp.isfinite(last.squared), last.solution, jnp.nan)
     return Solved(solution, last.residual, last.iterations)

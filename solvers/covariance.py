@@ -1,16 +1,16 @@
-"""Covariance of the unknowns of an arrow system: the inverse of its matrix, only where somebody looks.
+"""Covariance of the unknowns of an arrow system: the required blocks of the inverse of its matrix.
 
 With `S = H - W V^-1 W'` and residuals of unit variance, the inverse of the whole matrix has the blocks
 
     dense       S^-1                                    around each host: `local_inverse.py`
     landmarks   V^-1 + V^-1 W' S^-1 W V^-1              the diagonal only: [n, s]
 
-and the second needs, per host, the covariance of its own relative coordinates `(eta of each rank, shared)`, which is
+and the second needs, per host, the covariance of its relative coordinates `(eta of each edge, shared)`, which is
 `J S^-1 J'` with small `J`, and one product of that with the host's cross terms: `r^2 s` operations a host, as `reduce`.
 
-How the blocks of `S^-1` are found is the linear solver's affair: by eigenvectors of the dense matrix, by a selected
-inverse of the band, or column by column. A coordinate with a part along an undetermined direction, and a landmark
-coupled to one, have infinite variance.
+The linear solver computes the blocks of `S^-1`: by eigenvectors of the dense matrix, by a selected inverse of the band,
+or column by column. A coordinate with a component along an undetermined direction, and a landmark coupled to one, have
+infinite variance.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 class ArrowCovariance(eqx.Module):
     """Marginal covariances around `h` rows of landmarks; never NaN.
 
-    Zero where held; infinite variance and zero covariance where undetermined.
+    Fixed coordinates have zero, undetermined ones infinite variance and zero covariance.
     """
 
     nodes: Float[Array, "h b b"]
     """Of the node that hosts each row."""
     neighbours: Float[Array, "h k b b"]
-    """Of that node with the target of the row's edge of each rank; zero where there is no edge."""
+    """Cross covariance of that node with the target of each edge of the row; zero for a missing edge."""
     shared: Float[Array, "q q"]
     landmarks: Float[Array, "h s"]
     """Variances."""
     rank: Int[Array, ""]
-    """Number of unknowns that the system determines, all landmarks included, flat gauge directions not."""
+    """Number of determined unknowns, including all landmarks, without flat gauge directions."""
 
 
 def covariance(
     system: ArrowSystem, solver: AbstractReducedSolver | None = None, rows: Int[Array, " h"] | None = None
 ) -> ArrowCovariance:
-    """Inverse of the system's matrix over the free coordinates; the matrix must be positive semidefinite.
+    """Compute the inverse of the system's matrix over the free coordinates; it must be positive semidefinite.
 
-    solver: whose structure inverts; None = dense. rows: which rows of landmarks; None = all.
+    solver: linear solver that inverts; None = dense. rows: rows of landmarks; None = all.
     """
     rows = jnp.arange(len(system.graph.of_host)) if rows is None else rows
     found = (DenseCholesky() if solver is None else solver).inverse(system, rows)
@@ -66,10 +66,10 @@ def covariance(
 
 
 def _landmarks(system: ArrowSystem, found: LocalInverse, rows: Int[Array, " h"]) -> Float[Array, "h s"]:
-    """`V^-1 + V^-1 W' S^-1 W V^-1`, its diagonal."""
+    """Return the diagonal of `V^-1 + V^-1 W' S^-1 W V^-1`."""
     hessian_inverse, basis = inverse_landmark_hessian(system)[rows], jax.tree.map(lambda leaf: leaf[rows], system.basis)
     cross = restricted(basis.triples, system.cross[rows, :-2])
-    # In this order: the square of a large inverse overflows, its product with the coupling does not.
+    # In this order, since the square of a large inverse may overflow, but its product with the coupling does not.
     pulled = expand(basis, hessian_inverse[:, None] * cross)
     spread = lambda local, side: jnp.einsum("nrs,nrt,nts->ns", side, to_relative(system, rows, local), side)
     variance = expand_variance(basis, hessian_inverse) + spread(found.covariance, pulled)
@@ -80,7 +80,7 @@ def _landmarks(system: ArrowSystem, found: LocalInverse, rows: Int[Array, " h"])
 
 
 def _marked(local: Float[Array, "h l l"], undetermined: Bool[Array, "h l"]) -> Float[Array, "h l l"]:
-    """Infinite variance and zero covariance of what is undetermined."""
+    """Set infinite variance and zero covariance for undetermined coordinates."""
     either = undetermined[:, :, None] | undetermined[:, None, :]
     added = jnp.where(undetermined, jnp.inf, 0.0).astype(local.dtype)
     return jnp.where(either, 0.0, local) + jax.vmap(jnp.diag)(added)

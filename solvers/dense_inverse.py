@@ -1,11 +1,11 @@
 """The inverse of a Schur complement as one dense matrix: `c^3` operations.
 
-The matrix is balanced by `diag(H)` (an eigenvalue is then the share of information that is left after everything else
-is estimated too). Directions below `rank_tolerance` are undetermined; the others have the pseudo-inverse, by
-eigenvectors. Where the Cholesky factor's inverse `C` shows that there are none (`1 / |C|` is no more than the smallest
-eigenvalue), it is taken, which takes less time. Along a flat gauge direction `a` the covariance is that of the solution
-held there, `a' x = 0`: `C - C a (a' C a)^-1 a' C`. See Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999,
-section 9.
+The matrix is balanced by `diag(H)` (an eigenvalue is then the share of information that is left when everything else is
+estimated too). Directions below `rank_tolerance` are undetermined; the others have the pseudo-inverse, by eigenvectors.
+If the inverse `C` from the Cholesky factor shows that all directions are determined (`1 / |C|` is a lower bound of the
+smallest eigenvalue), it is used instead, which is faster. Along a flat gauge direction `a` the covariance is
+conditional on `a' x = 0`: `C - C a (a' C a)^-1 a' C`. See Triggs et al., "Bundle Adjustment - A Modern Synthesis",
+1999, section 9.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vggtgeo.solvers.local_inverse import LocalInverse, balance, local_coordinat
 
 
 def dense_inverse(system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
-    """The inverse over the free coordinates, held along flat gauge directions; NaN nowhere."""
+    """Return the inverse over the free coordinates, conditional on flat gauge directions; without NaN."""
     free, reduced = system.free, reduce(system)
     scale = balance(system, jnp.diagonal(reduced.hessian))
     stiffness, directions = gauge_stiffness(system, reduced), free_gauge(system)
@@ -44,11 +44,11 @@ def dense_inverse(system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
 
 @jax.custom_jvp
 def _pseudo_inverse(balanced: Float[Array, "c c"]) -> tuple[Float[Array, "c c"], Float[Array, "c c"]]:
-    """The inverse `P` along directions that are determined, and the projector `N` on the others."""
+    """Return the inverse `P` along determined directions, and the projector `N` on the others."""
     tolerance = rank_tolerance(len(balanced), balanced.dtype)
     factor = jnp.linalg.cholesky(balanced)
     whole = jsp.linalg.cho_solve((factor, True), jnp.eye(len(balanced), dtype=balanced.dtype))
-    # No NaN passes the comparison.
+    # The comparison is False for NaN.
     return jax.lax.cond(
         jnp.linalg.norm(whole) * tolerance < 1,
         lambda: (whole, jnp.zeros_like(whole)),
@@ -58,7 +58,9 @@ def _pseudo_inverse(balanced: Float[Array, "c c"]) -> tuple[Float[Array, "c c"],
 
 @_pseudo_inverse.defjvp
 def _pseudo_inverse_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Any, Any]:
-    """At constant rank, `dN = -(P dA N + N dA P)` and `dP = -P dA P + P^2 dA N + N dA P^2` (Golub and Pereyra 1973).
+    """Differentiate at constant rank: `dN = -(P dA N + N dA P)`, `dP = -P dA P + P^2 dA N + N dA P^2`.
+
+    Source: Golub and Pereyra 1973.
 
     The eigenvectors of the many equal eigenvalues of a singular matrix have no derivative, nor has its factor.
     """
@@ -81,7 +83,7 @@ def _by_eigenvectors(
 def _hold(
     matrix: Float[Array, "c c"], direction: Float[Array, " c"], stiffness: Float[Array, ""]
 ) -> Float[Array, "c c"]:
-    """The covariance given `direction' x = 0`, where there is stiffness along it."""
+    """Return the covariance conditional on `direction' x = 0`, if there is stiffness along it."""
     along = matrix @ direction
     size = direction @ along
     flat = (stiffness > 0) & (size > 0)

@@ -1,4 +1,4 @@
-"""An exact Hessian, definite or not, ready to be solved: what a Newton step and a derivative of the optimum need."""
+"""An exact Hessian, definite or not, and its factor, for a Newton step and a derivative of the optimum."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, Dense
 
 
 class ExactModel(eqx.Module):
-    """A Hessian, definite or not, and its Schur complement `S` over the free coordinates, ready to be solved."""
+    """A Hessian, definite or not, with the factor of its Schur complement `S` over the free coordinates."""
 
     system: ArrowSystem
     factor: AbstractFactor
     diagonal: Float[Array, " c"]
 
     def solve(self, vector: ArrowVector) -> ArrowVector:
-        """`H^-1 vector` over the free coordinates; zero where held, undetermined or lost.
+        """Return `H^-1 vector` over the free coordinates; zero for fixed or undetermined ones, or if not finite.
 
         `S x = v_c - W V^-1 v_d`, `z = V^-1 (v_d - W' x)`, with a stiffness added along flat gauge directions.
         """
         return self.checked(vector)[0]
 
     def checked(self, vector: ArrowVector) -> tuple[ArrowVector, Bool[Array, ""]]:
-        """The same, and whether it was found: an iteration may end before."""
+        """Return the solution of `solve`, and whether an iterative solver has converged."""
         inverse = inverse_landmark_hessian(self.system)
         rest = vector.dense - carry_to_nodes(self.system, inverse * vector.landmarks)
         dense, found = self.factor.checked(self.system, rest)
@@ -42,13 +42,13 @@ class ExactModel(eqx.Module):
         return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0))), found
 
     def largest(self, gradient: ArrowVector) -> Float[Array, ""]:
-        """Largest entry of a gradient, in units of the root of its own curvature."""
+        """Return the largest entry of a gradient, each scaled by the root of its curvature."""
         landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
         dense = jnp.max(gradient.dense**2 / self.diagonal, initial=0.0)
         return jnp.sqrt(jnp.maximum(dense, jnp.max(landmarks, initial=0.0)))
 
     def size(self, gradient: ArrowVector) -> Float[Array, ""]:
-        """Squared norm of a gradient, each entry in units of its own curvature."""
+        """Return the squared norm of a gradient, each squared entry divided by its curvature."""
         landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
         return jnp.sum(gradient.dense**2 / self.diagonal) + jnp.sum(landmarks)
 
@@ -58,9 +58,9 @@ def exact_model(
     solver: AbstractReducedSolver | None = None,
     definite: Callable[[], ArrowSystem] | None = None,
 ) -> ExactModel:
-    """The model of an exact Hessian, with the linear algebra of `solver`; None = dense.
+    """Return the model of an exact Hessian, with the linear algebra of `solver`; None = dense.
 
-    definite: makes a system with a positive Hessian nearby; None = this one has.
+    definite: returns a nearby system with a positive Hessian; None = `system` is positive.
     """
     solver = DenseCholesky() if solver is None else solver
     factor = solver.factor(system, (lambda: system) if definite is None else definite)

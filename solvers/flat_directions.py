@@ -1,4 +1,4 @@
-"""Directions along which the energy is flat for a known reason, and how they are held."""
+"""Known flat directions of the energy (gauge), and the stiffness that fixes them."""
 
 from __future__ import annotations
 
@@ -18,24 +18,26 @@ from vggtgeo.solvers.arrow import (
 from vggtgeo.solvers.local_inverse import rank_tolerance
 
 MIN_DIAGONAL = 1e-6
-"""Least curvature that damping and scaling assume of a coordinate, where the largest is 1 or more."""
+"""Minimum curvature of a coordinate for damping and scaling, if the largest curvature is 1 or more."""
 
 
 def at_least(diagonal: Float[Array, " c"]) -> Float[Array, " c"]:
-    """The diagonal of a Hessian, no smaller than the least curvature; that shrinks with the largest, so that a tiny
-    factor on all weights does not change what the damping is in proportion.
+    """Return the diagonal of a Hessian with a lower bound, `MIN_DIAGONAL`.
+
+    The bound scales with the largest entry below 1, so that a small factor on all weights does not change the relative
+    damping.
     """
     largest = jnp.max(diagonal, initial=0.0)
     return jnp.maximum(diagonal, MIN_DIAGONAL * jnp.where(largest > 0, jnp.minimum(largest, 1.0), 1.0))
 
 
 def free_gauge(system: ArrowSystem) -> Float[Array, "c g"]:
-    """The gauge directions over the free coordinates."""
+    """Return the gauge directions over the free coordinates."""
     return jnp.where(system.free[:, None], system.gauge, 0.0)
 
 
 def gauge_stiffness(system: ArrowSystem, reduced: Reduced) -> Float[Array, " g"]:
-    """Stiffness to add along each gauge direction: zero where the energy curves along it, else as in `_where_flat`."""
+    """Return the stiffness to add along each gauge direction: zero if the energy is curved, else see `_where_flat`."""
     directions = free_gauge(system)
     quadratic = lambda matrix: jnp.einsum("cg,cd,dg->g", directions, matrix, directions)
     return _where_flat(
@@ -46,8 +48,9 @@ def gauge_stiffness(system: ArrowSystem, reduced: Reduced) -> Float[Array, " g"]
 
 
 def flat_stiffness(system: ArrowSystem) -> Float[Array, " g"]:
-    """The stiffness of `gauge_stiffness`, from one product of the system with each gauge direction:
-    `d' H d - d' W V^-1 W' d` against `d' H d`.
+    """Return the stiffness of `gauge_stiffness`, from one product of the system with each gauge direction.
+
+    It compares `d' H d - d' W V^-1 W' d` with `d' H d`.
     """
     inverse, directions = inverse_landmark_hessian(system), free_gauge(system)
 
@@ -60,11 +63,11 @@ def flat_stiffness(system: ArrowSystem) -> Float[Array, " g"]:
 
 
 def _where_flat(whole: Float[Array, " g"], left: Float[Array, " g"], size: Float[Array, " g"]) -> Float[Array, " g"]:
-    """A direction is flat where elimination of the landmarks takes all but `sqrt(eps)` of its curvature away; then it
-    is held by the stiffness that was there, rather than left to the damping.
+    """Return the stiffness of flat directions, zero for others.
 
-    Without landmarks on it, the Hessian itself has no curvature along a free scale: all of `d' H d` is then rounding
-    error of the curvatures `size = d' diag(H) d` of its coordinates, which take its place.
+    A direction is flat if elimination of the landmarks leaves less than `sqrt(eps)` of its curvature. It then gets the
+    stiffness before the elimination. Without landmarks the Hessian has no curvature along a free scale: `d' H d` is
+    then rounding error of the curvatures `size = d' diag(H) d` of its coordinates, which are used instead.
     """
     curved = jnp.abs(whole) > rank_tolerance(1, whole.dtype) * size
     reference = jnp.where(curved, whole, size)
@@ -72,10 +75,10 @@ def _where_flat(whole: Float[Array, " g"], left: Float[Array, " g"], size: Float
 
 
 def pins(system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Array, " c"]) -> Float[Array, "c g"]:
-    """Stiffness on one coordinate a flat direction, the one that moves most along it.
+    """Return the stiffness on one coordinate for each flat direction, the one with the largest component.
 
-    It removes the flatness while a banded matrix stays banded. Columns hold that stiffness at the pinned coordinate;
-    they are zero where nothing is flat.
+    It removes the flatness while a banded matrix stays banded. Columns have that stiffness at the pinned coordinate;
+    they are zero for directions that are not flat.
     """
     at = jnp.argmax(jnp.abs(free_gauge(system)), axis=0)
     pinned = jnp.zeros_like(system.gauge).at[at, jnp.arange(len(at))].set(1.0)
@@ -85,7 +88,8 @@ def pins(system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Arr
 def pinned_update(
     system: ArrowSystem, stiffness: Float[Array, " g"], diagonal: Float[Array, " c"]
 ) -> tuple[Float[Array, "c u"], Float[Array, " u"]]:
-    """`U, D` with `B + U D U'` the matrix that the gauge's own stiffness holds, where `B` is the pinned one:
+    """Return `U, D` such that `B + U D U'` has the gauge's stiffness, where `B` is the pinned matrix.
+
     `U = [G, P]` and `D = diag(K, -stiffness of pins)`.
     """
     pinned = pins(system, stiffness, diagonal)
@@ -99,11 +103,11 @@ def solve_pinned(
     inverse: Callable[[Array], Array],
     rhs: Float[Array, " c"],
 ) -> Float[Array, " c"]:
-    """Solve with `B + U D U'` (the identity of Woodbury).
+    """Solve with `B + U D U'` by the Woodbury identity.
 
     Args:
-        updates: `U`, and
-        weights: the diagonal of `D`, as `pinned_update` gives them.
+        updates: `U` of `pinned_update`.
+        weights: the diagonal of `D` of `pinned_update`.
         inverse: `B^-1` times columns `[c, m]`.
         rhs: right-hand side.
 

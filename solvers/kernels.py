@@ -1,10 +1,10 @@
 """Robust kernels `rho(s)` of a squared, weighted residual norm `s`; the energy of a residual is `rho(s) / 2`.
 
-`s = w |r|^2` is whitened where a weight is 1 / variance: then the width of a kernel counts in standard deviations.
+`s = w |r|^2` is whitened if a weight is 1 / variance: then the width of a kernel is in standard deviations.
 
-A kernel is normalised so that `rho(0) = 0` and `rho'(0) = 1`: near zero every kernel is the plain square. A kernel of
-your own needs `rho` alone; its derivatives are derived.
-References: Huber 1964; Black & Anandan 1996; Barron, "A General and Adaptive Robust Loss Function", CVPR 2019.
+A kernel is normalised so that `rho(0) = 0` and `rho'(0) = 1`: near zero every kernel is quadratic. A user-defined
+kernel needs only `rho`; its derivatives are automatic. References: Huber 1964; Black & Anandan 1996; Barron, "A General
+and Adaptive Robust Loss Function", CVPR 2019.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ Values = Float[Array, "*n"]
 
 
 def _number(given: Any) -> Array:
-    """One real number as an array; a traced one is taken as it is. ValueError for anything else."""
+    """Return one real number as an array, a traced one unchanged; raise ValueError for anything else."""
     if isinstance(given, jax.Array):
         return given
     found = np.asarray(given)
     if found.ndim or found.dtype.kind not in "iuf":
-        raise ValueError(f"the kernel's number is {given!r:.60}; expected a real number, as in `Huber(1.5)`")
+        raise ValueError(f"parameters of a kernel must be real numbers, as in `Huber(1.5)`, got {given!r:.60}")
     return jnp.asarray(given)
 
 
 class AbstractKernel(eqx.Module):
     """A robust kernel; `s = w |r|^2` is the squared norm of the weighted residual, any shape, `s >= 0`.
 
-    The width `delta` of a kernel acts on `sqrt(w) |r|`. Where weights are `1 / sigma^2`, that is a number of standard
-    deviations: `Huber(1.5)` is quadratic up to 1.5 sigma. Only for weights of 1 is it in the residual's own unit.
+    The width `delta` of a kernel applies to `sqrt(w) |r|`. If weights are `1 / sigma^2`, it is in standard deviations:
+    `Huber(1.5)` is quadratic up to 1.5 sigma. Only for weights of 1 is it in the unit of the residual.
 
     Fields:
 
-    Example: a kernel of one's own, for small residuals the square.
+    Example: a user-defined kernel, quadratic for small residuals.
         >>> class Welsch(vg.kernels.AbstractKernel):
         ...     def rho(self, s):
         ...         return 1 - jax.numpy.exp(-s)
@@ -50,21 +50,21 @@ class AbstractKernel(eqx.Module):
 
     @abc.abstractmethod
     def rho(self, s: Values) -> Values:
-        """The kernel's value, same shape and unit as `s`."""
+        """Return the kernel's value, same shape and unit as `s`."""
 
     def weight(self, s: Values) -> Values:
-        """The first derivative `rho'(s)`: the factor by which iteratively reweighted least squares scales `s`.
+        """Return the first derivative `rho'(s)`: the factor by which iteratively reweighted least squares scales `s`.
 
-        Derived from `rho`; a kernel may override it with a formula.
+        Derived from `rho` automatically; a kernel may override it with a formula.
         """
         return jax.jvp(self.rho, (s,), (jnp.ones_like(s),))[1]
 
     def curvature(self, s: Values) -> Values:
-        """The second derivative `rho''(s)`, never positive for the kernels of this file. Derived, like `weight`."""
+        """Return the second derivative `rho''(s)`, not positive for the kernels of this file; derived from `rho`."""
         return jax.jvp(self.weight, (s,), (jnp.ones_like(s),))[1]
 
     def widened(self, factor: Float[Array, ""]) -> Self:
-        """The kernel whose width `delta` is `factor` times as large; a kernel without a width stays as it is."""
+        """Return the kernel whose width `delta` is `factor` times as large; a kernel without a width stays as it is."""
         if not hasattr(self, "delta"):
             return self
         return eqx.tree_at(lambda kernel: kernel.delta, self, self.delta * factor)
@@ -92,7 +92,7 @@ class Square(AbstractKernel):
 
 
 class Huber(AbstractKernel):
-    """`rho(s) = s` up to `delta^2`, then `2 delta sqrt(s) - delta^2`: outliers pull with a constant force.
+    """`rho(s) = s` up to `delta^2`, then `2 delta sqrt(s) - delta^2`: the force of outliers is constant.
 
     Fields:
         delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
@@ -106,7 +106,7 @@ class Huber(AbstractKernel):
     delta: Float[Array, ""] = eqx.field(converter=_number, default=1.5)
 
     def _root(self, s: Values) -> tuple[Bool[Array, "*n"], Values]:
-        """`sqrt(s)`, made safe below `delta` so that neither branch of `where` makes a NaN gradient."""
+        """Return `sqrt(s)`, safe below `delta`, so that neither branch of `where` has a NaN gradient."""
         beyond = s > self.delta**2
         return beyond, jnp.sqrt(jnp.where(beyond, s, 1.0))
 
@@ -124,7 +124,7 @@ class Huber(AbstractKernel):
 
 
 class Cauchy(AbstractKernel):
-    """`rho(s) = delta^2 log(1 + s / delta^2)`: the pull of an outlier falls with its distance.
+    """`rho(s) = delta^2 log(1 + s / delta^2)`: the force of an outlier decreases with its distance.
 
     Fields:
         delta: width, > 0, of `sqrt(w) |r|`: standard deviations where weights are 1 / variance.
@@ -197,7 +197,7 @@ class Barron(AbstractKernel):
 
     def rho(self, s: Values) -> Values:
         breadth, _ = self._base(s)
-        # Not `base ** (alpha / 2) - 1`, which loses all digits of a small `s`.
+        # `base ** (alpha / 2) - 1` would lose all digits for a small `s`.
         return 2 * breadth / self.alpha * jnp.expm1(self.alpha / 2 * jnp.log1p(s / breadth))
 
     def weight(self, s: Values) -> Values:

@@ -1,7 +1,7 @@
-"""From the landmarks of a problem to the coordinates in which a system holds them as independent scalars, and back.
+"""Change of basis between the landmarks of a problem and the independent scalar landmarks of a system.
 
-Two changes of basis, each about landmarks of its own: those of three unknowns (`triples.py`), the first of a host, and
-those on straight segments (`segments.py`), the last.
+Two changes of basis for disjoint landmarks: those of three unknowns (`triples.py`), the first of a host, and those on
+straight segments (`segments.py`), the last.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from vggtgeo.solvers.arrow import ArrowSystem, LandmarkBasis
 
 
 def join_landmarks(system: ArrowSystem, fraction: Float[Array, "n m q"] | None) -> ArrowSystem:
-    """The system with scalar landmarks alone: triples and, where there is a `fraction`, segments in their basis."""
+    """Return the system with scalar landmarks only: triples and, if `fraction` is given, segments in their basis."""
     system = join_triples(system)
     return system if fraction is None else segments.join_segments(system, fraction)
 
 
 def join_triples(system: ArrowSystem) -> ArrowSystem:
-    """The system in coordinates in which the blocks of its triples are diagonal."""
+    """Return the system in coordinates in which the blocks of its triples are diagonal."""
     if system.blocks is None:
         return system
     factors = triples.factor_triples(system.blocks, system.cross[:, -1])
@@ -27,21 +27,21 @@ def join_triples(system: ArrowSystem) -> ArrowSystem:
 
 
 def expand(basis: LandmarkBasis, landmarks: Float[Array, "n *rows s"]) -> Float[Array, "n *rows z"]:
-    """A step of the system's landmarks as one of the problem's."""
+    """Return a step of the system's landmarks as one of the problem's."""
     if basis.segments is not None:
         landmarks = segments.expand_segments(basis.segments, landmarks)
     return landmarks if basis.triples is None else triples.expand_triples(basis.triples, landmarks)
 
 
 def expand_variance(basis: LandmarkBasis, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
-    """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
+    """Return variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
     if basis.segments is not None:
         variance = segments.expand_segments_variance(basis.segments, variance)
     return variance if basis.triples is None else triples.expand_triples_variance(basis.triples, variance)
 
 
 def restrict(basis: LandmarkBasis, gradient: Float[Array, "n z"]) -> Float[Array, "n s"]:
-    """The transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
+    """Return the transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
     if basis.segments is not None:
         gradient = segments.restrict_segments(basis.segments, gradient)
     return gradient if basis.triples is None else triples.restrict_triples(basis.triples, gradient)

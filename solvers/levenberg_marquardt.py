@@ -1,13 +1,14 @@
 """Levenberg-Marquardt for arrow-shaped problems, as an optimistix least-squares solver.
 
-An optimistix step linearises once, then tries dampings until one is accepted: a rejected try costs one factorisation
-of the reduced system, one back-substitution and one energy, never a linearisation. `iterations` counts the tries, as
-Ceres counts its iterations. Damping follows the gain ratio (Nielsen 1999; the rule and constants of Ceres).
+An optimistix step linearises once, then tries dampings until a step is accepted. A rejected step costs one
+factorisation of the reduced system, one back-substitution and one energy, but no linearisation. `iterations` counts all
+tried steps, as in Ceres. The damping follows the gain ratio (Nielsen 1999; rule and constants of Ceres).
 
-Reweighting takes the curvature of a robust kernel along a residual for the larger one across it, so where outliers
-lead, steps keep twice what they promise and the energy creeps down. The whole second-order correction (Triggs et al.
-1999, section 4.3) promises too much far from the optimum. So the part of it that is applied follows the gain ratio too:
-it grows while steps keep their promise and is halved when one does not. `benchmarks/robustness.py` compares the three.
+Reweighting overestimates the curvature of a robust kernel along a residual, so with many outliers the actual decrease
+is about twice the predicted one and convergence is slow. The full second-order correction (Triggs et al. 1999, section
+4.3) predicts too large a decrease far from the optimum. The applied part of the correction therefore also follows the
+gain ratio: it grows while the model predicts well, and is halved otherwise. `benchmarks/robustness.py` compares the
+three.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 
 class Termination(eqx.Enumeration):
-    """Why the iteration ended; the message says what to do."""
+    """Reason for the end of the iteration, with a message that states the remedy."""
 
     running = "The iteration has not ended."
     energy_converged = "Converged: the last accepted step lowered the energy by less than `rtol`, relatively."
@@ -61,39 +62,39 @@ _NUMBERS = {
     **dict.fromkeys(("rtol", "atol", "initial_damping", "max_damping", "min_damping"), sys.float_info.max),
     "max_correction": 1.0,
 }
-"""Fields of the solver that are numbers, and how large each may be."""
+"""Numeric fields of the solver and their maximum values."""
 CONVERGED = (Termination.energy_converged, Termination.gradient_converged, Termination.step_converged)
 
 
 _CODES: Any = Termination
-"""The same class; to a type checker its members would be the messages."""
+"""The same class: a type checker would infer the members as messages."""
 
 
 def termination_message(termination: Termination) -> str:
-    """Why the iteration ended and what to do, of a concrete code."""
+    """Return the message of a concrete code: why the iteration ended, and the remedy."""
     message: str = _CODES[termination]
     return message
 
 
 def termination_name(termination: Termination) -> str:
-    """Name of a concrete code, as `energy_converged`."""
+    """Return the name of a concrete code, such as `energy_converged`."""
     return next(name for name, code in Termination._name_to_item.items() if termination == code)
 
 
 class IterationRecord(eqx.Module):
-    """What each try did, row i try i; row 0 is the start, and rows beyond the last try hold NaN."""
+    """Data of each tried step, row i for step i; row 0 is the initial state, and rows after the last step are NaN."""
 
     damping: Float[Array, " h"]
-    """With which it was solved."""
+    """Damping of the step."""
     gain: Float[Array, " h"]
-    """Decrease of the energy over the promised one; the step was taken where it is above 1e-3."""
+    """Actual over predicted decrease of the energy; the step is accepted above 1e-3."""
     gradient_norm: Float[Array, " h"]
-    """Of the linearisation that it started from, as in `Solution.gradient_norm`."""
+    """Of the linearisation, as in `Solution.gradient_norm`."""
     moved: PyTree[Float[Array, "h ..."]]
-    """`problem.recorded(point)` after it; of bundle adjustment the poses, world -> camera, [h, n, 7]."""
+    """`problem.recorded(point)` after the step; for bundle adjustment the poses, world -> camera, [h, n, 7]."""
 
     def with_try(self, i: Int[Array, ""], damping: Array, gain: Array, gradient_norm: Array, moved: PyTree) -> Self:
-        """The record with row `i`."""
+        """Return the record with row `i`."""
         write = lambda column, row: column.at[i].set(row)
         return type(self)(
             write(self.damping, damping),
@@ -104,22 +105,22 @@ class IterationRecord(eqx.Module):
 
 
 class LevenbergMarquardtState(eqx.Module):
-    """Loop state; `history[i]` is the energy after try i (NaN beyond the last)."""
+    """Loop state; `history[i]` is the energy after step i (NaN after the last)."""
 
     energy: Float[Array, ""]
     damping: Float[Array, ""]
     growth: Float[Array, ""]
     correction: Float[Array, ""]
-    """Part of the kernels' curvature that the next linearisation takes along."""
+    """Part of the kernels' curvature in the next linearisation."""
     iterations: Int[Array, ""]
     linearisations: Int[Array, ""]
     gradient_norm: Float[Array, ""]
     history: Float[Array, " h"]
     termination: Termination
     polished: Bool[Array, ""]
-    """Whether differentiation moved the point on to the optimum; set by the adjoint."""
+    """Whether the point was refined to the optimum for differentiation; set by the adjoint."""
     gradient_residual: Float[Array, ""]
-    """`gradient_norm` at the point that was returned, as far as it is known."""
+    """`gradient_norm` at the returned point, as far as it is known."""
     record: IterationRecord | None = None
 
 
@@ -129,45 +130,43 @@ class _Try(eqx.Module):
     damping: Float[Array, ""]
     growth: Float[Array, ""]
     gain: Float[Array, ""]
-    """What the step gave over what it promised."""
+    """Actual over predicted decrease."""
     iterations: Int[Array, ""]
     history: Float[Array, " h"]
     accepted: Bool[Array, ""]
     stuck: Bool[Array, ""]
-    overbold: Bool[Array, ""]
-    """Not accepted, and the correction may be why: linearise again with less of it before the damping rises."""
+    overcorrected: Bool[Array, ""]
+    """Rejected, possibly due to the correction: linearise again with less of it before the damping is raised."""
     finite: Bool[Array, ""]
-    """Whether the step was."""
+    """Whether the step is finite."""
     record: IterationRecord | None
 
 
-MOST_ITERATIONS = 1_000_000
-"""The energy of each is kept: more would fill the memory before the first."""
+MAX_ITERATIONS = 1_000_000
+"""Maximum of `max_iterations`: the history has one energy for each, and is allocated in advance."""
 
 
 class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt with Schur elimination of the landmarks.
 
     Use with `optimistix.least_squares(energy_of, solver, y0, args=problem)`: `args` is an `AbstractArrowProblem`, `y0`
-    one of its points. Another function than its energy is refused. Failures are optimistix results, too.
+    one of its points. Any other function than its energy is an error. Failures are also optimistix results.
 
     Fields:
         rtol: Relative decrease of the energy that ends the iteration.
-        atol: Gradient norm, in units of the scaled step, that ends the iteration; where all curvatures are below 1
-            it counts in the root of the largest, so that weights that are all tiny do not look like an optimum.
-        norm: Not used by the iteration itself; optimistix asks for one.
-        max_iterations: Tries in all, accepted or not.
-        initial_damping: Damping of the first try, relative to the diagonal of the Hessian.
+        atol: Gradient norm, in units of the scaled step, that ends the iteration. If all curvatures are below 1 it is
+            relative to the root of the largest, so that very small weights do not look like convergence.
+        norm: Not used by the iteration; required by optimistix.
+        max_iterations: Maximum number of steps, accepted or not.
+        initial_damping: Damping of the first step, relative to the diagonal of the Hessian.
         max_damping: Damping above which the iteration ends: no step lowers the energy.
-        min_damping: Least damping.
-        max_correction: Largest part of the kernels' curvature to apply, below 1; 0 for plain reweighting.
-        fixed_correction: Apply `max_correction` from the start, whatever the gain.
-        reduced_solver: Linear algebra of the reduced system; `choose_reduced_solver` finds the one that suits a
-            graph.
+        min_damping: Minimum damping.
+        max_correction: Maximum part of the kernels' curvature to apply, below 1; 0 for plain reweighting.
+        fixed_correction: Apply `max_correction` from the start, independent of the gain.
+        reduced_solver: Linear solver of the reduced system; `choose_reduced_solver` chooses one for a graph.
         differentiable_loop: Make the inner loop reverse-differentiable (bounded, slower), for
-            `optimistix.RecursiveCheckpointAdjoint`; `vggtgeo.solve` sets it where that adjoint is given.
-        record_iterations: Keep an `IterationRecord`, for pictures of the iteration; without it nothing of it is
-            compiled.
+            `optimistix.RecursiveCheckpointAdjoint`; `vggtgeo.solve` sets it for that adjoint.
+        record_iterations: Record an `IterationRecord`, for plots of the iteration; otherwise it is not compiled.
 
     Example:
         >>> import vggtgeo as vg
@@ -192,35 +191,35 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     record_iterations: bool = False
 
     def __check_init__(self) -> None:
-        most: Any = self.max_iterations  # of a caller: annotations promise what nobody has checked
+        most: Any = self.max_iterations  # an argument may violate its annotation
         whole = isinstance(most, numbers.Integral) and not isinstance(most, bool)
-        if not whole or not 0 <= most <= MOST_ITERATIONS:
-            raise ValueError(f"`max_iterations` is {most!r:.60}; expected a whole number from 0 to {MOST_ITERATIONS}")
+        if not whole or not 0 <= most <= MAX_ITERATIONS:
+            raise ValueError(f"`max_iterations` must be a whole number from 0 to {MAX_ITERATIONS}, got {most!r:.60}")
         for name, highest in _NUMBERS.items():
             given: Any = getattr(self, name)
-            if isinstance(given, jax.Array):  # a traced one has no value to ask
+            if isinstance(given, jax.Array):  # the value of a traced array is unknown
                 continue
             if not isinstance(given, int | float | np.floating | np.integer) or not 0 <= given <= highest:
                 until = "" if highest > 1 else f", at most {highest:g}"
-                raise ValueError(f"`{name}` is {given!r:.60}; it must be a number, at least 0{until}")
+                raise ValueError(f"`{name}` must be a number, at least 0{until}, got {given!r:.60}")
         ends: tuple[Any, Any] = (self.min_damping, self.max_damping)
         if not any(isinstance(end, jax.Array) for end in ends) and ends[0] > ends[1]:
-            raise ValueError(f"`min_damping` is {ends[0]:g} and `max_damping` {ends[1]:g}; it must not be larger")
+            raise ValueError(f"`min_damping` must be at most `max_damping`, {ends[1]:g}, got {ends[0]:g}")
         parts: tuple[Any, Any] = (self.norm, self.reduced_solver)
         if not callable(parts[0]) or not isinstance(parts[1], AbstractReducedSolver):
-            raise ValueError("`norm` must be a function, and `reduced_solver` one of `vggtgeo.solvers.reduced`")
+            raise ValueError("`norm` must be a function, and `reduced_solver` an `AbstractReducedSolver`")
 
     def init(
         self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> LevenbergMarquardtState:
         if not isinstance(args, AbstractArrowProblem):
             raise ValueError(
-                f"`args` is of type `{type(args).__name__}`; `SchurLevenbergMarquardt` solves an "
-                "`AbstractArrowProblem` given as `args`, with `fn=vggtgeo.solvers.problem.energy_of`"
+                f"`args` must be an `AbstractArrowProblem`, with `fn=vggtgeo.solvers.problem.energy_of`, got the type "
+                f"`{type(args).__name__}`"
             )
         energy = args.energy(y)
         finite = jnp.isfinite(energy)
-        # Of another function this solver would minimise something else without a word.
+        # For another function this solver would silently minimise something else.
         same = jnp.isclose(_value(fn(y, args)), energy, rtol=1e-3, atol=0.0) | ~finite
         begun = _CODES.running if self.max_iterations else _CODES.max_iterations
         history = jnp.full(self.max_iterations + 1, jnp.nan, energy.dtype).at[0].set(energy)
@@ -264,7 +263,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             history=state.history,
             accepted=jnp.asarray(False),
             stuck=jnp.asarray(False),
-            overbold=jnp.asarray(False),
+            overcorrected=jnp.asarray(False),
             finite=jnp.asarray(True),
             record=state.record,
         )
@@ -302,14 +301,14 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return y, aux, {}
 
     def _start_record(self, start: PyTree, history: Float[Array, " h"]) -> IterationRecord:
-        """Nothing but the start."""
+        """Return a record with the initial state only."""
         nothing = jnp.full_like(history, jnp.nan)
         unmoved = lambda leaf: jnp.full((len(history), *leaf.shape), jnp.nan, leaf.dtype).at[0].set(leaf)
         return IterationRecord(nothing, nothing, nothing, jax.tree.map(unmoved, start))
 
     def _loop(self, attempt: Callable[[_Try], _Try], first: _Try) -> _Try:
         go_on: Callable[[_Try], Any] = lambda trial: (
-            ~(trial.accepted | trial.stuck | trial.overbold) & (trial.iterations < self.max_iterations)
+            ~(trial.accepted | trial.stuck | trial.overcorrected) & (trial.iterations < self.max_iterations)
         )
         if not self.differentiable_loop:
             return jax.lax.while_loop(go_on, attempt, first)
@@ -326,18 +325,18 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         step: ArrowVector,
         predicted: Float[Array, ""],
     ) -> _Try:
-        """Take the step if it keeps its promise, else shrink the trust region."""
+        """Accept the step if the actual decrease is close to the predicted one, else raise the damping."""
         energy = state.energy
         candidate = problem.retract(point, ArrowVector(step.dense, expand(system.basis, step.landmarks)))
         new_energy = problem.energy(candidate)
         gain = (energy - new_energy) / jnp.where(predicted > 0, predicted, 1.0)
         accepted = jnp.isfinite(new_energy) & (predicted > 0) & (gain > 1e-3)
-        overbold = ~accepted & (state.correction > 0) if not self.fixed_correction else jnp.asarray(False)
+        overcorrected = ~accepted & (state.correction > 0) if not self.fixed_correction else jnp.asarray(False)
         shrink = jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
         damping = jnp.where(accepted, trial.damping * shrink, trial.damping * trial.growth)
         damping, growth = (
-            jnp.where(overbold, trial.damping, damping),
-            jnp.where(overbold, trial.growth, trial.growth * 2),
+            jnp.where(overcorrected, trial.damping, damping),
+            jnp.where(overcorrected, trial.growth, trial.growth * 2),
         )
         iterations = trial.iterations + 1
         kept = jnp.where(accepted, new_energy, energy)
@@ -350,8 +349,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             iterations=iterations,
             history=trial.history.at[iterations].set(kept),
             accepted=accepted,
-            overbold=overbold,
-            stuck=~accepted & ~overbold & (_negligible(predicted, energy) | (damping > self.max_damping)),
+            overcorrected=overcorrected,
+            stuck=~accepted & ~overcorrected & (_negligible(predicted, energy) | (damping > self.max_damping)),
             finite=jnp.isfinite(predicted),
             record=trial.record,
         )
@@ -372,8 +371,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         gradient_norm: Float[Array, ""],
         curvature: Float[Array, ""],
     ) -> Termination:
-        # The gradient norm and this unit both go with the root of a factor on all weights. A problem in pixels or in
-        # standard deviations has curvatures far above 1, and there the unit is 1.
+        # The gradient norm and this unit both scale with the root of a factor on all weights. A problem in pixels or in
+        # standard deviations has curvatures far above 1, so the unit is 1.
         unit = jnp.sqrt(jnp.minimum(curvature, 1.0))
         small = last.accepted & (energy - last.energy <= self.rtol * energy)
         options = [
@@ -390,26 +389,26 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
 
 def _value(returned: Any) -> Array:
-    """What the function returned, without the auxiliary output that optimistix adds."""
+    """Return the value of the function without the auxiliary output that optimistix adds."""
     return jnp.asarray(returned[0] if isinstance(returned, tuple) else returned)
 
 
 def _negligible(predicted: Float[Array, ""], energy: Float[Array, ""]) -> Bool[Array, ""]:
-    """The model itself promises less than the energy's last digits."""
+    """Return whether the predicted decrease is below the rounding error of the energy."""
     return jnp.isfinite(predicted) & (jnp.abs(predicted) <= jnp.finfo(energy.dtype).eps * energy)
 
 
 def _gradient_norm(system: ArrowSystem) -> Float[Array, ""]:
-    """Largest gradient entry, each scaled by the root of its own curvature (the unit of `sqrt(energy)`)."""
+    """Return the largest gradient entry, each scaled by the root of its curvature (the unit of `sqrt(energy)`)."""
     scaled = lambda gradient, curvature: gradient * jax.lax.rsqrt(jnp.where(curvature > 0, curvature, jnp.inf))
     landmarks = scaled(system.landmark_gradient, system.landmark_hessian)
-    # A landmark that presses against its bound is at rest there (the condition of Karush, Kuhn and Tucker).
+    # A landmark at an active bound is stationary (Karush-Kuhn-Tucker condition).
     landmarks = landmarks if system.held is None else jnp.where(system.held, 0.0, landmarks)
     dense = jnp.where(system.free, scaled(*dense_gradient(system)), 0.0)
     return jnp.maximum(jnp.max(jnp.abs(landmarks), initial=0.0), jnp.max(jnp.abs(dense), initial=0.0))
 
 
 def _largest_curvature(system: ArrowSystem) -> Float[Array, ""]:
-    """Largest diagonal entry of the Hessian among the coordinates that may move."""
+    """Return the largest diagonal entry of the Hessian among the free coordinates."""
     dense = jnp.where(system.free, dense_gradient(system)[1], 0.0)
     return jnp.maximum(jnp.max(system.landmark_hessian, initial=0.0), jnp.max(dense, initial=0.0))

@@ -1,8 +1,8 @@
-"""The inverse of a Schur complement where the covariances of a host's surroundings need it, and nowhere else.
+"""The blocks of the inverse of a Schur complement around each host, which the covariances need.
 
-A host's landmarks see the dense coordinates only through itself, its neighbours and the shared coordinates. So the
-`L = b (k + 1) + q` local coordinates `(neighbours, host, shared)` of each host hold all that poses, pairs, intrinsics
-and landmarks ask of the inverse: `n L^2` numbers, where the whole has `(b n + q)^2`.
+A host's landmarks depend on the dense coordinates only through itself, its neighbours and the shared coordinates. The
+`L = b (k + 1) + q` local coordinates `(neighbours, host, shared)` of each host therefore suffice for the covariances of
+poses, pairs, intrinsics and landmarks: `n L^2` numbers instead of `(b n + q)^2`.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ class LocalInverse(eqx.Module):
     """Blocks of the inverse over the local coordinates of some rows of landmarks."""
 
     covariance: Float[Array, "h l l"]
-    """Of the directions that something determines; zero where held."""
+    """Covariance along determined directions; zero for fixed coordinates."""
     null: Float[Array, "h l l"]
-    """Projector on the undetermined directions, in the units of the system; zero where all is determined."""
+    """Projector on the undetermined directions, in the units of the system; zero if all are determined."""
     undetermined: Bool[Array, "h l"]
     rank: Int[Array, ""]
-    """Number of dense coordinates that are determined, flat gauge directions not counted."""
+    """Number of determined dense coordinates, without flat gauge directions."""
 
 
 def local_nodes(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array, "h m"]:
-    """Neighbours of each row, then its host; any node where a row has fewer neighbours."""
+    """Return the neighbours of each row, then its host; an arbitrary node for missing neighbours."""
     neighbours = jnp.minimum(system.neighbours()[rows], system.num_nodes - 1)
     return jnp.concatenate([neighbours, system.graph.host_of_row[rows, None]], 1)
 
 
 def local_coordinates(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array, "h l"]:
-    """Which of the dense coordinates the local ones of each row are."""
+    """Return the dense coordinates of the local ones of each row."""
     block = system.source_adjoint.shape[-1]
     nodes = local_nodes(system, rows)[:, :, None] * block + jnp.arange(block)
     shared = jnp.arange(system.num_nodes * block, len(system.free))
@@ -43,7 +43,7 @@ def local_coordinates(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array,
 
 
 def to_relative(system: ArrowSystem, rows: Int[Array, " h"], local: Float[Array, "h l l"]) -> Float[Array, "h r r"]:
-    """`J C J'`: a covariance of the local coordinates carried to the rows of cross terms, `(eta, shared)`."""
+    """Return `J C J'`: a covariance of the local coordinates in those of the cross terms, `(eta, shared)`."""
     degree, block = system.graph.of_host.shape[1], system.source_adjoint.shape[-1]
     wide, shared = degree * block, system.shared
     seen = seen_by_hosts(system)
@@ -59,16 +59,16 @@ def to_relative(system: ArrowSystem, rows: Int[Array, " h"], local: Float[Array,
 
 
 def balance(system: ArrowSystem, diagonal: Float[Array, " c"]) -> Float[Array, " c"]:
-    """Root of the Hessian's diagonal, which makes one unit of all; 1 where it vanishes or is held."""
+    """Return the root of the Hessian's diagonal as scale; 1 if it vanishes or the coordinate is fixed."""
     used = (diagonal > 0) & system.free
     return jnp.sqrt(jnp.where(used, diagonal, 1.0))
 
 
 def rank_tolerance(size: int, dtype: np.dtype) -> float:
-    """Eigenvalue of the balanced matrix below which it is rounding error: `10 size eps` (the trace is `size`)."""
+    """Return the rounding error of eigenvalues of a balanced matrix: `10 size eps` (the trace is `size`)."""
     return 10 * size * float(jnp.finfo(dtype).eps)
 
 
 def visible(dtype: np.dtype) -> float:
-    """Squared part of a unit vector that is more than rounding error."""
+    """Return the squared part of a unit vector above which it is not rounding error."""
     return math.sqrt(float(jnp.finfo(dtype).eps))

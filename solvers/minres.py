@@ -1,7 +1,7 @@
-"""Minimum residuals: symmetric systems that need not be definite, with a definite preconditioner.
+"""Minimum residuals for symmetric systems, definite or not, with a definite preconditioner.
 
-Lanczos vectors make the matrix tridiagonal, Givens rotations solve the least-squares problem that is left (Paige and
-Saunders 1975). In the norm of the preconditioner the residual never rises, at a saddle either.
+Lanczos vectors make the matrix tridiagonal, Givens rotations solve the remaining least-squares problem (Paige and
+Saunders 1975). In the norm of the preconditioner the residual never increases, even for an indefinite matrix.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Apply = Callable[[Float[Array, " c"]], Float[Array, " c"]]
 
 
 class MinresSolved(NamedTuple):
-    """Outcome of `minres`."""
+    """Result of `minres`."""
 
     solution: Float[Array, " c"]
     iterations: Int[Array, ""]
@@ -42,7 +42,7 @@ class _Loop(NamedTuple):
 
 
 def minres(apply: Apply, inverse: Apply, rhs: Float[Array, " c"], rtol: float, max_iterations: int) -> MinresSolved:
-    """Solve `A x = rhs` from zero until the residual's norm, that of the preconditioner, has fallen by `rtol`."""
+    """Solve `A x = rhs` from zero until the residual, in the preconditioner's norm, has decreased by `rtol`."""
     zero, one = jnp.zeros((), rhs.dtype), jnp.ones((), rhs.dtype)
     first = inverse(rhs)
     start = jnp.sqrt(jnp.maximum(rhs @ first, 0.0))
@@ -61,7 +61,7 @@ def minres(apply: Apply, inverse: Apply, rhs: Float[Array, " c"], rtol: float, m
 
 def _advanced(loop: _Loop, apply: Apply, inverse: Apply) -> _Loop:
     vector = loop.preconditioned / loop.beta
-    before = jnp.where(loop.old_beta > 0, loop.old_beta, 1.0)  # nothing comes before the first
+    before = jnp.where(loop.old_beta > 0, loop.old_beta, 1.0)  # zero in the first iteration
     image = apply(vector) - jnp.where(loop.old_beta > 0, loop.beta / before, 0.0) * loop.older
     alpha = vector @ image
     image = image - alpha / loop.beta * loop.newer

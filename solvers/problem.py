@@ -1,4 +1,4 @@
-"""What the arrow solvers ask of a problem. An implementation is a pytree: its leaves are what can be differentiated."""
+"""Interface of a problem for the arrow solvers. An implementation is a pytree, differentiable by its leaves."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
 
     @abc.abstractmethod
     def energy(self, point: Point) -> Float[Array, ""]:
-        """The energy to minimise."""
+        """Return the energy to minimise."""
 
     @abc.abstractmethod
     def linearise(self, point: Point, correction: Float[Array, ""] | None = None) -> ArrowSystem:
-        """Exact gradient and the Gauss-Newton (reweighted) approximation of the Hessian at `point`.
+        """Compute the exact gradient and the Gauss-Newton (reweighted) approximation of the Hessian at `point`.
 
-        `correction`, in [0, 1): the part of the robust kernels' own (negative) curvature that the Hessian takes along;
-        it stays positive definite.
+        `correction`, in [0, 1): the part of the robust kernels' (negative) curvature in the Hessian, which stays
+        positive definite.
         """
 
     @abc.abstractmethod
     def gradient(self, point: Point) -> ArrowVector:
-        """Exact gradient in the coordinates of `retract`, held coordinates as if free; differentiable once more."""
+        """Compute the exact gradient in the coordinates of `retract`, as if all were free; differentiable."""
 
     @abc.abstractmethod
     def hessian(self, point: Point) -> ArrowSystem:
-        """Exact gradient and exact Hessian at `point`, in the coordinates of `retract`."""
+        """Compute the exact gradient and Hessian at `point`, in the coordinates of `retract`."""
 
     @abc.abstractmethod
     def retract(self, point: Point, step: ArrowVector) -> Point:
@@ -41,24 +41,24 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
 
     @abc.abstractmethod
     def restore_fixed(self, point: Point) -> Point:
-        """`point` with every held coordinate taken from where the iteration starts, which the problem knows.
+        """Return `point` with all fixed coordinates set to those of the problem's initial state.
 
-        Landmarks on segments stay where they are, but follow the fractions where those are differentiated.
+        Landmarks on segments are unchanged, but depend on the fractions for differentiation.
         """
 
     def fractions(self) -> Float[Array, "n g q"] | None:
-        """Position of each landmark along its segment, where the last ones are joined: see `segments.py`."""
+        """Return the position of each landmark along its segment, if there are segments: see `segments.py`."""
         return None
 
     def recorded(self, point: Point) -> PyTree:
-        """The part of `point` that a record of the iterations keeps."""
+        """Return the part of `point` for the record of the iterations."""
         return point
 
     @abc.abstractmethod
     def zero_step(self, point: Point) -> ArrowVector:
-        """The zero of the tangent space at `point`."""
+        """Return the zero of the tangent space at `point`."""
 
 
 def energy_of(point: Point, problem: AbstractArrowProblem[Point]) -> Float[Array, ""]:
-    """The function to give to `optimistix.least_squares`, with the problem as its `args`."""
+    """Return the energy: the function for `optimistix.least_squares`, with the problem as `args`."""
     return problem.energy(point)

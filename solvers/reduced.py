@@ -1,4 +1,4 @@
-"""Solving the reduced (Schur complement) system of an arrow system: one strategy a class."""
+"""Linear solvers for the reduced (Schur complement) system of an arrow system; each class is one strategy."""
 
 from __future__ import annotations
 
@@ -19,46 +19,46 @@ Prepared = TypeVar("Prepared", bound=eqx.Module)
 
 
 class AbstractFactor(eqx.Module):
-    """The undamped Schur complement of an exact Hessian over the free coordinates, definite or not.
+    """Factor of the undamped Schur complement of an exact Hessian over the free coordinates, definite or not.
 
-    Flat gauge directions are held by a stiffness.
+    Flat gauge directions have an added stiffness.
     """
 
     @abc.abstractmethod
     def solve(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> Float[Array, " c"]:
-        """`S^-1 rhs` of the system that was factorised; zero for held coordinates, whatever `rhs` says of them."""
+        """Return `S^-1 rhs` of the factorised system; zero for fixed coordinates, for any `rhs`."""
 
     def checked(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
-        """The same, and whether it was found: an iteration may end before."""
+        """Return the solution of `solve`, and whether an iterative solver has converged."""
         return self.solve(system, rhs), jnp.asarray(True)
 
 
 class AbstractReducedSolver(eqx.Module, Generic[Prepared]):
-    """Prepares what does not depend on the damping once, then solves for any damping.
+    """Linear solver: one preparation for each linearisation, then solves for any damping.
 
-    The same structure serves the derivative of the optimum (`factor`) and covariances (`inverse`).
+    The same structure is used for the derivative of the optimum (`factor`) and covariances (`inverse`).
     """
 
     @abc.abstractmethod
     def prepare(self, system: ArrowSystem) -> Prepared:
-        """Work shared by all dampings."""
+        """Compute the part shared by all dampings."""
 
     @abc.abstractmethod
     def step(
         self, system: ArrowSystem, prepared: Prepared, damping: Float[Array, ""]
     ) -> tuple[ArrowVector, Float[Array, ""]]:
-        """`(step, predicted decrease of the energy)` of the damped model."""
+        """Return `(step, predicted decrease of the energy)` of the damped model."""
 
     @abc.abstractmethod
     def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> AbstractFactor:
-        """For solves without damping.
+        """Factorise the system without damping.
 
-        system: of the exact Hessian. definite: makes one with a positive Hessian nearby, for those that precondition.
+        system: of the exact Hessian. definite: returns a nearby system with a positive Hessian, for preconditioners.
         """
 
     @abc.abstractmethod
     def inverse(self, system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
-        """The inverse around some rows of landmarks; the system must be positive semidefinite."""
+        """Return the inverse around some rows of landmarks; the system must be positive semidefinite."""
 
 
 class _Prepared(eqx.Module):
@@ -68,7 +68,7 @@ class _Prepared(eqx.Module):
 
 
 class LuFactor(AbstractFactor):
-    """By elimination with pivots; not finite where the matrix is singular."""
+    """LU factor with pivoting; not finite if the matrix is singular."""
 
     factors: tuple[Float[Array, "c c"], Int[Array, " c"]]
 
@@ -78,7 +78,7 @@ class LuFactor(AbstractFactor):
 
 
 class DenseCholesky(AbstractReducedSolver[_Prepared]):
-    """Dense reduced system by Cholesky: `c^3 / 3` operations; right for windows (c < 1000)."""
+    """Dense Cholesky: `c^3 / 3` operations, for windows (c < 1000)."""
 
     def prepare(self, system: ArrowSystem) -> _Prepared:
         reduced = reduce(system)
@@ -109,17 +109,17 @@ class DenseCholesky(AbstractReducedSolver[_Prepared]):
 
 
 def damping_diagonal(diagonal: Float[Array, " c"], free: Bool[Array, " c"]) -> Float[Array, " c"]:
-    """What the damping multiplies: the Hessian's diagonal, no smaller than the rounding error of its largest entry.
+    """Return the diagonal for the damping: the Hessian's, at least the rounding error of its largest entry.
 
-    Without that floor a coordinate that nothing determines is damped by next to nothing, and rounding errors of the
-    gradient drive it away: cameras slid 1.6 m along parallel lines in float32.
+    Without this bound an undetermined coordinate is hardly damped, and rounding errors of the gradient move it away (in
+    float32, cameras move along parallel lines).
     """
     largest = jnp.max(jnp.where(free, diagonal, 0.0), initial=0.0)
     return jnp.maximum(at_least(diagonal), jnp.finfo(diagonal.dtype).eps * largest)
 
 
 def solve_free(matrix: Float[Array, "c c"], rhs: Float[Array, " c"], free: Bool[Array, " c"]) -> Float[Array, " c"]:
-    """Solve the positive definite system of the free coordinates; zero for the others. NaN where not definite."""
+    """Solve the positive definite system of the free coordinates; zero for others, NaN if not definite."""
     both = free[:, None] & free[None, :]
     matrix = jnp.where(both, matrix, 0.0) + jnp.diag(jnp.where(free, 0.0, 1.0).astype(matrix.dtype))
     scale = jnp.sqrt(jnp.diagonal(matrix))
@@ -135,7 +135,7 @@ def predicted_decrease(
     step: ArrowVector,
     damping: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """`1/2 (l d' D d - g' d)`: what the undamped model loses along the minimiser `d` of the damped model."""
+    """Return `1/2 (l d' D d - g' d)`: the decrease of the undamped model along the minimiser `d` of the damped one."""
     free_gradient = jnp.where(system.free, gradient, 0.0)
     dense = step.dense @ (damping * diagonal * step.dense - free_gradient)
     curved = damping * system.landmark_hessian * step.landmarks - system.landmark_gradient

@@ -6,8 +6,8 @@ the segment: `z_s = (1 - t_s) a + t_s b`. In `(a, b)` the landmark block `V` has
 
     z_s = (1 - t_s) y_a + (t_s - l (1 - t_s)) y_b,      V_y = diag(V_aa, V_bb - l V_ab),
 
-so that all that is written for scalar landmarks (Schur complement, damping, covariance) holds for segments as well.
-Only what enters and leaves the system passes through this basis, see `landmark_basis.py`.
+so that the code for scalar landmarks (Schur complement, damping, covariance) also applies to segments. Only inputs and
+outputs of the system are transformed by this basis, see `landmark_basis.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vggtgeo.solvers.arrow import ArrowSystem, SegmentLandmarks
 
 
 def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> ArrowSystem:
-    """The system whose last `m q` landmarks a host are restricted to `m` affine functions of `fraction`."""
+    """Return the system whose last `m q` landmarks a host are restricted to `m` affine functions of `fraction`."""
     _, segments, samples = fraction.shape
     alone = system.cross.shape[-1] - segments * samples
     rows = system.cross[..., alone:].reshape(*system.cross.shape[:2], segments, samples)
@@ -30,7 +30,7 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
     ratio = jnp.where(own != 0, mixed / jnp.where(own != 0, own, 1.0), 0.0)
     second = second - ratio[..., None] * first
     rest = total(second, second)
-    # Where one sample alone determines the segment, the second coordinate is rounding error.
+    # If only one sample determines the segment, the second coordinate is rounding error.
     determined = jnp.abs(rest) > 1e3 * jnp.finfo(rest.dtype).eps * (jnp.abs(own) + jnp.abs(other))
     joint = SegmentLandmarks(fraction, ratio, determined)
     joined = jnp.einsum("nrms,nmsk->nrkm", rows, joint.basis)
@@ -42,17 +42,17 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
 
 
 def expand_segments(segments: SegmentLandmarks, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
-    """From the system's landmarks to those of the problem: the samples of the segments."""
+    """Transform the system's landmarks to those of the problem, the samples of the segments."""
     return _expanded(segments.basis, landmarks)
 
 
 def expand_segments_variance(segments: SegmentLandmarks, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
-    """Variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
+    """Return variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
     return _expanded(segments.basis**2, variance)
 
 
 def restrict_segments(segments: SegmentLandmarks, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:
-    """The transpose of `expand_segments`: a gradient by the problem's landmarks as one by the system's."""
+    """Return the transpose of `expand_segments`: a gradient by the problem's landmarks as one by the system's."""
     hosts, count, samples = segments.fraction.shape
     alone = landmarks.shape[-1] - count * samples
     values = landmarks[:, alone:].reshape(hosts, count, samples)
@@ -61,7 +61,7 @@ def restrict_segments(segments: SegmentLandmarks, landmarks: Float[Array, "n z"]
 
 
 def slopes(landmarks: Float[Array, "n z"], fraction: Float[Array, "n m q"]) -> Float[Array, "n m 1"]:
-    """Change of the last `m q` landmarks, straight along their segments, from fraction 0 to 1."""
+    """Return the change of the last `m q` landmarks, linear along their segments, from fraction 0 to 1."""
     lines = landmarks[:, landmarks.shape[-1] - fraction.shape[1] * fraction.shape[2] :].reshape(fraction.shape)
     offset = fraction - jnp.mean(fraction, -1, keepdims=True)
     spread = jnp.sum(offset**2, -1, keepdims=True)

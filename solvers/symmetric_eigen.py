@@ -2,9 +2,9 @@
 
     dw = diag(V' dA V),     dV = V (F * V' dA V),     F_ij = 1 / (w_j - w_i),
 
-with `F_ij = 0` where two eigenvalues cannot be told apart: their eigenvectors may turn among each other at no cost, so
-only what does not depend on that turn (their projector, the sum of their eigenvalues) has a derivative, and it is the
-right one. Cost: one eigenvalue problem; the derivative two products more.
+with `F_ij = 0` if two eigenvalues are numerically equal. Their eigenvectors are then unique only up to a rotation, and
+only functions invariant under it (their projector, the sum of their eigenvalues) have a derivative, which is exact.
+Cost: one eigenvalue problem; the derivative two more products.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vggtgeo.solvers.local_inverse import rank_tolerance
 
 @jax.custom_jvp
 def symmetric_eigen(matrix: Float[Array, "c c"]) -> tuple[Float[Array, " c"], Float[Array, "c c"]]:
-    """Eigenvalues, ascending, and eigenvectors as columns."""
+    """Return eigenvalues, ascending, and eigenvectors as columns."""
     values, vectors = jnp.linalg.eigh(matrix)
     return values, vectors
 

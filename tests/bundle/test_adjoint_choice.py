@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 import pytest
+from reported import raises
 
 import vggtgeo as vg
 
@@ -48,5 +49,5 @@ def test_an_adjoint_that_cannot_work_is_refused_by_name(loss: Callable[..., jax.
     """`ImplicitAdjoint` is refused before anything is compiled, and the message names what to take. Oracle: the
     exception's type and the names in it.
     """
-    with pytest.raises(vg.InputError, match=r"`adjoint`.*ImplicitAdjoint.*ArrowAdjoint.*RecursiveCheckpointAdjoint"):
+    with raises("`adjoint`", "ImplicitAdjoint", "ArrowAdjoint", "RecursiveCheckpointAdjoint"):
         loss(jnp.ones(()), adjoint=optx.ImplicitAdjoint())

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from reported import raises
 from scenes import make_scene, matrix
 from scipy.optimize import least_squares
 from vggtgeo.solvers.arrow import multiply
 
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
-from vggtgeo.io.errors import InputError
 
 GROUP = np.array([0, 1, 0, 1])
 PINHOLES = np.array([[300.0, 310.0, 160.0, 120.0], [250.0, 245.0, 150.0, 125.0]])
@@ -306,26 +306,26 @@ def test_square_pixels_are_an_exact_tie() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "named"),
     [
         (
             {"camera": vg.cameras.RadialTangential},
-            r"`intrinsics` has shape \(4,\); expected \(8\): fx, .*RadialTangential",
+            ("`intrinsics`", "(4,)", "(8)", "RadialTangential"),
         ),
-        ({"camera": "pinhole"}, "`camera` is 'pinhole'; expected a camera's class"),
-        ({"camera_of": [0, 0, 0, 0]}, r"expected \(g, 4\)"),
-        ({"camera_of": [0, 2, 0, 1], "intrinsics": PINHOLES}, "`camera_of` goes from 0 to 2; `intrinsics` has 2 rows"),
-        ({"camera_of": [0, 1], "intrinsics": PINHOLES}, "expected 4 whole numbers"),
-        ({"intrinsics_sigma": [1.0, 2.0]}, r"`intrinsics_sigma` has shape \(2,\)"),
-        ({"camera": vg.cameras.SquarePinhole, "intrinsics": [-1.0, 2, 3]}, "focal lengths must be positive"),
+        ({"camera": "pinhole"}, ("`camera`", "'pinhole'")),
+        ({"camera_of": [0, 0, 0, 0]}, ("`intrinsics`", "(g, 4)")),
+        ({"camera_of": [0, 2, 0, 1], "intrinsics": PINHOLES}, ("`camera_of`", 2, "`intrinsics`")),
+        ({"camera_of": [0, 1], "intrinsics": PINHOLES}, ("`camera_of`", 4)),
+        ({"intrinsics_sigma": [1.0, 2.0]}, ("`intrinsics_sigma`", "(2,)")),
+        ({"camera": vg.cameras.SquarePinhole, "intrinsics": [-1.0, 2, 3]}, ("`intrinsics`", "positive", "-1")),
     ],
 )
-def test_cameras_that_do_not_fit_are_refused(options: dict, message: str) -> None:
+def test_cameras_that_do_not_fit_are_refused(options: dict, named: tuple) -> None:
     # Proves that what is wrong with a camera is said by name. Oracle: the message.
     import inspect
 
     made = rig(tuple(map(tuple, PINHOLES)), noise=0.5)
     options = {**options}
     intrinsics = options.pop("intrinsics", PINHOLES[0])
-    with pytest.raises(InputError, match=message):
+    with raises(*named):
         inspect.unwrap(vg.pack)(made.seen, made.poses, intrinsics, made.inverse_depth, **options)

@@ -94,7 +94,7 @@ def test_a_solve_says_what_is_not_finite() -> None:
     worse = infinite(bad)
     solution = jax.jit(vg.solve)(worse, START)
     assert solution.result == "nonfinite_input"
-    assert "residual of `range` is not finite, first of observation 1" in solution.message
+    assert "residual of `range` is not finite, first at observation 1" in solution.message
 
 
 def infinite(problem: Problem) -> Problem:

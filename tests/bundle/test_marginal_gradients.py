@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reported import raises
 from scenes import make_scene
 from vggtgeo.solvers.symmetric_eigen import symmetric_eigen
 
@@ -198,5 +199,5 @@ def test_reorder_and_gather_work_under_jit() -> None:
 @pytest.mark.parametrize("order", [jnp.asarray([0.0, 1.0]), jnp.asarray([[0], [1]])])
 def test_an_order_of_another_kind_is_refused_when_traced(order: jax.Array) -> None:
     # Proves that type and shape of a traced order are checked.
-    with pytest.raises(vg.InputError, match=r"`order` is (float|int)"):
+    with raises("`order`", order.dtype):
         jax.jit(vg.reorder)(vg.no_prior(2), order)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from reported import raises
 from scenes import Scene, make_scene
 from vggtgeo.solvers.kernels import Huber
 
@@ -16,7 +17,6 @@ from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem
-from vggtgeo.io.errors import InputError
 from vggtgeo.simulation import simulate_window
 
 SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)
@@ -150,33 +150,33 @@ def test_wrong_lists_are_refused_by_name() -> None:
     wrong_host = seen.point_edge.copy()
     wrong_host[0] = len(seen.edges) - 1
     cases = [
-        (bad(edges=seen.edges + 1), "`edges` goes from 1 to 3"),
-        (bad(host=seen.host - 1), "`host` goes from -1"),
-        (bad(point_edge=seen.point_edge + 9), "`point_edge` goes from 9"),
-        (bad(line_landmark=seen.line_landmark + 1000), "`line_landmark`"),
-        (bad(edges=seen.edges + 0.5), "`edges` holds float64; expected whole numbers"),
-        (replace(SCENE, start_poses=np.nan * SCENE.start_poses), r"`poses\[0\]` is .*; it must be finite"),
+        (bad(edges=seen.edges + 1), ("`edges`", 1, 3)),
+        (bad(host=seen.host - 1), ("`host`", -1)),
+        (bad(point_edge=seen.point_edge + 9), ("`point_edge`", 9)),
+        (bad(line_landmark=seen.line_landmark + 1000), ("`line_landmark`",)),
+        (bad(edges=seen.edges + 0.5), ("`edges`", "float64")),
+        (replace(SCENE, start_poses=np.nan * SCENE.start_poses), ("`poses[0]`", "finite", "nan")),
         (
             bad(point_edge=wrong_host),
-            r"`point_edge\[0\]` starts at keyframe 2, but its landmark is hosted in keyframe 0",
+            ("`point_edge[0]`", 2, 0),
         ),
-        (bad(line_landmark=both_kinds, line_edge=its_edge), "both name landmark"),
-        (bad(point_landmark=twice), r"name landmark 0 on edge 0 more than once"),
-        (replace(SCENE, start_intrinsics=np.array([300.0, -1.0, 0.0, 0.0])), "focal lengths must be positive"),
-        (replace(SCENE, start_poses=2 * SCENE.start_poses), r"`poses\[0\]` has a quaternion of length 2"),
-        (bad(point_weight=seen.point_weight[1:]), "`point_weight` has shape"),
-        (replace(SCENE, start_poses=SCENE.start_poses[:, :4]), r"`poses` has shape \(3, 4\); expected \(n, 7\)"),
-        (bad(point_weight=-seen.point_weight), r"`point_weight\[0\]` is -.*; it must be finite and not negative"),
-        (bad(line_weight=seen.line_weight * np.nan), r"`line_weight\[0\]` is nan"),
-        (bad(alpha=-1.0), "`alpha` is -1.0"),
-        (bad(depth_mean=-seen.depth_mean), r"`depth_mean\[0\]` is -.*; it must be positive and finite"),
-        (bad(line_coefficients=3 * seen.line_coefficients), r"`line_coefficients\[0\]` .*divided by its root"),
-        (bad(depth_sigma=0 * seen.depth_sigma), r"`depth_sigma\[0\]` is 0"),
-        (replace(SCENE, start_inverse_depth=-SCENE.start_inverse_depth), r"`inverse_depth\[0\]` is -"),
-        (replace(SCENE, start_inverse_depth=SCENE.start_inverse_depth[1:]), "`inverse_depth` has shape"),
+        (bad(line_landmark=both_kinds, line_edge=its_edge), ("`point_landmark`", "`line_landmark`")),
+        (bad(point_landmark=twice), ("`point_landmark`", "landmark 0", "edge 0")),
+        (replace(SCENE, start_intrinsics=np.array([300.0, -1.0, 0.0, 0.0])), ("`intrinsics`", "positive", "-1")),
+        (replace(SCENE, start_poses=2 * SCENE.start_poses), ("`poses[0]`", "quaternion", 2)),
+        (bad(point_weight=seen.point_weight[1:]), ("`point_weight`", "shape")),
+        (replace(SCENE, start_poses=SCENE.start_poses[:, :4]), ("`poses`", "(3, 4)", "(n, 7)")),
+        (bad(point_weight=-seen.point_weight), ("`point_weight[0]`", "got -")),
+        (bad(line_weight=seen.line_weight * np.nan), ("`line_weight[0]`", "nan")),
+        (bad(alpha=-1.0), ("`alpha`", -1.0)),
+        (bad(depth_mean=-seen.depth_mean), ("`depth_mean[0]`", "got -")),
+        (bad(line_coefficients=3 * seen.line_coefficients), ("`line_coefficients[0]`", "normalised")),
+        (bad(depth_sigma=0 * seen.depth_sigma), ("`depth_sigma[0]`", "got 0")),
+        (replace(SCENE, start_inverse_depth=-SCENE.start_inverse_depth), ("`inverse_depth[0]`", "got -")),
+        (replace(SCENE, start_inverse_depth=SCENE.start_inverse_depth[1:]), ("`inverse_depth`", "shape")),
     ]
-    for scene, message in cases:
-        with pytest.raises(InputError, match=message):
+    for scene, named in cases:
+        with raises(*named):
             scene.pack()
 
 
@@ -187,15 +187,15 @@ def test_numbers_beyond_the_precision_are_refused_by_name() -> None:
     far, sharp, turned = seen.point_target.copy(), seen.depth_sigma.copy(), SCENE.start_poses.copy()
     far[3, 1], sharp[2], turned[1, 5] = 1e39, 1e-50, -1e60
     cases = [
-        (bad(point_target=far), r"`point_target\[3, 1\]` is 1e\+39; float32 holds numbers from 1.2e-38 to 3.4e\+38"),
-        (bad(depth_sigma=sharp), r"`depth_sigma\[2\]` is 1e-50; float32"),
-        (bad(alpha=1e50), "`alpha` is 1e\\+50; float32"),
-        (replace(SCENE, start_poses=turned), r"`poses\[1, 5\]` is -1e\+60; float32"),
+        (bad(point_target=far), ("`point_target[3, 1]`", "1e+39", "float32", "1.2e-38", "3.4e+38")),
+        (bad(depth_sigma=sharp), ("`depth_sigma[2]`", "1e-50", "float32")),
+        (bad(alpha=1e50), ("`alpha`", "1e+50", "float32")),
+        (replace(SCENE, start_poses=turned), ("`poses[1, 5]`", "-1e+60", "float32")),
     ]
-    for scene, message in cases:
+    for scene, named in cases:
         if scene.start_poses is SCENE.start_poses:  # double precision has no digits for matches at 1e60 m either
             scene.pack()
-        with pytest.raises(InputError, match=message):
+        with raises(*named):
             scene.pack(dtype=np.float32)
 
 
@@ -204,35 +204,35 @@ def test_a_size_that_is_too_small_is_refused(name: str) -> None:
     # Proves that nothing is cut off silently: the error names the size and what is needed.
     fits = PaddedSize(3, 6, 3, 2, 6)
     SCENE.pack(size=fits)
-    with pytest.raises(InputError, match=rf"`size.{name}` is {getattr(fits, name) - 1}; this problem needs"):
+    with raises(f"`size.{name}`", getattr(fits, name) - 1, getattr(fits, name)):
         SCENE.pack(size=replace(fits, **{name: getattr(fits, name) - 1}))
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "named"),
     [
-        ({"intrinsics_mean": np.ones(3)}, r"`intrinsics_mean` is \[1. 1. 1.\]; expected 4 finite numbers"),
-        ({"intrinsics_mean": np.full(4, np.nan)}, "expected 4 finite numbers"),
-        ({"intrinsics_sigma": np.nan}, "`intrinsics_sigma` is nan; it must be positive"),
-        ({"intrinsics_sigma": 1e-200}, r"`intrinsics_sigma` is 1e-200; 1 / sigma\^2 is beyond the numbers of float64"),
-        ({"intrinsics_sigma": 1e-30, "dtype": np.float32}, "`intrinsics_sigma` is 1e-30"),
-        ({"kernel": Huber(jnp.asarray(1e-50)), "dtype": np.float32}, "`kernel.delta` is 1e-50; float32 holds numbers"),
-        ({"fixed_intrinsics": 1}, "`fixed_intrinsics` is 1; expected True, False, or 4 of them"),
-        ({"fixed_intrinsics": [True, False]}, "expected True, False, or 4 of them"),
-        ({"kernel": "huber"}, "`kernel` is 'huber'; expected a kernel object"),
-        ({"kernel": Huber(jnp.asarray(0.0))}, "`kernel` has the width 0.0; it must be positive"),
-        ({"kernel": Scaled(offset=0.1)}, r"`kernel` of type `Scaled` has rho\(0\) = 0.1.* take the constant off"),
-        ({"kernel": Scaled(slope=2.0)}, r"rho'\(0\) = 2.0; they must be 0 and 1"),
+        ({"intrinsics_mean": np.ones(3)}, ("`intrinsics_mean`", "[1. 1. 1.]", 4)),
+        ({"intrinsics_mean": np.full(4, np.nan)}, ("`intrinsics_mean`", "nan")),
+        ({"intrinsics_sigma": np.nan}, ("`intrinsics_sigma`", "nan", "positive")),
+        ({"intrinsics_sigma": 1e-200}, ("`intrinsics_sigma`", "1e-200", "float64")),
+        ({"intrinsics_sigma": 1e-30, "dtype": np.float32}, ("`intrinsics_sigma`", "1e-30")),
+        ({"kernel": Huber(jnp.asarray(1e-50)), "dtype": np.float32}, ("`kernel.delta`", "1e-50", "float32")),
+        ({"fixed_intrinsics": 1}, ("`fixed_intrinsics`", 1, 4)),
+        ({"fixed_intrinsics": [True, False]}, ("`fixed_intrinsics`", "[True, False]", 4)),
+        ({"kernel": "huber"}, ("`kernel`", "'huber'")),
+        ({"kernel": Huber(jnp.asarray(0.0))}, ("`kernel`", "width", 0.0)),
+        ({"kernel": Scaled(offset=0.1)}, ("`kernel`", "`Scaled`", "rho(0)", "0.1")),
+        ({"kernel": Scaled(slope=2.0)}, ("`kernel`", "rho'(0)", 2.0)),
         (
             {"terms": [Height(keyframe=[0], height=jnp.ones(1), weight=jnp.ones(1), kernel=Scaled(slope=2.0))]},
-            r"`height.kernel` of type `Scaled`",
+            ("`height.kernel`", "`Scaled`"),
         ),
     ],
 )
-def test_wrong_options_are_refused_by_name(options: dict, message: str) -> None:
+def test_wrong_options_are_refused_by_name(options: dict, named: tuple) -> None:
     # Proves that an int is no mask, a name no kernel: each used to give a wrong result or a raw broadcast error.
     start = (SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth)
-    with pytest.raises(InputError, match=message):
+    with raises(*named):
         UNCHECKED(SCENE.observations, *start, **options)
 
 
@@ -253,11 +253,11 @@ def test_a_problem_in_which_nothing_is_observed_is_refused() -> None:
     zero = {name: 0 * getattr(seen, name) for name in ("point_weight", "line_weight", "depth_weight")}
     start = SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth
     for options in ({"intrinsics_sigma": 5.0}, {"terms": [vg.no_prior(3)]}):
-        with pytest.raises(InputError, match="nothing is observed: all weights"):
+        with raises("`problem`", "weights"):
             pack(replace(seen, **zero), *start, **options)
     problem, state, _ = SCENE.pack()
     nothing = problem.with_terms(tuple(term.reweighted(jnp.zeros_like(term.weight)) for term in problem.terms))
-    with pytest.raises(InputError, match="nothing is observed: all weights"):
+    with raises("`problem`", "weights"):
         vg.solve(nothing, state)
     solution = jax.jit(vg.solve)(nothing, state)
     assert float(jnp.abs(solution.state.poses.wxyz_xyz - state.poses.wxyz_xyz).max()) == 0.0

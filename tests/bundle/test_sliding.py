@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from reported import raises
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 import vggtgeo as vg
@@ -55,7 +56,7 @@ def test_the_observations_within_some_keyframes_are_theirs() -> None:
     assert int(sizes.count["points"]) == 3 * 2 * 8
     assert int(sizes.count["lines"]) == 3 * 2 * 4
     for wrong in ([1, 1], np.array([0.5])):
-        with pytest.raises(vg.InputError, match=r"`keyframes` is \[(1|0.5)"):
+        with raises("`keyframes`", np.asarray(wrong).tolist()):
             whole.observations.within(wrong)
 
 
@@ -99,7 +100,7 @@ def test_windows_of_other_shapes_are_refused() -> None:
     # Proves that shapes, cameras and a missing keyframe are checked before anything is compiled.
     problem, initial, _ = vg.simulate_window(3, points=4, lines=0).pack(terms=[vg.no_prior(3)])
     smaller, start, _ = vg.simulate_window(2, points=4, lines=0).pack(terms=[vg.no_prior(2)])
-    with pytest.raises(vg.InputError, match="`next_problem` has 2 keyframes"):
+    with raises("`next_problem`", 2):
         vg.slide(problem, initial, smaller, start)
     with pytest.raises(vg.InputError, match=r"`next_initial\.inverse_depth`"):
         vg.slide(problem, initial, problem, start)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reported import raises
 from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, reduce
 from vggtgeo.solvers.band_cholesky import BandCholesky
@@ -272,9 +273,9 @@ def test_what_is_too_large_is_refused() -> None:
     # Proves the sentences for a map whose dense matrix nobody wants. Oracle: their text.
     window, _ = simulate_loop(610, points=1, reach=1)
     problem, initial, _ = window.pack()
-    with pytest.raises(ValueError, match="give `reduced_solver=choose_reduced_solver"):
+    with raises("reduced_solver=choose_reduced_solver", error=ValueError):
         covariances(problem, initial)
-    with pytest.raises(ValueError, match="give `keyframes`, at most 32"):
+    with raises("`keyframes`", 32, error=ValueError):
         covariances(problem, initial, reduced_solver=ITERATIVE)
-    with pytest.raises(ValueError, match="610 keyframes inside `jit` or `vmap`; expected arrays with values"):
+    with raises(610, "`jit`", error=ValueError):
         jax.eval_shape(observability, problem, initial)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from own_terms import SCENE, PointToPlane, PositionFix, StepOfWheels
+from reported import raises
 
 import vggtgeo as vg
 
@@ -62,9 +63,9 @@ def test_a_flat_term_on_edges_is_refused_by_name(weight: dict[str, jax.Array]) -
     """
     problem, _, _ = SCENE.pack()
     flat = PointToPlane(normal=jnp.ones((5, 3)), distance=jnp.ones(5), **weight)
-    with pytest.raises(vg.InputError, match=r"`point_to_plane\.weight` has shape \(5?,?\).*FlatTerm"):
+    with raises("`point_to_plane.weight`", np.shape(flat.weight), "FlatTerm"):
         problem.with_term(flat)
-    with pytest.raises(vg.InputError, match=r"`point_to_plane\.weight` has shape \(5?,?\).*FlatTerm"):
+    with raises("`point_to_plane.weight`", np.shape(flat.weight), "FlatTerm"):
         SCENE.pack(terms=[flat])
 
 
@@ -72,5 +73,5 @@ def test_flat_data_beside_padded_weights_are_refused_by_name() -> None:
     """The field that is flat is the one that is named. Oracle: the exception."""
     problem, _, _ = SCENE.pack()
     half = PointToPlane(normal=jnp.ones((5, 3)), distance=jnp.ones(5), weight=problem.points.weight)
-    with pytest.raises(vg.InputError, match=r"`point_to_plane\.normal` has shape \(5, 3\).*FlatTerm"):
+    with raises("`point_to_plane.normal`", "(5, 3)", "FlatTerm"):
         problem.with_term(half)

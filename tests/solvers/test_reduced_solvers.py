@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reported import raises, warns
 from scenes import make_scene
 from sequence_problems import KEYFRAMES, REACH, TIGHT, Pairs, packed, sequence
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
@@ -28,7 +29,7 @@ from vggtgeo.bundle.marginalisation import no_prior
 from vggtgeo.bundle.node_order import longest, narrow_order
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
-from vggtgeo.bundle.solver_choice import MUCH_DENSE, choose_reduced_solver, default_solver
+from vggtgeo.bundle.solver_choice import DENSE_WARNING, choose_reduced_solver, default_solver
 
 LOOPS = ((0, 8), (1, 6), (2, 7))
 SOLVERS = {
@@ -162,7 +163,7 @@ def test_a_marginalisation_prior_needs_no_band() -> None:
 
 def test_a_reach_below_one_is_refused() -> None:
     # Proves the message. Oracle: its text.
-    with pytest.raises(ValueError, match="`reach` is 0; it must be at least 1"):
+    with raises("`reach`", 0, error=ValueError):
         BandCholesky(0)
 
 
@@ -217,10 +218,10 @@ def test_the_choice_follows_the_graph() -> None:
 def test_a_solve_without_a_word_follows_the_graph() -> None:
     # Proves which linear solver `solve` takes by itself, and that a dense one of many keyframes in `jit` is told.
     # Oracle: a chain, whose band is known, and the text of the warning.
-    i = np.arange(MUCH_DENSE + 1)
+    i = np.arange(DENSE_WARNING + 1)
     chain = many(len(i), np.stack([i[:-1], i[1:]], 1))
     assert default_solver(chain).reduced_solver == BandCholesky(1)
     taken = []
-    with pytest.warns(UserWarning, match="of 301 keyframes inside `jit` takes a dense linear solver"):
+    with warns(301, "`jit`", "dense", warning=UserWarning):
         jax.make_jaxpr(lambda problem: taken.append(default_solver(problem)))(chain)
     assert taken[0].reduced_solver == DenseCholesky()

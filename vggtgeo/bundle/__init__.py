@@ -1,1 +1,1 @@
-"""Bundle adjustment: the problem, its terms, solving it, and what the solution knows."""
+"""Bundle adjustment: the problem, its terms, the solver, and the analysis of a solution."""

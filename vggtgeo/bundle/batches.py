@@ -1,4 +1,4 @@
-"""Many windows at once: one padding for all of them, and one call that solves them on all devices."""
+"""Batches of windows: one padded size for all, and one call that solves them on all devices."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def pack_batch(
     """Pack windows of different content to one shape and stack them: every array gets a leading batch axis.
 
     Args:
-        windows: the first four arguments of `pack` for each window, and, as a fifth, its own terms; windows may differ
-            in keyframes, landmarks, edges, and in which terms they have and how many observations of them.
-        size: padded shape; None takes the smallest that fits all.
-        terms: what all windows share.
+        windows: the first four arguments of `pack` for each window and, as an optional fifth, its own terms; windows
+            may differ in keyframes, landmarks, edges, kinds of terms and numbers of observations.
+        size: padded shape; None: the smallest that fits all.
+        terms: terms that all windows share.
         options: the other keyword arguments of `pack`, the same for all windows.
 
     Raises:
-        InputError: no window, or what `pack` finds wrong with one; the message names it.
+        InputError: `windows` is empty, or a window is invalid for `pack`; the message has its index.
 
     Example:
         >>> seen = [vg.simulate_window(keyframes) for keyframes in (2, 3)]
@@ -55,7 +55,7 @@ def pack_batch(
     """
     check_kind("windows", windows, Sequence, "a list of windows")
     if not windows:
-        raise InputError("`windows` is empty; give at least one")
+        raise InputError("`windows` must have at least one window, got none")
     _check_windows(windows)
     given = _same_terms([(*terms, *(term for own in window[4:] for term in own)) for window in windows])
     if size is None:
@@ -73,8 +73,8 @@ def _check_windows(windows: Sequence[Any]) -> None:
     for number, window in enumerate(windows):
         if not isinstance(window, tuple | list) or not 4 <= len(window) <= 5:
             raise InputError(
-                f"`windows[{number}]` is of the type `{type(window).__name__}`; expected (observations, poses, "
-                "intrinsics, inverse_depth), and its terms where it has some"
+                f"`windows[{number}]` must be (observations, poses, intrinsics, inverse_depth), optionally with a list "
+                f"of terms, got the type `{type(window).__name__}`"
             )
         check_kind(f"windows[{number}][0]", window[0], Observations, "`vggtgeo.Observations`")
         with _named(number):
@@ -83,7 +83,7 @@ def _check_windows(windows: Sequence[Any]) -> None:
 
 @contextmanager
 def _named(number: int) -> Iterator[None]:
-    """Errors name the window."""
+    """Prefix errors with the index of the window."""
     try:
         yield
     except InputError as error:
@@ -91,16 +91,16 @@ def _named(number: int) -> Iterator[None]:
 
 
 def _same_terms(windows: Sequence[Sequence[GivenTerm]]) -> list[list[GivenTerm]]:
-    """For each window the same kinds of terms in the same order; one that it lacks has no observation there."""
+    """Return the same kinds of terms in the same order for each window; missing ones have no observation."""
     kinds = {term.name: term for terms in reversed(windows) for term in terms}
     own = [{term.name: term for term in terms} for terms in windows]
     for number, (found, terms) in enumerate(zip(own, windows, strict=True)):
         if len(found) < len(terms):
-            raise InputError(f"`windows[{number}]`: two of its terms have one name: {[term.name for term in terms]}")
-    return [[terms.get(name, _nothing_of(kind)) for name, kind in kinds.items()] for terms in own]
+            raise InputError(f"`windows[{number}]` has terms with equal names, got {[term.name for term in terms]}")
+    return [[terms.get(name, _without_observations(kind)) for name, kind in kinds.items()] for terms in own]
 
 
-def _nothing_of(term: GivenTerm) -> GivenTerm:
+def _without_observations(term: GivenTerm) -> GivenTerm:
     return term.emptied() if isinstance(term, FlatTerm) else term.reweighted(jnp.zeros_like(term.weight))
 
 
@@ -118,22 +118,22 @@ def solve_batch(
     at_once: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Solution:
-    """`solve` for every window of a batch; works under `jit` and `grad` like `solve`.
+    """Solve every window of a batch; works under `jit` and `grad` like `solve`.
 
-    On a CPU one window after the other fills a core, and each stops when it has converged; on a GPU all windows run in
-    one program (`vmap`), which goes on until the last has converged. `benchmarks/batches.py` compares them.
+    On a CPU the windows run one after the other, and each stops when it has converged. On a GPU all windows run in one
+    program (`vmap`) until the last has converged. `benchmarks/batches.py` compares them.
 
     Args:
         problems: every array with a leading batch axis, see `pack_batch`.
-        initials: the same for the starting states.
+        initials: initial states, with the same batch axis.
         solver: as in `solve`.
         adjoint: as in `solve`.
-        at_once: windows solved by one `vmap` on a device, the rest in turn; None: 1 on a CPU, else all.
-        devices: share the batch out over these devices (its length must be a multiple of their number); None: leave
-            the placement to JAX. A process sees its CPU cores as devices when `jax_num_cpu_devices` says so.
+        at_once: number of windows solved by one `vmap` on a device, the others in turn; None: 1 on a CPU, else all.
+        devices: distribute the batch over these devices (its length must be a multiple of their number); None: JAX
+            chooses. Set `jax_num_cpu_devices` to use CPU cores as devices.
 
     Raises:
-        InputError: `problems` and `initials` are not of one number of windows, or cannot be shared out equally.
+        InputError: `problems` and `initials` have different numbers of windows, or cannot be distributed equally.
 
     Example:
         >>> twice = jax.tree.map(lambda leaf: jax.numpy.stack([leaf, leaf]), (problem, initial))
@@ -145,24 +145,25 @@ def solve_batch(
     check_kinds(problems, initials, "initials")
     if jnp.ndim(initials.inverse_depth) != 3:
         raise InputError(
-            "`initials` has no axis of windows; give what `vggtgeo.batches.pack_batch` makes, or use `vggtgeo.solve`"
+            "`initials` must have a leading batch axis: pass the result of `vggtgeo.batches.pack_batch`, or call "
+            "`vggtgeo.solve`"
         )
     count = len(initials.intrinsics)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((problems, initials))}
     if lengths != {(count,)}:
         found = ", ".join(str(length[0]) if length else "none" for length in sorted(lengths))
         raise InputError(
-            f"the arrays of `problems` and `initials` have different numbers of windows ({found}); give both as "
-            "`vggtgeo.batches.pack_batch` makes them"
+            f"`problems` and `initials` must have one number of windows in all arrays, got {found}: pass both as "
+            "returned by `vggtgeo.batches.pack_batch`"
         )
     if at_once is not None:
         check_whole("at_once", at_once, 1)
     if devices is not None and not (devices and all(isinstance(device, jax.Device) for device in devices)):
-        raise InputError(f"`devices` is {devices!r:.60}; expected a list of devices, such as `jax.devices()`, or None")
+        raise InputError(f"`devices` must be a list of devices, such as `jax.devices()`, or None, got {devices!r:.60}")
     if devices is not None and count % len(devices):
         raise InputError(
-            f"`problems` holds {count} windows, `devices` {len(devices)} devices: pad the batch to a multiple, with "
-            "copies of a window for instance"
+            f"`problems` has {count} windows, which must be a multiple of the {len(devices)} `devices`: pad the batch, "
+            "for instance with copies of a window"
         )
     platform = devices[0].platform if devices else jax.default_backend()
     size = at_once or (1 if platform == "cpu" else None)
@@ -177,10 +178,10 @@ def solve_batch(
 
     if devices is None:
         return here(problems, initials)
-    return _shared_out(here, devices)(problems, initials)
+    return _distributed(here, devices)(problems, initials)
 
 
-def _shared_out(here: Any, devices: Sequence[jax.Device]) -> Any:
+def _distributed(here: Any, devices: Sequence[jax.Device]) -> Any:
     mesh = jax.sharding.Mesh(np.asarray(devices), ("batch",))
     batch = PartitionSpec("batch")
     return jax.jit(jax.shard_map(here, mesh=mesh, in_specs=batch, out_specs=batch, check_vma=False))

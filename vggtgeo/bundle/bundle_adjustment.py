@@ -16,7 +16,7 @@ from vggtgeo.solvers.problem import AbstractArrowProblem
 from vggtgeo.solvers.segments import slopes
 
 MIN_SHRINK = 0.1
-"""The depths of a segment fall at most to this fraction in one step, so they stay positive together."""
+"""Smallest factor by which the depths of a segment shrink in one step, so that all stay positive."""
 
 
 class BundleAdjustment(AbstractArrowProblem[State]):
@@ -25,7 +25,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
     problem: Problem
     """Prepared: see `objective.prepared`."""
     start: State | None
-    """Where the iteration starts: held coordinates stay there, and a derivative by them goes through it."""
+    """Initial state: fixed coordinates keep its values, and derivatives by them pass through it."""
 
     def __init__(self, problem: Problem, start: State | None = None):
         self.problem = prepared(problem)
@@ -44,7 +44,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         return linearise(self.problem, point, exact=True)
 
     def retract(self, point: State, step: ArrowVector) -> State:
-        """Poses move by `exp(xi) T`, the camera and inverse depths by addition, those as far as their bound."""
+        """Move poses by `exp(xi) T`, the camera and inverse depths by addition, the latter at most to their bound."""
         first = num_offsets(point)
         moved = point.inverse_depth + step.landmarks[:, first:]
         poses = self.problem.num_camera - self.problem.num_parameters
@@ -73,8 +73,9 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         return State(jaxlie.SE3(poses), intrinsics, depth, point.pixel_offset)
 
     def straightened(self, point: State) -> State:
-        """`point` with the inverse depths of each segment on the straight line nearest to them (or at their mean, where
-        that line is not positive), which is where the iteration keeps them.
+        """Return `point` with the inverse depths of each segment on their least-squares line, as the iteration needs.
+
+        If that line is not positive, all samples get the mean.
         """
         fraction = self.problem.fraction
         if fraction is None:
@@ -87,7 +88,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         return State(point.poses, point.intrinsics, depth, point.pixel_offset)
 
     def _along_segments(self, depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
-        """The same depths, with their derivative by the fractions: a line stays where it is, its samples move on it."""
+        """Return the same depths, with a derivative by the fractions: a line is fixed, its samples move along it."""
         fraction = self.problem.fraction
         if fraction is None:
             return depth
@@ -99,7 +100,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         return self.problem.fraction
 
     def recorded(self, point: State) -> Float[Array, "n 7"]:
-        """The poses."""
+        """Return the poses."""
         return point.poses.wxyz_xyz
 
     def zero_step(self, point: State) -> ArrowVector:
@@ -110,8 +111,8 @@ class BundleAdjustment(AbstractArrowProblem[State]):
 
 
 def _shortened(depth: Float[Array, "h l"], moved: Float[Array, "h l"], segments: int) -> Float[Array, "h l"]:
-    """The step of each segment as a whole, as far as all its samples stay positive: a line stays a line."""
-    change, room = moved - depth, depth - _least(depth)
+    """Shorten the step of each segment by one factor, so that all its samples stay positive and on a line."""
+    change, room = moved - depth, depth - _lower_bound(depth)
     too_far = -change > room
     share = jnp.where(too_far, room / jnp.where(too_far, -change, 1.0), 1.0)
     share = jnp.min(share.reshape(len(depth), segments, -1), 2, keepdims=True)
@@ -119,7 +120,7 @@ def _shortened(depth: Float[Array, "h l"], moved: Float[Array, "h l"], segments:
     return jnp.where(share < 1, depth + share * change, moved)
 
 
-def _least(depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
+def _lower_bound(depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
     return jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
 
 

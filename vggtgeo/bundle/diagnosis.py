@@ -1,10 +1,13 @@
-"""What a solve reports beside why it ended: the observations that are at fault, term by term.
+"""Diagnosis of a solve: faulty observations, term by term.
 
-Four faults that an energy does not show. A residual or a derivative that is not finite. A term most of whose
-observations its kernel rejects: with more than half of them gone, the breakdown point of any robust estimate, what is
-left says nothing about the term. A held pose that contradicts terms in a frame of their own (position fixes): moving
-all poses together as one rigid body, which no image can notice, would lower the energy of the term. And positions that
-the precision cannot hold as finely as the observations are stated.
+Four faults that the energy does not show:
+
+- a residual or a derivative that is not finite;
+- a term most of whose observations are rejected by its kernel: beyond one half, the breakdown point of any robust
+  estimate, the result does not depend on the term in a meaningful way;
+- a fixed pose that is inconsistent with terms in a frame of their own (position fixes): a rigid motion of all poses,
+  which the images do not observe, would lower the energy of the term;
+- positions whose rounding error is larger than the standard deviation of the observations.
 """
 
 from __future__ import annotations
@@ -45,12 +48,12 @@ from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
 
 SIGNIFICANCE = 1e-3
-"""Probability that Gaussian noise of the stated weights makes an observation count as rejected, or a held pose as
-contradicted."""
+"""Significance level: probability that Gaussian noise of the given weights makes an observation count as rejected, or a
+fixed pose as inconsistent."""
 
 
 class Diagnosis(eqx.Module):
-    """Faults of a problem at a state, an entry a term; a pytree of arrays, for one problem or a batch.
+    """Faults of a problem at a state, one entry for each term; a pytree of arrays, for one problem or a batch.
 
     Example (of `solve`'s):
         >>> solution.diagnosis.names
@@ -61,28 +64,27 @@ class Diagnosis(eqx.Module):
     """
 
     value: Int[Array, " k"]
-    """First observation, counted through the axes of the term's weight, whose residual is not finite; -1 = none."""
+    """First observation whose residual is not finite, a flat index into the term's weight; -1 = all are finite."""
     derivative: Int[Array, " k"]
-    """First one whose residual has a derivative that is not finite; -1 = none."""
+    """First observation whose residual has a derivative that is not finite; -1 = all are finite."""
     rejected: Float[Array, " k"]
-    """Share of the observations beyond the noise that their weights state (`SIGNIFICANCE`) where the kernel's pull
-    falls with the distance."""
+    """Share of outliers by the noise of their weights (`SIGNIFICANCE`), in the range where the kernel redescends."""
     unresolved: Float[Array, " k"]
     """Share of the observations that the last digit of a pose's position moves by more than a standard deviation."""
     saved: Float[Array, " k"]
-    """Of a term on poses: by how much its `sum w rho' |r|^2` would fall if all poses moved as one rigid body."""
+    """Of a term on poses: decrease of its `sum w rho' |r|^2` by the best rigid motion of all poses."""
     motion: Float[Array, "k 6"]
-    """That motion, in the axes of the first held camera: metres, then radians."""
+    """That motion, in the axes of the first fixed camera: metres, then radians."""
     energy: Float[Array, ""]
     """`sum rho`, of all terms."""
     redundancy: Int[Array, ""]
-    """Rows of residuals less free unknowns."""
+    """Rows of residuals minus free unknowns."""
     names: tuple[str, ...] = eqx.field(static=True)
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     """Of the terms' weights."""
 
     def sentences(self, failed: bool) -> list[str]:
-        """What is wrong, in words (outside `jit`, for one problem). failed: the solve ended in no optimum."""
+        """Return the faults as sentences (outside `jit`, for one problem). failed: the solve did not converge."""
         found = [self._not_finite(k) for k in range(len(self.names))] if failed else []
         found += [self._unresolved(k) for k in range(len(self.names))]
         found += [] if failed else [self._rejected(k) for k in range(len(self.names))]
@@ -92,10 +94,10 @@ class Diagnosis(eqx.Module):
     def _not_finite(self, k: int) -> str:
         value, derivative = int(self.value[k]), int(self.derivative[k])
         if value >= 0:
-            return f"The residual of `{self.names[k]}` is not finite, first of {self._place(k, value)}."
+            return f"The residual of `{self.names[k]}` is not finite, first at {self._place(k, value)}."
         if derivative >= 0:
             return (
-                f"The residual of `{self.names[k]}` is finite, but its derivative is not, first of "
+                f"The residual of `{self.names[k]}` is finite, but its derivative is not, first at "
                 f"{self._place(k, derivative)}: the norm of a vector or a root has no derivative at zero."
             )
         return ""
@@ -118,8 +120,8 @@ class Diagnosis(eqx.Module):
         if not share > MAJORITY:
             return ""
         return (
-            f"The kernel of `{self.names[k]}` rejects {share:.0%} of its observations, which have no part in the "
-            "result: look for another frame, unit or weight of them, or start with `Graduation`."
+            f"The kernel of `{self.names[k]}` rejects {share:.0%} of its observations, which then do not influence the "
+            "result: check their frame, unit and weight, or start with `Graduation`."
         )
 
     def _contradicted(self, k: int) -> str:
@@ -130,16 +132,16 @@ class Diagnosis(eqx.Module):
             return ""
         metres, radians = (float(np.linalg.norm(half)) for half in np.split(np.asarray(self.motion[k]), 2))
         return (
-            f"The poses that are held contradict `{self.names[k]}`: {saved / float(self.energy):.0%} of all squared "
-            f"residuals would go if all poses moved together by {metres:.3g} m and {np.degrees(radians):.3g} degrees. "
-            "Bring the start into the frame of the term, or hold no pose (`fixed_pose`)."
+            f"The fixed poses are inconsistent with `{self.names[k]}`: a motion of all poses by {metres:.3g} m and "
+            f"{np.degrees(radians):.3g} degrees would remove {saved / float(self.energy):.0%} of squared residuals. "
+            "Transform the initial poses into the frame of the term, or fix no pose (`fixed_pose`)."
         )
 
 
 def diagnose(problem: Problem, start: State, state: State, energy: Float[Array, ""] | None = None) -> Diagnosis:
-    """The faults of a prepared problem at `state`; positions are looked at where the iteration starts.
+    """Find the faults of a prepared problem at `state`; the precision of positions is checked at `start`.
 
-    energy: of the problem at `state`, where it is known.
+    energy: of the problem at `state`, if it is known.
     """
     terms = problem.terms
     slopes = [_at_both(problem, term, start, state) for term in terms]
@@ -166,7 +168,7 @@ def diagnose(problem: Problem, start: State, state: State, energy: Float[Array, 
 
 
 def diagnosis_like(problem: Problem) -> Diagnosis:
-    """A diagnosis of the structure of that of `problem`, without its numbers."""
+    """Return a diagnosis with the structure of that of `problem` and placeholder values."""
     count, dtype = len(problem.terms), problem.pixels.dtype
     whole, share = jnp.zeros(count, int), jnp.zeros(count, dtype)
     names, shapes = (
@@ -182,42 +184,41 @@ def _diagnose_jit(problem: Problem, state: State) -> Diagnosis:
     return diagnose(prepared(problem), state, state)
 
 
-def refuse_not_finite(problem: Problem, state: State, finite: Any) -> None:
-    """InputError where numbers of a linearisation at `state` are not finite, with the term and the observation that
-    are why; inside `jit` nothing, for there results are NaN.
+def check_linearisation(problem: Problem, state: State, finite: Any) -> None:
+    """Raise InputError if a linearisation at `state` is not finite, with the term and the observation at fault.
+
+    Inside `jit` this does nothing: there results are NaN.
     """
     if isinstance(finite, jax.core.Tracer) or np.all(finite):
         return
     found = _diagnose_jit(problem, state).sentences(failed=True)
-    why = " ".join(found) or "Look for weights or standard deviations that are far too large or too small."
-    raise InputError(f"`problem` has no finite linearisation at `state`. {why}")
+    why = " ".join(found) or "Check for weights or standard deviations that are far too large or too small."
+    raise InputError(f"the linearisation of `problem` at `state` must be finite. {why}")
 
 
 class Observed(NamedTuple):
-    """Of each observation of a term, in the axes of its weight."""
+    """Check results of each observation of a term, in the axes of its weight."""
 
     present: Bool[Array, "*b"]
     squared: Float[Array, "*b"]
     """`w |r|^2`."""
     value: Bool[Array, "*b"]
-    """Whether its residual is finite."""
+    """Whether the residual is finite."""
     derivative: Bool[Array, "*b"]
-    """Whether all derivatives of that are."""
+    """Whether all derivatives of the residual are finite."""
     entries: int
-    """Of one residual."""
+    """Number of entries of one residual."""
 
 
 class _Slopes(NamedTuple):
-    """Residuals of a term on poses and their derivatives by local coordinates, where the iteration starts and where it
-    ends.
-    """
+    """Residuals of a term on poses and their derivatives by local coordinates, at the initial and the final state."""
 
     residual: Float[Array, "2 m k"]
     jacobian: Float[Array, "2 m k d"]
 
 
 def _at_both(problem: Problem, term: AbstractTerm, start: State, state: State) -> _Slopes | None:
-    """None for another term, and without observations. Of both states in one program: it is compiled once."""
+    """Return None for other kinds of terms, and without observations. One `vmap` over both states compiles once."""
     if not isinstance(term, PoseTerm | PairTerm) or not len(term.weight):
         return None
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), start, state)
@@ -237,7 +238,7 @@ def _observed(problem: Problem, term: AbstractTerm, state: State, slopes: _Slope
             entries=residual.shape[1],
         )
     zero = jnp.zeros(state.num_unknowns, state.inverse_depth.dtype)
-    # One derivative along all coordinates together is not finite if any is not.
+    # The derivative along the sum of all coordinates is not finite if any derivative is not.
     residuals = lambda step: term_residuals(problem, term, state.moved(step))
     residual, slope = jax.jvp(residuals, (zero,), (jnp.ones_like(zero),))
     if jnp.ndim(term.weight) == 0:  # one observation, whose residual is a vector
@@ -266,7 +267,7 @@ def _observed_on_edges(problem: Problem, term: EdgeTerm, state: State) -> Observ
         squared = one.weights * jnp.sum(residual**2, 0)
         return squared, jnp.all(jnp.isfinite(residual), 0), jnp.all(jnp.isfinite(slope), 0)
 
-    # A loop: of all edges at once the projections would fill the memory.
+    # A loop over edges: the projections of all edges together would fill the memory.
     squared, value, derivative = jax.lax.map(
         edge, (places(problem), motions_of(relative_poses(problem, state)), edge_data(alone))
     )
@@ -284,10 +285,10 @@ def _share(which: Bool[Array, "*b"], present: Bool[Array, "*b"]) -> Float[Array,
 
 def _rejected(term: AbstractTerm, own: Observed) -> Float[Array, ""]:
     level = float(stats.chi2.isf(SIGNIFICANCE, own.entries))
-    # The derivative of the pull `rho'(s) r` along the residual: below zero it falls with the distance.
+    # The derivative of the force `rho'(s) r` along the residual: negative where the kernel redescends.
     weight = term.kernel.weight(own.squared)
     rises = weight + 2 * own.squared * term.kernel.curvature(own.squared)
-    rounding = 10 * jnp.finfo(weight.dtype).eps * weight  # Huber's pull is constant
+    rounding = 10 * jnp.finfo(weight.dtype).eps * weight  # Huber's force is constant
     return _share((own.squared > level) & (rises < -rounding), own.present)
 
 
@@ -313,7 +314,7 @@ def _unresolved(problem: Problem, term: AbstractTerm, state: State, slopes: _Slo
 
 
 class _Rigid(NamedTuple):
-    """A term's gradient and Hessian by a rigid motion of all poses together, and what the poses feel one by one."""
+    """A term's gradient and Hessian by a rigid motion of all poses, and the diagonal summed over single poses."""
 
     gradient: Float[Array, "6"]
     hessian: Float[Array, "6 6"]
@@ -339,7 +340,7 @@ def _rigid(term: AbstractTerm, carry: Float[Array, "n 6 6"], slopes: _Slopes | N
 
 
 def _carried(problem: Problem, state: State) -> Float[Array, "n 6 6"]:
-    """Tangent of each pose by that of a rigid motion, in the axes of the first held camera."""
+    """Return the tangent of each pose by that of a rigid motion, in the axes of the first fixed camera."""
     poses = state.poses.wxyz_xyz
     anchor = jaxlie.SE3(poses[jnp.argmax(problem.fixed_pose)])
     return lie.adjoint(jax.vmap(lambda pose: lie.relative(anchor, jaxlie.SE3(pose)))(poses))
@@ -348,13 +349,13 @@ def _carried(problem: Problem, state: State) -> Float[Array, "n 6 6"]:
 def _saved(
     problem: Problem, state: State, slopes: list[_Slopes | None]
 ) -> tuple[Float[Array, " k"], Float[Array, "k 6"]]:
-    """`g' K^+ g` and `-K^+ g` of each term, of its gradient and Hessian by a rigid motion."""
+    """Return `g' K^+ g` and `-K^+ g` of each term, with its gradient and Hessian by a rigid motion."""
     if not any(own is not None for own in slopes):
         return jnp.zeros(len(slopes)), jnp.zeros((len(slopes), lie.TANGENT))
     carry = _carried(problem, state)
     terms = [_rigid(term, carry, own) for term, own in zip(problem.terms, slopes, strict=True)]
     gradient, hessian, size = (jnp.stack(parts) for parts in zip(*terms, strict=True))
-    # Balanced by what the poses feel one by one: a relative term feels no common motion but by rounding.
+    # Balanced by the diagonal over single poses: the response of a relative term to a common motion is rounding error.
     scale = jnp.sqrt(jnp.where(size > 0, size, 1.0))
     balanced = hessian / scale[:, :, None] / scale[:, None, :]
     finite = jnp.all(jnp.isfinite(balanced), (1, 2)) & jnp.all(jnp.isfinite(gradient), 1)

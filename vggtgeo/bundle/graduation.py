@@ -1,8 +1,8 @@
-"""Graduated non-convexity: a way into the basin of a redescending kernel from a start that outliers dominate.
+"""Graduated non-convexity: initialisation of a redescending kernel when outliers dominate the initial residuals.
 
-A kernel so wide that it is nearly quadratic has few local minima; its optimum is the start for the next narrower one,
-and so on down to the kernel asked for (Blake & Zisserman 1987; Yang et al., RA-L 2020). Only the last, full solve is
-differentiated: the optimum does not depend on the way to it.
+A very wide kernel is nearly quadratic and has few local minima. Its optimum is the initial state for the next narrower
+kernel, and so on down to the requested one (Blake & Zisserman 1987; Yang et al., RA-L 2020). Only the last, full solve
+is differentiated, since the optimum does not depend on the path to it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from vggtgeo.solvers.problem import energy_of
 
 
 class Graduation(eqx.Module):
-    """A few iterations at each of these kernel widths before the solve proper.
+    """A few iterations with each of these wider kernels before the solve.
 
     Fields:
-        factors: Widths, in units of the kernel's own.
-        iterations: Tries at each width.
+        factors: Widths, relative to the kernel's own.
+        iterations: Iterations at each width.
 
     Example: `vg.solve(problem, initial, graduation=vg.Graduation())`, from 16 times the kernel's width to twice.
         >>> vg.Graduation().factors
@@ -39,15 +39,15 @@ class Graduation(eqx.Module):
     iterations: int = eqx.field(static=True, default=4)
 
     def __check_init__(self) -> None:
-        """InputError for widths or a number of tries that are none."""
+        """Raise InputError for invalid widths or an invalid number of iterations."""
         check_whole("iterations", self.iterations, 0)
         factors = real_numbers("factors", self.factors)
         if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
-            must = "a tuple of positive widths, in units of the kernel's own"
-            raise InputError(f"`factors` is {self.factors}; it must be {must}")
+            must = "a tuple of positive widths, relative to the kernel's own"
+            raise InputError(f"`factors` must be {must}, got {self.factors}")
 
     def start(self, problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> State:
-        """The state after the widest to the narrowest of the factors, held coordinates as in `initial`."""
+        """Return the state after all factors, the widest first; fixed coordinates as in `initial`."""
         brief = eqx.tree_at(lambda s: s.max_iterations, solver, self.iterations)
 
         def stage(state: State, factor: Float[Array, ""]) -> tuple[State, None]:

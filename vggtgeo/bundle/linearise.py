@@ -1,11 +1,10 @@
 """Normal equations, gradient and exact Hessian of any sum of terms, in the arrow's shape.
 
-One pass over the edges, sorted by row: every edge term gives columns `[6 + c + 2, m p]` (see `terms/edge.py`); their
-Gram matrix is kept in relative coordinates, and their products with the depth column are added into the row's cross
-terms in place: relative pose and target's camera in rows of the edge's own, the host's camera (or the one that all
-share) in rows that all edges of the row add to. Slot terms lie on the diagonal of the landmarks, terms on poses and
-pairs become blocks, the cameras' and the dense ones one small matrix (layout chosen by measurement on CPU, see
-`benchmarks/solver.py`).
+One pass over the edges, sorted by row: every edge term gives columns `[6 + c + 2, m p]` (see `terms/edge.py`). Their
+Gram matrix is kept in relative coordinates. Their products with the depth column are added in place to the row's cross
+terms: relative pose and target camera in separate rows for each edge, the host camera (or the shared one) in rows that
+all edges of the row add to. Slot terms are on the diagonal of the landmarks, terms on poses and pairs become blocks,
+camera and dense terms one small matrix (layout chosen by measurement on CPU, see `benchmarks/solver.py`).
 """
 
 from __future__ import annotations
@@ -45,16 +44,16 @@ def linearise(
     exact: bool = False,
     joined: bool = True,
 ) -> ArrowSystem:
-    """Second-order model of the energy of a prepared problem at `state`, with its exact gradient.
+    """Return the second-order model of the energy of a prepared problem at `state`, with its exact gradient.
 
     The Hessian is the reweighted Gauss-Newton one, or the exact one (in the coordinates of `exp(x) T` and additive
-    camera parameters and inverse depths). With a `correction` the reweighted one is corrected for that part of the
-    kernels' curvature, see `terms/term.py`. Not `joined`: landmarks that depend on each other (segments, points with
-    free pixels) are not in the basis that makes them scalars, so that systems may be added.
+    camera parameters and inverse depths). `correction` adds that part of the kernels' curvature to the reweighted one,
+    see `terms/term.py`. Without `joined`, coupled landmarks (segments, points with free pixels) are not in the basis
+    that makes them scalars, so that systems can be added.
     """
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
     degree, size = problem.edges.of_host.shape[1], lie.TANGENT + cameras.seen
-    apart = cameras.seen - cameras.size  # of the target's camera, where it may be another than the host's
+    apart = cameras.seen - cameras.size  # parameters of the target's camera, if it can differ from the host's
     wide = lie.TANGENT * degree
     common = wide + apart * degree
 
@@ -86,7 +85,7 @@ def linearise(
         (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
-    # After the edges, in place: XLA would copy cross terms that do not begin as zeros.
+    # After the edges, in place: XLA would copy cross terms that are not initialised with zeros.
     if by_pixel is None:
         cross = cross.at[:, -2:].add(jnp.stack(by_depth, 1))
     else:
@@ -119,10 +118,10 @@ def linearise(
 
 
 def energy_gradient(problem: Problem, state: State) -> ArrowVector:
-    """Gradient of a prepared problem by left tangents, camera and inverse depths, held coordinates as if free.
+    """Return the gradient by left tangents, camera and inverse depths of a prepared problem, as if all were free.
 
-    What implicit differentiation differentiates once more: one order of automatic differentiation instead of two. The
-    part by the relative pose of an edge goes to its two poses through `eta = x_j - Ad(M) x_i`.
+    Implicit differentiation differentiates it once more, so that one order of automatic differentiation suffices. The
+    part by the relative pose of an edge is transformed to its two poses by `eta = x_j - Ad(M) x_i`.
     """
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
     first = num_offsets(state)
@@ -162,18 +161,18 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
 
 
 def _graph(problem: Problem) -> EdgeGraph:
-    """The covisibility graph, with the camera of each keyframe where there are several, and the host of each row."""
+    """Return the covisibility graph, with the camera of each keyframe (if several) and the host of each row."""
     edges = problem.edges
     return EdgeGraph(edges.source, edges.target, edges.of_host, problem.camera_of, problem.host)
 
 
 def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
-    """Which of the dense coordinates move, `bool[c]`."""
+    """Return which of the dense coordinates are free, `bool[c]`."""
     return jnp.concatenate([jnp.repeat(~problem.fixed_pose, lie.TANGENT), ~problem.fixed_intrinsics.reshape(-1)])
 
 
 def scale_direction(problem: Problem, state: State) -> Float[Array, "c 1"]:
-    """Unit motion of the poses under a change of scale about the first held camera (about camera 0 without one)."""
+    """Return the unit motion of the poses under a change of scale about the first fixed camera, or camera 0."""
     rotations, translations = state.poses.rotation().as_matrix(), state.poses.translation()
     held = jnp.argmax(problem.fixed_pose)
     anchor = -rotations[held].T @ translations[held]
@@ -185,7 +184,7 @@ def scale_direction(problem: Problem, state: State) -> Float[Array, "c 1"]:
 
 
 def lie_curvature(gradient: Float[Array, "e 6"]) -> Float[Array, "e 6 6"]:
-    """Curvature of the relative tangent in the two poses: `B_ab = 1/2 <gradient by eta, [e_a, e_b]>`.
+    """Return the curvature of the relative tangent in the two poses: `B_ab = 1/2 <gradient by eta, [e_a, e_b]>`.
 
     `exp(x_j) M exp(-x_i) = exp(eta) M` with `eta = x_j - A x_i + 1/2 [x_j, -A x_i] + O(3)` (Baker-Campbell-Hausdorff),
     and the bracket of se(3) is `[(v, w), (v', w')] = (w x v' + v x w', w x w')`.
@@ -208,12 +207,12 @@ with free pixels."""
 
 
 def num_offsets(state: State) -> int:
-    """`2 p`: unknowns that are coordinates of free pixels, the first landmarks of each keyframe: all `u`, all `v`."""
+    """Return `2 p`, the number of free pixel coordinates: the first unknowns of each row, all `u`, then all `v`."""
     return 0 if state.pixel_offset is None else 2 * state.pixel_offset.shape[1]
 
 
 def offsets_of(landmarks: Float[Array, "n t"]) -> Float[Array, "n p 2"]:
-    """The unknowns of free pixels as offsets."""
+    """Return the unknowns of free pixels as offsets."""
     return jnp.swapaxes(landmarks.reshape(len(landmarks), 2, -1), 1, 2)
 
 
@@ -229,12 +228,12 @@ def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[in
     for columns, (_, view) in zip(parts, seen, strict=True):
         slots, depth = len(view.inverse_depth), view.size + 1
         own, pixels = columns[: depth + 1], columns[depth + 1 :]
-        # One unknown after the other: XLA does not vectorise a loop over all of them at once.
+        # One unknown after the other: XLA does not vectorise a loop over all of them.
         coupled.append([products(own, by_one, slots) for by_one in (*pixels, own[-1])])
         pairs = [(pixels[a], pixels[b]) for a, b in ((0, 0), (1, 1), (0, 1))] if view.free_pixels else []
         blocks.append(jnp.stack([products(a, b, slots) for a, b in pairs]) if pairs else None)
     size = seen[0][1].size
-    # Of all columns: those of the shared coordinates alone would be copied first.
+    # The product of all columns: a slice of the shared coordinates would be copied first.
     gram = sum((columns @ columns.T)[: size + 1, : size + 1] for columns in parts)
     return gram, *_placed(seen, coupled, blocks, sizes)
 
@@ -256,7 +255,7 @@ def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, in
 def _placed(
     seen: Seen, coupled: list[list[Array]], blocks: list[Array | None], sizes: tuple[int, int]
 ) -> tuple[Columns, Array | None]:
-    """The terms' cross terms and blocks at their landmarks, added up."""
+    """Return the terms' cross terms and blocks at their landmarks, added up."""
     parts = [part for (term, view), own in zip(seen, coupled, strict=True) for part in _places(term, view, own, sizes)]
     pixels = [
         (term.first_slot, own[:, : view.free_pixels])
@@ -269,9 +268,7 @@ def _placed(
 
 
 def _places(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tuple[int, int]) -> Columns:
-    """Where the columns of a term (those by `u`, `v` of its slots, if any, and by inverse depth) are among the
-    landmarks.
-    """
+    """Return the columns of a term by `u`, `v` (if free) and inverse depth, with their landmark positions."""
     free, points = view.free_pixels, sizes[0]
     *pixels, depth = by_unknown
     by_pixel = [(axis * points + term.first_slot, own[:, :free]) for axis, own in enumerate(pixels)]
@@ -279,10 +276,10 @@ def _places(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tupl
 
 
 def _joined(parts: Columns, size: int) -> Columns:
-    """Blocks of columns that cover all `size` columns once, each with its first column."""
+    """Merge blocks of columns to blocks that cover all `size` columns once, each with its first column."""
     ends = [start + part.shape[1] for start, part in parts]
     if [0, *ends] == [*(start for start, _ in parts), size]:
-        return parts  # one after the other, as points and lines: no padding, no sum
+        return parts  # contiguous, as points and lines are: neither padding nor a sum
     total = jnp.zeros((len(parts[0][1]), size), parts[0][1].dtype)
     for start, part in parts:
         total = total.at[:, start : start + part.shape[1]].add(part)
@@ -292,7 +289,7 @@ def _joined(parts: Columns, size: int) -> Columns:
 def _depth_terms(
     problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
 ) -> tuple[Float[Array, "h s"], Float[Array, "h s"]]:
-    """Gradient and curvature of the terms on inverse depths."""
+    """Return gradient and curvature of the terms on inverse depths."""
     gradient = jnp.zeros_like(state.inverse_depth)
     curvature = jnp.zeros_like(gradient)
     for term in problem.slot_terms:
@@ -304,7 +301,7 @@ def _depth_terms(
 def _pixel_terms(
     problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
 ) -> tuple[Float[Array, "h 3 p"], Float[Array, "h 2 p"]] | tuple[None, None]:
-    """Hessian and gradient of the terms on free pixels."""
+    """Return Hessian and gradient of the terms on free pixels."""
     if state.pixel_offset is None:
         return None, None
     rows, points, _ = state.pixel_offset.shape
@@ -317,7 +314,7 @@ def _pixel_terms(
 
 
 def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool[Array, "h t"] | None:
-    """Landmarks on their bound that the energy presses against it; those of segments move as a whole and never are."""
+    """Return the landmarks at an active bound; segments are bounded as a whole and never marked."""
     if not problem.positive_depth:
         return None
     alone = jnp.arange(gradient.shape[1]) < problem.first_segment
@@ -328,7 +325,7 @@ def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool
 def _node_factors(
     problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
 ) -> NodeFactors | None:
-    """All terms on poses and pairs as blocks over `(first, second, camera of the first)`."""
+    """Return all terms on poses and pairs as blocks over `(first, second, camera of the first)`."""
     found = []
     cameras, block = cameras_of(problem, state), lie.TANGENT
     tail = cameras.size
@@ -340,13 +337,13 @@ def _node_factors(
             gradient = jnp.pad(gradient, ((0, 0), (0, tail)))
             found.append(NodeFactors(touched[0], touched[1], hessian, gradient))
         else:
-            # Nothing touches the second node's place, between the pose and the camera.
+            # The columns of the second node, between the pose and the camera, stay zero.
             apart = jnp.concatenate([jnp.arange(block), 2 * block + jnp.arange(tail)])
             whole = jnp.zeros((len(gradient), 2 * block + tail, 2 * block + tail), gradient.dtype)
             whole = whole.at[:, apart[:, None], apart].set(hessian)
             spread = jnp.zeros((len(gradient), 2 * block + tail), gradient.dtype).at[:, apart].set(gradient)
-            nobody = jnp.full_like(touched[0], problem.num_keyframes)
-            found.append(NodeFactors(touched[0], nobody, whole, spread))
+            no_node = jnp.full_like(touched[0], problem.num_keyframes)
+            found.append(NodeFactors(touched[0], no_node, whole, spread))
     if not found:
         return None
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
@@ -365,9 +362,9 @@ def _to_nodes(problem: Problem, factors: NodeFactors) -> Float[Array, " c"]:
 def _dense_terms(
     problem: Problem, state: State, correction: Float[Array, ""] | None, exact: bool
 ) -> tuple[Float[Array, "p p"], Float[Array, " c"]]:
-    """Hessian and gradient of the terms on the camera and of the dense ones.
+    """Return Hessian and gradient of the camera terms and the dense terms.
 
-    Without the latter only the camera's coordinates have a Hessian, and no matrix over all poses is made.
+    Without dense terms the Hessian has only the camera's coordinates, so no matrix over all poses is allocated.
     """
     tail = problem.num_parameters
     hessian = jnp.zeros((tail, tail), state.inverse_depth.dtype)

@@ -1,14 +1,14 @@
-"""Marginalisation: what a keyframe that leaves the window has said about the others, as a Gaussian prior.
+"""Marginalisation: the information of a keyframe that leaves the window, as a Gaussian prior on the others.
 
-What goes with a keyframe are the terms on the landmarks that it hosts, on its pose, on pairs that it is part of, and
-the prior that earlier keyframes left behind. At fixed linearisation points they form the quadratic
+The terms removed with a keyframe are those on the landmarks that it hosts, on its pose, on its pairs, and the prior of
+earlier marginalisations. At fixed linearisation points they form the quadratic
 
     1/2 x' H x + g' x,     x = (states) boxminus (linearisation points),
 
-from which the landmarks and then the leaving pose are eliminated by Schur complements. The square root of what is left
-is the new prior `1/2 |R x + r0|^2`. States that already are under a prior keep their linearisation point (first
-estimates): two linearisations of one state would add information along the gauge, which no measurement contains.
-Cost: one linearisation, one symmetric eigenvalue problem of size `6 n + 4`.
+from which the landmarks and then the leaving pose are eliminated by Schur complements. The square root of the result is
+the new prior `1/2 |R x + r0|^2`. States that are already under a prior keep their linearisation point (first-estimates
+Jacobians): two linearisations of one state would add spurious information along the gauge. Cost: one linearisation, one
+symmetric eigenvalue problem of size `6 n + 4`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.diagnosis import refuse_not_finite
+from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observed import check_weights
@@ -41,13 +41,13 @@ from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.solvers.arrow import reduce
 from vggtgeo.solvers.finite import is_finite, unless
 
-_MOST_KEYFRAMES = 1000
-"""Of a prior, whose matrix is dense: 0.3 GB."""
+_MAX_KEYFRAMES = 1000
+"""Largest number of keyframes of a prior, whose matrix is dense: 0.3 GB."""
 _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
 def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: int = 4) -> MarginalPrior:
-    """A prior that says nothing, of the shape of one for `keyframes` keyframes and cameras of so many `parameters`.
+    """Return an empty prior (zero information) for `keyframes` keyframes and `parameters` camera parameters.
 
     Example:
         >>> import vggtgeo as vg
@@ -55,8 +55,8 @@ def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: in
         (28, 28)
 
     """
-    check_whole("keyframes", keyframes, 1, _MOST_KEYFRAMES)
-    check_whole("parameters", parameters, 1, _MOST_KEYFRAMES)
+    check_whole("keyframes", keyframes, 1, _MAX_KEYFRAMES)
+    check_whole("parameters", parameters, 1, _MAX_KEYFRAMES)
     size = lie.TANGENT * keyframes + parameters
     identity = np.tile(np.array([1.0, 0, 0, 0, 0, 0, 0], dtype), (keyframes, 1))
     return MarginalPrior(
@@ -69,10 +69,14 @@ def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: in
 
 
 def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -> MarginalPrior:
-    """The prior over poses and camera that remains when keyframe `leaving` is taken out of the window.
+    """Marginalise keyframe `leaving`: return the prior over the other poses and the camera.
 
-    The problem must have a `marginal` term (`problem.with_term(no_prior(n))` to begin with). The result has the same
-    shape; it says nothing about the keyframe that left. Pure; `leaving` may be traced.
+    The problem must have a `marginal` term (at first `problem.with_term(no_prior(n))`). The result has the same shape,
+    with zero information about keyframe `leaving`. Pure; `leaving` may be traced.
+
+    Raises:
+        InputError: `leaving` is out of range, or `state` does not match `problem` or is not finite.
+        ValueError: `problem` has no `marginal` term.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> window = problem.with_term(vg.no_prior(4))
@@ -90,7 +94,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     prior = _marginal_term(problem)
     point = _linearisation_point(prior, state)
     quadratic, gradient, finite = _quadratic(problem, point, leaving)
-    refuse_not_finite(problem, point, finite)
+    check_linearisation(problem, point, finite)
     leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
     leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
     held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics.reshape(-1)])
@@ -102,20 +106,20 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
 
 
 def reorder(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPrior:
-    """The prior with keyframe `order[i]` in place i; -1 puts a keyframe there that it says nothing about.
+    """Permute a prior: keyframe `order[i]` comes to position i; -1 inserts a keyframe without information.
 
-    order: int [n]. Pure; `prior` and `order` may be traced. A traced order has no values to check.
+    order: int [n]. Pure; `prior` and `order` may be traced. The values of a traced order are not checked.
 
     Raises:
-        InputError: an order that names a keyframe twice, or one that is not there.
+        InputError: `order` has a keyframe twice, or an index out of range.
 
-    Example: the first of three keyframes has left, and a place is free at the end.
+    Example: the first of three keyframes has left, and a new one takes the last position.
         >>> import numpy as np, vggtgeo as vg
         >>> vg.reorder(vg.no_prior(3), np.array([1, 2, -1])).root.shape
         (22, 22)
 
     """
-    check_kind("prior", prior, MarginalPrior, "a prior, such as `vggtgeo.marginalise` gives")
+    check_kind("prior", prior, MarginalPrior, "a prior, such as the result of `vggtgeo.marginalise`")
     order = _order_of(order, len(prior.poses.wxyz_xyz))
     known, tail = order >= 0, len(prior.intrinsics)
     place = jnp.maximum(order, 0)
@@ -138,12 +142,12 @@ def _order_of(given: Any, count: int) -> Int[Array, " n"]:
         or (inside >= count).any()
     ):
         found = f"{order.dtype}{list(order.shape)}" if traced else order.tolist()
-        raise InputError(f"`order` is {found}; it must have whole numbers below {count}, each once, or -1")
+        raise InputError(f"`order` must have distinct whole numbers below {count}, or -1, got {found}")
     return jnp.asarray(order)
 
 
 def _linearisation_point(prior: MarginalPrior, state: State) -> State:
-    """The prior's own points where it says something, the current estimate elsewhere."""
+    """Return the prior's linearisation points where it has information, the current estimate elsewhere."""
     weight, tail = jnp.sum(prior.root**2, 0), len(prior.intrinsics)
     pose_known = jnp.sum(weight[:-tail].reshape(-1, lie.TANGENT), 1) > 0
     intrinsics_known = weight[-tail:] > 0
@@ -156,7 +160,7 @@ def _linearisation_point(prior: MarginalPrior, state: State) -> State:
 
 
 def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""] | int) -> tuple[Array, Array, Bool[Array, ""]]:
-    """Hessian and gradient of the leaving terms over the dense coordinates, landmarks eliminated; are they finite?"""
+    """Return Hessian and gradient of the leaving terms with landmarks eliminated, and whether they are finite."""
     leaving_terms = tuple(_leaving(term, problem, leaving) for term in problem.terms)
     system = linearise(prepared(problem.with_terms(leaving_terms)), point)
     reduced = reduce(system)
@@ -164,7 +168,7 @@ def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""] | int) ->
 
 
 def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int) -> AbstractTerm:
-    """The part of a term that goes with a keyframe; what is about the camera alone stays in the problem."""
+    """Return the part of a term that is removed with a keyframe; terms on the camera alone stay in the problem."""
     goes: Array
     if isinstance(term, EdgeTerm):
         goes = (problem.edges.source == leaving)[:, None]
@@ -182,7 +186,7 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
 def _eliminate(
     quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows: Bool[Array, " c"], held: Bool[Array, " c"]
 ) -> _Quadratic:
-    """Condition on held coordinates, then take the leaving rows out by a Schur complement (pseudo-inverse)."""
+    """Condition on fixed coordinates, then eliminate the leaving rows by a Schur complement (pseudo-inverse)."""
     free = ~held
     quadratic = jnp.where(free[:, None] & free[None, :], quadratic, 0.0)
     gradient = jnp.where(free, gradient, 0.0)
@@ -197,10 +201,10 @@ def _eliminate(
 
 @jax.custom_jvp
 def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) -> _Quadratic:
-    """`R, r0` with `R' R = H` and `R' r0 = g` on the part of the space where `H` is positive.
+    """Return `R, r0` with `R' R = H` and `R' r0 = g` on the subspace where `H` is positive.
 
-    Only up to a rotation from the left, which no use of a prior sees; the derivative is one of those that satisfy both
-    equations, for changes of `H` that keep its rank.
+    The result is unique up to a rotation from the left, which does not change the prior. The derivative is one of those
+    that satisfy both equations, for changes of `H` that keep its rank.
     """
     safe = _balance(quadratic)
     values, vectors = jnp.linalg.eigh(quadratic / safe[:, None] / safe[None, :])
@@ -214,12 +218,12 @@ def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) ->
 
 @square_root.defjvp
 def _square_root_derivative(primals: _Quadratic, tangents: _Quadratic) -> tuple[_Quadratic, _Quadratic]:
-    """With a right inverse `Q` of the kept rows, `R Q = I`:
+    """Differentiate with a right inverse `Q` of the kept rows, `R Q = I`:
 
         dR = Q' dH (I - Q R / 2),     dr0 = Q' (dg - dR' r0).
 
-    Hence `dR' R + R' dR = dH`, but for the part of `dH` that would raise the rank. Eigenvectors are never
-    differentiated: those of equal eigenvalues, as of the many zeros of a prior, have no derivative.
+    Hence `dR' R + R' dR = dH`, except for the part of `dH` that would raise the rank. Eigenvectors are not
+    differentiated: those of equal eigenvalues, such as the many zeros of a prior, have no derivative.
     """
     root, offset = square_root(*primals)
     inverse = _right_inverse(root, _balance(primals[0]))
@@ -230,13 +234,13 @@ def _square_root_derivative(primals: _Quadratic, tangents: _Quadratic) -> tuple[
 
 
 def _balance(quadratic: Float[Array, "c c"]) -> Float[Array, " c"]:
-    """Metres, radians and pixels differ by orders of magnitude: a unit for each, before rounding error is cut off."""
+    """Return a scale for each coordinate: metres, radians and pixels must be comparable before the rank is decided."""
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(quadratic), 0.0))
     return jax.lax.stop_gradient(jnp.where(scale > 0, scale, 1.0))
 
 
 def _right_inverse(root: Float[Array, "c c"], unit: Float[Array, " c"]) -> Float[Array, "c c"]:
-    """`Q = D^-2 R' (R D^-2 R')^-1` of the rows that are not zero, zero columns for the others."""
+    """Return `Q = D^-2 R' (R D^-2 R')^-1` of the rows that are not zero, zero columns for the others."""
     rows = root / unit
     empty = jnp.diag(jnp.all(root == 0, 1).astype(root.dtype))
     return jnp.linalg.solve(rows @ rows.T + empty, rows / unit).T

@@ -1,6 +1,6 @@
 """The energy of bundle adjustment: the sum of its terms, from the residual that each one defines.
 
-This is what the solver minimises, term by term and in the same functions: there is no other definition.
+The solver minimises exactly this energy, with the same functions.
 """
 
 from __future__ import annotations
@@ -23,11 +23,14 @@ from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Cameras
 
 EdgeData = tuple[dict[str, Any], ...]
-"""Data and weights of each edge term, of one edge or with a leading axis of edges."""
+"""Data and weights of each edge term, for one edge or with a leading axis of edges."""
 
 
 def energy(problem: Problem, state: State) -> Float[Array, ""]:
-    """The energy that `solve` minimises.
+    """Return the energy that `solve` minimises.
+
+    Raises:
+        InputError: `state` does not have the size or precision of `problem`.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> energy = jax.jit(vg.energy)
@@ -45,7 +48,10 @@ def _energy_jit(problem: Problem, state: State) -> Float[Array, ""]:
 
 
 def energy_terms(problem: Problem, state: State) -> dict[str, Float[Array, ""]]:
-    """The energy of each term at `state`, by its name.
+    """Return the energy of each term at `state`, by the name of the term.
+
+    Raises:
+        InputError: `state` does not have the size or precision of `problem`.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> terms = jax.jit(vg.analysis.energy_terms)(problem, solution.state)
@@ -63,12 +69,12 @@ def _energy_terms_jit(problem: Problem, state: State) -> dict[str, Float[Array, 
 
 
 def prepared(problem: Problem) -> Problem:
-    """The problem with absent observations made harmless and laid out for the loops over edges; done once a solve."""
+    """Return the problem with safe data for absent observations, laid out for the loops over edges; once per solve."""
     return problem.with_terms(tuple(term.prepared() for term in problem.terms))
 
 
 def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
-    """The energy of a prepared problem: one pass over the edges, and the terms without landmarks."""
+    """Return the energy of a prepared problem: one pass over the edges, plus all other terms."""
     total = _without_edges(problem, state)
     if not problem.edge_terms:
         return total
@@ -102,34 +108,34 @@ def _without_edges(problem: Problem, state: State) -> Float[Array, ""]:
 
 
 def pixel_observations(problem: Problem, state: State) -> list[tuple[HostPixel, Float[Array, "h p 2"]]]:
-    """The terms on the pixels of landmarks in their host, each with the offsets that it is about."""
+    """Return the terms on the pixels of landmarks in their host, each with its offsets."""
     offset = state.pixel_offset
     return [] if offset is None else [(term, offset) for term in problem.pixel_terms]
 
 
 def cameras_of(problem: Problem, state: State) -> Cameras:
-    """The cameras with their estimated parameters."""
+    """Return the cameras with their estimated parameters."""
     return Cameras(state.intrinsics, problem.camera, problem.camera_of)
 
 
 def relative_poses(problem: Problem, state: State) -> jaxlie.SE3:
-    """`M = T_j T_i^-1` of every edge, batch `[e]`."""
+    """Return `M = T_j T_i^-1` of every edge, batch `[e]`."""
     poses = state.poses.wxyz_xyz
     return lie.relative(jaxlie.SE3(poses[problem.edges.source]), jaxlie.SE3(poses[problem.edges.target]))
 
 
 class Hosts(NamedTuple):
-    """What the loops over edges read of each row of landmarks, slots last; made once for all edges."""
+    """Data of each row of landmarks for the loops over edges, slots last; computed once for all edges."""
 
     pixels: Float[Array, "h 2 s"]
     rays: tuple[Float[Array, "h s"], Float[Array, "h s"]] | None
     inverse_depth: Float[Array, "h s"]
     offset: Float[Array, "h p 2"] | None
-    """Of the pixels that are unknowns, which `pixels` and `rays` contain."""
+    """Offsets of the free pixels, already included in `pixels` and `rays`."""
 
 
 class Motions(NamedTuple):
-    """The relative pose of each edge, as the loops read it."""
+    """The relative pose of each edge, with its matrices."""
 
     relative: jaxlie.SE3
     rotation: Float[Array, "e 3 3"]
@@ -137,7 +143,7 @@ class Motions(NamedTuple):
 
 
 def hosts_of(problem: Problem, state: State) -> Hosts:
-    """The slots of all rows; with viewing rays where the hand-written derivatives know the camera."""
+    """Return the slots of all rows; with viewing rays if the hand-written derivatives support the camera."""
     pixels, rays = problem.pixels, None
     if state.pixel_offset is not None:
         pixels = pixels.at[:, : state.pixel_offset.shape[1]].add(state.pixel_offset)
@@ -149,12 +155,12 @@ def hosts_of(problem: Problem, state: State) -> Hosts:
 
 
 def motions_of(relative: jaxlie.SE3) -> Motions:
-    """Relative poses, and their matrices."""
+    """Return relative poses with their matrices."""
     return Motions(relative, relative.rotation().as_matrix(), relative.translation())
 
 
 class Place(NamedTuple):
-    """Where an edge lies in the graph, of one edge or with a leading axis of edges."""
+    """Indices of an edge in the graph, for one edge or with a leading axis of edges."""
 
     ends: tuple[Int[Array, "*e"], Int[Array, "*e"]]
     """Keyframes `(i, j)`."""
@@ -163,12 +169,12 @@ class Place(NamedTuple):
 
 
 def places(problem: Problem) -> Place:
-    """Where all edges lie."""
+    """Return the indices of all edges."""
     return Place(problem.edges.ends, problem.edges.row)
 
 
 def view_of(cameras: Cameras, hosts: Hosts, place: Place, motion: Motions) -> EdgeView:
-    """The slots of a row, along the edge at `place` with that relative pose."""
+    """Return the slots of a row, seen along the edge at `place` with that relative pose."""
     own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, place.row, keepdims=False), hosts)
     fast, projection = None, None
     known = pinhole_parameters(cameras)
@@ -180,12 +186,12 @@ def view_of(cameras: Cameras, hosts: Hosts, place: Place, motion: Motions) -> Ed
 
 
 def edge_data(problem: Problem) -> EdgeData:
-    """What differs from edge to edge in the terms of a prepared problem."""
+    """Return the data of each edge in the terms of a prepared problem."""
     return tuple({**term.data(), "weight": term.weight} for term in problem.edge_terms)
 
 
 def of_edge(problem: Problem, view: EdgeView, data: EdgeData) -> list[tuple[EdgeTerm, EdgeView]]:
-    """Each edge term with the data of one edge, and the slots that it is about."""
+    """Return each edge term with the data of one edge, and the slots that it observes."""
     found = []
     for term, own in zip(problem.edge_terms, data, strict=True):
         found.append((term.holding(own), view.slots(term.first_slot, term.weight.shape[-1])))

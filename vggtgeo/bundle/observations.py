@@ -1,4 +1,4 @@
-"""What bundle adjustment sees, as flat numpy lists of unequal lengths: what `pack` turns into padded arrays."""
+"""Observations of bundle adjustment as flat numpy lists, which `pack` turns into padded arrays."""
 
 from __future__ import annotations
 
@@ -17,34 +17,33 @@ from vggtgeo.io.given import real_numbers
 
 @dataclass(frozen=True)
 class Observations:
-    """What bundle adjustment sees, as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples.
+    """Observations as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples.
 
-    A weight is 1 / variance: a match of standard deviation `s` pixels has weight `1 / s^2`, and weight 1 states a
-    standard deviation of 1 pixel. The width of the kernel counts in these standard deviations. A depth of weight 1
-    has the standard deviation `depth_sigma`; `alpha` scales the information of all depths, so that the energy and the
-    covariances take them as known to `depth_sigma / sqrt(alpha depth_weight)`.
+    A weight is 1 / variance: a match of standard deviation `s` pixels has weight `1 / s^2`, and weight 1 means a
+    standard deviation of 1 pixel. The width of the kernel is in these standard deviations. A depth of weight 1 has the
+    standard deviation `depth_sigma`. `alpha` scales the information of all depths: energy and covariances use the
+    standard deviation `depth_sigma / sqrt(alpha depth_weight)`.
 
     Fields:
         edges: int `[E, 2]`: (host keyframe, target keyframe).
         host: int `[D]`: keyframe that hosts each landmark (one inverse depth each).
         pixel: `[D, 2]`: its pixel in the host.
-        point_edge: int `[A]`: along which edge each match was seen.
-        point_landmark: int `[A]`: which landmark it is.
+        point_edge: int `[A]`: edge of each match.
+        point_landmark: int `[A]`: landmark of each match.
         point_target: `[A, 2]` pixels.
-        point_weight: `[A]`: 1 / variance of both coordinates, 1/pixels^2; 0 = the match is not there.
-        line_edge: int `[B]`: along which edge each line sample was seen.
-        line_landmark: int `[B]`: which landmark it is.
+        point_weight: `[A]`: 1 / variance of both coordinates, 1/pixels^2; 0 = absent.
+        line_edge: int `[B]`: edge of each line sample.
+        line_landmark: int `[B]`: landmark of each line sample.
         line_coefficients: `[B, 3]`: a, b, c with a^2 + b^2 = 1.
-        line_weight: `[B]`: 1 / variance of the distance from the line, 1/pixels^2; 0 = the sample is not there.
-        depth_mean: `[D]`: prior inverse depth, 1/m; None = no depth prior at all.
+        line_weight: `[B]`: 1 / variance of the distance from the line, 1/pixels^2; 0 = absent.
+        depth_mean: `[D]`: prior inverse depth, 1/m; None = no depth prior.
         depth_sigma: `[D]`: its standard deviation, 1/m; None = 1.
         depth_weight: `[D]`: factor on the information `1 / depth_sigma^2`, 1 by default; 0 = no prior for this
             landmark.
-        alpha: Factor on the information of all depths: with 2, the paper's value, a depth of `depth_sigma=0.1`
-            counts as one of 0.0707.
-        pixel_sigma: `[D]` or one for all, pixels: standard deviation of `pixel`, where a point was observed in its
-            host, in the unit of the matches' `1 / sqrt(point_weight)`; None: the pixels are exact. Samples of lines
-            have none.
+        alpha: Factor on the information of all depths: with 2, the paper's value, `depth_sigma=0.1` has the effect of
+            0.0707.
+        pixel_sigma: `[D]` or a number, pixels: standard deviation of `pixel` of a point in its host, like
+            `1 / sqrt(point_weight)` of the matches; None: the pixels are exact. Ignored for line samples.
         segment: int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples
             then lie on a straight line (two unknowns a segment); None: each sample has its own.
 
@@ -87,13 +86,13 @@ class Observations:
         return f"Observations({named}, {'no ' * (self.depth_mean is None)}depth prior)"
 
     def within(self, keyframes: Sequence[int] | np.ndarray) -> Observations:
-        """What some keyframes see of each other: the observations of a window, its keyframes numbered from 0.
+        """Return the observations between some keyframes: those of a window, its keyframes numbered from 0.
 
         Args:
-            keyframes: int [k], each once; place i of the window holds `keyframes[i]`.
+            keyframes: int [k], distinct; position i of the window is `keyframes[i]`.
 
         Raises:
-            InputError: they are no whole numbers, or one is there twice.
+            InputError: `keyframes` are not whole numbers, or not distinct.
 
         Example:
             >>> import vggtgeo as vg
@@ -103,7 +102,7 @@ class Observations:
         """
         chosen = real_numbers("keyframes", keyframes)
         if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or len(np.unique(chosen)) < len(chosen):
-            raise InputError(f"`keyframes` is {chosen.tolist()!r:.60}; it must be a list of whole numbers, each once")
+            raise InputError(f"`keyframes` must be a list of distinct whole numbers, got {chosen.tolist()!r:.60}")
         ends, host = np.asarray(self.edges), np.asarray(self.host)
         inside = np.all(np.isin(ends, chosen), axis=1)
         hosted = np.isin(host, chosen)
@@ -138,14 +137,14 @@ class Observations:
 class FlatTerm:
     """A term on landmarks before packing: one row an observation, in any order.
 
-    `pack(..., terms=[...])` puts each row where its landmark is, and pads.
+    `pack(..., terms=[...])` moves each row to the slot of its landmark, and pads.
 
     Fields:
         kind: A class of terms on edges or on slots.
-        fields: What its constructor takes: data of the observations `[k, ...]`, `weight [k]` (1 without one),
-            `kernel`, and what all observations share.
-        landmark: int `[k]`, as `Observations.host` lists them.
-        edge: int `[k]`, as `Observations.edges` lists them: where the landmark was seen (terms on edges only).
+        fields: Arguments of its constructor: data of the observations `[k, ...]`, `weight [k]` (1 by default),
+            `kernel`, and shared fields.
+        landmark: int `[k]`, indices into `Observations.host`.
+        edge: int `[k]`, indices into `Observations.edges`: edge of each observation (terms on edges only).
 
     Example: each landmark that keyframe 0 hosts lies on a plane that is known in keyframe 1.
         >>> import numpy as np, vggtgeo as vg
@@ -173,23 +172,23 @@ class FlatTerm:
 
     @property
     def weight(self) -> np.ndarray:
-        """`[k]`; one number is that of each."""
+        """`[k]`; a single number is used for all."""
         given = np.asarray(self.fields.get("weight", 1.0))
         return np.full(len(self.landmark), given) if given.ndim == 0 and given.dtype.kind in "iuf" else given
 
     def rows(self) -> dict[str, Any]:
-        """The fields that have one row an observation, `weight` among them."""
+        """Return the fields with one row for each observation, including `weight`."""
         shared = {f.name for f in dataclasses.fields(self.kind) if f.metadata.get("shared")} | self.kind.structure
         given = {name: value for name, value in self.fields.items() if name not in shared}
         return {**jax.tree.map(np.asarray, given), "weight": self.weight}
 
     def shared(self) -> dict[str, Any]:
-        """The fields that all observations share."""
+        """Return the fields that all observations share."""
         rows = self.rows()
         return {name: value for name, value in self.fields.items() if name not in rows}
 
     def emptied(self) -> FlatTerm:
-        """The same term without an observation."""
+        """Return the same term without observations."""
         none = jax.tree.map(lambda values: values[:0], self.rows())
         edge = None if self.edge is None else np.zeros(0, int)
         return FlatTerm(self.kind, {**self.shared(), **none}, np.zeros(0, int), edge)

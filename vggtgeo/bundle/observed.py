@@ -1,4 +1,4 @@
-"""Whether a problem observes anything at all: asked where arrays are concrete, never inside `jit`."""
+"""Checks that a problem has observations; concrete arrays only, not inside `jit`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,10 @@ from vggtgeo.io.errors import InputError, InputWarning
 
 
 def check_observed(problem: Problem) -> None:
-    """At least one observation that ties a landmark or a pose, and weights that are such; a problem that is traced may
-    be anything.
+    """Check that there is an observation of a landmark or a pose, and that weights are valid, unless traced.
 
     Raises:
-        InputError: there is none: all weights are zero, and every state is an optimum; or a weight is negative or not
-            finite, which would count as an observation that is not there.
+        InputError: all weights are zero, so every state is an optimum; or a weight is negative or not finite.
 
     """
     check_weights(problem)
@@ -33,14 +31,15 @@ def check_observed(problem: Problem) -> None:
             if np.any(np.asarray(term.present())) and not (isinstance(term, DenseTerm) and not int(term.rows())):
                 return
     raise InputError(
-        "nothing is observed: all weights of the terms on landmarks and poses are zero, so every state is an optimum; "
-        "give at least one observation a positive weight"
+        "`problem` must have an observation of positive weight: all weights of the terms on landmarks and poses are "
+        "zero, so every state is an optimum"
     )
 
 
 def check_weights(problem: Problem) -> None:
-    """InputError for a weight that is negative or not finite, where it has a value: under one, a linearisation leaves
-    zeros or worse, which look like results.
+    """Raise InputError for a weight that is negative or not finite, unless traced.
+
+    The linearisation would turn it into zeros or NaN, which can look like results.
     """
     with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
         for term in problem.terms:
@@ -53,17 +52,18 @@ def _check_weights(name: str, weight: np.ndarray) -> None:
     wrong = weight[~(np.isfinite(weight) & (weight >= 0))]
     if wrong.size:
         raise InputError(
-            f"`{name}.weight` has {wrong.size} values of {weight.size} that are negative or not finite (the "
-            f"first: {wrong.flat[0]:g}); give 0 to an observation that is to count for nothing"
+            f"`{name}.weight` must be finite and not negative, got {wrong.flat[0]:g} (and {wrong.size - 1} other "
+            f"invalid values of {weight.size}); use 0 for an absent observation"
         )
 
 
-def check_tied(observations: Observations, keyframes: int) -> None:
-    """Every keyframe is tied to the first by matches of positive weight, through others if need be: one that is not
-    would stay where it was put, or float with all that hangs on it. For problems without terms of their own.
+def check_connected(observations: Observations, keyframes: int) -> None:
+    """Check that matches of positive weight connect all keyframes; others would not be determined.
+
+    For problems without user-defined terms. Warns about landmarks without a match or a depth prior.
 
     Raises:
-        InputError: one that is not, by its number.
+        InputError: a keyframe is not connected to keyframe 0.
 
     """
     points, lines = np.asarray(observations.point_weight) > 0, np.asarray(observations.line_weight) > 0
@@ -74,8 +74,8 @@ def check_tied(observations: Observations, keyframes: int) -> None:
     loose = np.flatnonzero(piece != piece[0])
     if len(loose):
         raise InputError(
-            f"keyframe {loose[0]} is tied to keyframe 0 by no match of positive weight ({len(loose)} of {keyframes} "
-            "are not); leave such keyframes out, or solve each connected piece alone"
+            f"keyframe {loose[0]} is not connected to keyframe 0 by matches of positive weight ({len(loose)} of "
+            f"{keyframes} keyframes are not): remove them, or solve each connected component separately"
         )
     seen = np.concatenate([observations.point_landmark[points], observations.line_landmark[lines]]).astype(int)
     known = np.isin(np.arange(len(observations.host)), seen)
@@ -84,7 +84,7 @@ def check_tied(observations: Observations, keyframes: int) -> None:
     if not known.all():
         warnings.warn(
             f"{int((~known).sum())} of {len(known)} landmarks have neither a match nor a depth prior of positive "
-            "weight: their inverse depth stays as it was given",
+            "weight: their inverse depth keeps its initial value",
             InputWarning,
             stacklevel=3,
         )

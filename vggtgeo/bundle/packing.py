@@ -1,7 +1,7 @@
-"""From flat lists of observations (numpy, unequal lengths) to a padded `Problem`, and back.
+"""Packing of flat lists of observations (numpy, unequal lengths) into a padded `Problem`.
 
-Padding is the business of this file and of `padding.py` and `term_padding.py` alone: slots and edges that hold nothing
-get weight 0, a finite pixel and a positive inverse depth, and no other file asks which entries are real.
+Padding is confined to this file, `padding.py` and `term_padding.py`: empty slots and edges get weight 0, a finite pixel
+and a positive inverse depth, so that no other file needs a mask.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from vggtgeo.bundle.packing_checks import (
     check_positive,
     check_size,
     check_whole_size,
-    warn_of_far,
+    warn_if_far,
 )
 from vggtgeo.bundle.padding import (
     GivenTerm,
@@ -60,7 +60,7 @@ from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 POSITIVE = ("depth_mean", "depth_sigma", "inverse_depth", "kernel.delta")
-"""What must not be zero in the precision of the problem."""
+"""Arguments that must not underflow to zero in the precision of the problem."""
 
 
 def pack(
@@ -83,34 +83,33 @@ def pack(
     """Pack flat observations and an initial guess into arrays.
 
     Args:
-        observations: what was measured.
+        observations: the measurements.
         poses: `[n, 7]` world -> camera, `(qw, qx, qy, qz, tx, ty, tz)`.
-        intrinsics: parameters of the camera, `fx, fy, cx, cy` in pixels; of another model as its `names` list them; of
-            several cameras `[g, k]`.
-        intrinsics_mean: the same, mean of their prior; None = `intrinsics`.
+        intrinsics: parameters of the camera, `fx, fy, cx, cy` in pixels; for other models in the order of their
+            `names`; for several cameras `[g, k]`.
+        intrinsics_mean: mean of the intrinsics' prior, same shape; None = `intrinsics`.
         inverse_depth: `[D]`, 1/m, positive.
-        size: padded shape; None takes the cheapest that fits. A keyframe that hosts far more landmarks than others then
-            has several rows of them, see `Problem.host`.
+        size: padded shape; None: the cheapest that fits. A keyframe that hosts far more landmarks than others then has
+            several rows, see `Problem.host`.
         intrinsics_sigma: standard deviation of the intrinsics' prior in pixels; None = no prior.
-        fixed_pose: bool `[n]`; None holds the first pose.
-        fixed_intrinsics: intrinsics that are held: one bool for all, one for each of a camera, or of their own shape.
-        camera: its model: `Pinhole`, `RadialTangential`, `KannalaBrandt`, each of them with `fx = fy` tied
-            (`SquarePinhole`, ...), or your own.
-        camera_of: int `[n]`: which of several cameras, a row of `intrinsics`, took each keyframe; None: one took all.
+        fixed_pose: bool `[n]`; None: only the first pose is fixed.
+        fixed_intrinsics: which intrinsics are fixed: one bool, one for each parameter of a camera, or their full shape.
+        camera: camera model: `Pinhole`, `RadialTangential`, `KannalaBrandt`, one of these with `fx = fy`
+            (`SquarePinhole`, ...), or your own class.
+        camera_of: int `[n]`: camera of each keyframe, a row of `intrinsics`; None: one camera for all.
         kernel: robust kernel of points, lines and depths; None = `Cauchy(1.5)`, the best of `benchmarks/robustness.py`.
-            Its width counts in standard deviations, of residuals times the root of their weight: 1.5 px for a match of
-            weight 1, 1.5 sigma for one of weight `1 / sigma^2`.
-        terms: what else is known: terms on poses, pairs or the camera, the prior of a marginalisation, and, as
-            `FlatTerm`, terms on landmarks. Each is padded by its kind.
-        dtype: float type of all arrays; None = JAX's own, which is double where `jax_enable_x64` is on.
+            Its width is in standard deviations, of residuals times the root of their weight: 1.5 px for a match of
+            weight 1, 1.5 sigma for weight `1 / sigma^2`.
+        terms: further terms: on poses, pairs or the camera, the prior of a marginalisation, and terms on landmarks as
+            `FlatTerm`. Each is padded by its kind.
+        dtype: float type of all arrays; None = JAX's default, which is double if `jax_enable_x64` is set.
 
     Raises:
-        InputError: an array of a wrong shape, an index out of range, a match given twice, a landmark with both points
-            and lines, an observation between keyframes that its landmark is not hosted in, an inverse depth, focal
+        InputError: an array of a wrong shape, an index out of range, a duplicate match, a landmark with both points
+            and lines, an observation along an edge that does not start at the landmark's host, an inverse depth, focal
             length or standard deviation that is not positive, weights that are negative or NaN, lines that are not
-            normalised, an edge twice or to itself, a kernel that is none, a size that is too small, or nothing that is
-            observed: all weights zero; or positions so far from the origin that this precision has no digits for most
-            of the matches.
+            normalised, a duplicate edge or one from a keyframe to itself, an invalid kernel, a size that is too small,
+            all weights zero, or positions so far from the origin that the precision is too low for most of the matches.
 
     Example:
         >>> import vggtgeo as vg
@@ -134,7 +133,7 @@ def pack(
     check_kernel("kernel", kernel)
     check_observations(observations, poses)
     check_positive("inverse_depth", inverse_depth, len(observations.host))
-    warn_of_far(inverse_depth)
+    warn_if_far(inverse_depth)
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
     terms = check_terms(terms, observations, len(poses))
     guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
@@ -169,14 +168,12 @@ def pack(
 
 
 def _of_type(problem: Problem, dtype: DTypeLike) -> Problem:
-    """All floats of one type, and of one that JAX calls strong: what is compiled for `Huber(1.5)` then serves a kernel
-    that was read from a file, too.
-    """
+    """Cast all floats to one strong type, so that `Huber(1.5)` and a kernel from a file share a compilation."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, problem)
 
 
 def as_arrays(observations: Observations) -> Observations:
-    """The same observations, lists turned into arrays."""
+    """Return the same observations with lists converted to arrays."""
     names = [field.name for field in fields(observations) if field.name != "alpha"]
     given = {name: getattr(observations, name) for name in names}
     arrays: dict[str, Any] = {name: real_numbers(name, v) for name, v in given.items() if v is not None}
@@ -186,7 +183,7 @@ def as_arrays(observations: Observations) -> Observations:
 def _layout(
     observations: Observations, keyframes: int, size: PaddedSize | None
 ) -> tuple[PaddedSize, Edges, Array | None, SlotIndex]:
-    """The padded size, the graph, the host of each row, and where each landmark and edge lies in them."""
+    """Return the padded size, the graph, the host of each row, and the index of landmarks and edges."""
     slots = count_slots(observations, keyframes, size.samples if size else None)
     needed = needed_size(slots, observations.edges, size)
     size = size or needed
@@ -209,7 +206,7 @@ def _layout(
 def _seen(
     observations: Observations, index: SlotIndex, size: PaddedSize, kernel: AbstractKernel, dtype: DTypeLike
 ) -> tuple[AbstractTerm, ...]:
-    """The terms that `Observations` lists: points, lines, and the depth of each landmark."""
+    """Return the terms of `Observations`: points, lines, depths and host pixels."""
     seen, every = observations, np.arange(len(observations.host))
     points = {"target": seen.point_target.astype(float), "weight": seen.point_weight, "kernel": kernel}
     lines = {"coefficients": seen.line_coefficients.astype(float), "weight": seen.line_weight, "kernel": kernel}
@@ -259,7 +256,7 @@ def _per_slot(index: SlotIndex, values: np.ndarray, empty: float, dtype: DTypeLi
 
 
 def _with_segments(problem: Problem, depths: Array, present: Array, size: PaddedSize) -> tuple[Problem, Array]:
-    """The problem with two-ends lines, and depths that are straight along them."""
+    """Return the problem with line segments, and depths that are straight along them."""
     samples = max(size.samples or 1, 1)
     shape = (len(depths), size.lines // samples, samples)
     inside = lambda array: np.asarray(array[:, size.points :]).reshape(*shape, *array.shape[2:])

@@ -1,8 +1,8 @@
-"""Static shapes: which slot a landmark takes, which row an edge, and how far each is padded.
+"""Static shapes: slots of landmarks, rows of edges, and their padding.
 
-Slots of a row: landmarks of points first, then line samples (segment after segment where lines have two ends). Each
-keyframe has a row. One that hosts many more landmarks than others has several, each with all edges of the keyframe, so
-that time and memory follow the number of landmarks and not the richest keyframe.
+Slots of a row: landmarks of points first, then line samples (segment after segment for line segments). Each keyframe
+has a row. A keyframe that hosts many more landmarks than others has several rows, each with all edges of the keyframe,
+so that time and memory scale with the number of landmarks and not with the largest keyframe.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from vggtgeo.geometry.line_segments import segment_slots
 from vggtgeo.io.errors import InputError
 
 GivenTerm = AbstractTerm | FlatTerm
-"""A term as `pack` takes it."""
+"""A term as an argument of `pack`."""
 
 
 @dataclass(frozen=True)
 class PaddedSize:
-    """Static shape of a problem: every problem packed to one size shares one compiled solver.
+    """Static shape of a problem: all problems of one size share one compiled solver.
 
     Fields:
         keyframes: Number of keyframes.
         points: Points in a row of landmarks (a keyframe has one row, unless `rows` is given).
         lines: Line samples in a row.
         degree: Largest number of edges of one host.
-        edges: Number of edges stored; None: every row is padded to `degree` edges.
-        samples: Samples of a segment, where observations have a `segment`; `lines` is a multiple of it.
-        terms: Names of terms on poses, pairs and the camera, and how many observations of each there is room for;
-            one that is not named here is not padded.
+        edges: Number of stored edges; None: every row is padded to `degree` edges.
+        samples: Samples of a segment, if observations have a `segment`; `lines` is a multiple of it.
+        terms: Names of terms on poses, pairs and the camera, with the padded number of observations of each; other
+            terms are not padded.
         rows: Rows of landmarks; None: one a keyframe. With a number, a keyframe that hosts more than `points` or
-            `lines` takes several rows.
+            `lines` has several rows.
 
     Example:
         >>> import vggtgeo as vg
@@ -66,13 +66,13 @@ class PaddedSize:
 
     @staticmethod
     def of(observations: Observations, keyframes: int, terms: Sequence[GivenTerm] = ()) -> PaddedSize:
-        """The cheapest that fits, every row padded to the same number of edges."""
+        """Return the cheapest size that fits, every row padded to the same number of edges."""
         counts = tuple((term.name, np.size(term.broadcast().weight)) for term in terms if isinstance(term, COUNTED))
         return replace(needed_size(count_slots(observations, keyframes), observations.edges), edges=None, terms=counts)
 
     @staticmethod
     def largest(sizes: Sequence[PaddedSize]) -> PaddedSize:
-        """The smallest that fits all of `sizes`, every row padded to the same number of edges."""
+        """Return the smallest size that fits all of `sizes`, every row padded to the same number of edges."""
         most = lambda name: max(getattr(size, name) for size in sizes)
         counts: dict[str, int] = {}
         for name, count in (named for size in sizes for named in size.terms):
@@ -89,27 +89,26 @@ class PaddedSize:
 
 
 COUNTED = (PoseTerm, PairTerm, CameraTerm)
-"""Kinds of terms whose observations are one list."""
+"""Kinds of terms whose observations are a list `[m]`."""
 
 
 @dataclass(frozen=True)
 class SlotIndex:
-    """Where `pack` put what was given as flat lists: landmark `i` at `[host[i], slot[i]]`; edges, see `stored_edge`.
+    """Positions of flat lists in padded arrays: landmark `i` is at `[host[i], slot[i]]`; for edges see `stored_edge`.
 
     `gather` and `gather_points` read padded arrays in the order of `Observations`. `scatter`, `scatter_points` and
-    `scatter_lines` write values of that order into padded arrays; these are traceable and differentiable, so they take
-    what a network computes.
+    `scatter_lines` write values of that order into padded arrays; they are differentiable, so the values may come from
+    a network.
 
     Fields:
-        host: int [D], row of the array that each landmark is in: the number of the host keyframe, unless some keyframe
-            has several rows (`Problem.host`).
-        slot: int [D], its slot there.
-        edge: int [E], the stored edge at the first row of its host.
+        host: int [D], row of each landmark: the host keyframe, unless a keyframe has several rows (`Problem.host`).
+        slot: int [D], slot of each landmark in its row.
+        edge: int [E], stored edge at the first row of the host.
         shape: rows, edges and slots of the problem.
-        part: int [D], which row of its host each landmark is in, from 0; None: each keyframe has one row.
-        step: int [E], stored edges from the one at a row of the host to that at its next row.
+        part: int [D], row of each landmark among those of its host, from 0; None: each keyframe has one row.
+        step: int [E], offset between the stored edges of one row of the host and the next.
 
-    Example: the energy of a problem by weights of a network, one a match.
+    Example: the energy of a problem as a function of the weights of matches, such as a network's.
         >>> import jax, jax.numpy as jnp, vggtgeo as vg
         >>> window = vg.simulate_window(3, points=10, lines=1)
         >>> problem, initial, index = window.pack()
@@ -132,9 +131,7 @@ class SlotIndex:
         return f"SlotIndex({len(self.host)} landmarks, {len(self.edge)} edges)"
 
     def stored_edge(self, edge: np.ndarray, landmark: np.ndarray) -> np.ndarray:
-        """Where the observations of landmarks along edges are, in arrays `[e, p, ...]`; both as `Observations` numbers
-        them.
-        """
+        """Return the index in arrays `[e, p, ...]` of observations; `edge` and `landmark` index `Observations`."""
         if self.part is None or self.step is None:
             return self.edge[edge]
         return self.edge[edge] + self.part[landmark] * self.step[edge]
@@ -144,16 +141,20 @@ class SlotIndex:
     @overload
     def gather(self, per_slot: Array) -> Any: ...
     def gather(self, per_slot: np.ndarray | Array) -> Any:
-        """Values of the landmarks, `[D, ...]`, from an array `[h, s, ...]`; InputError for one of another shape.
+        """Return values of the landmarks, `[D, ...]`, from an array `[h, s, ...]`.
 
-        NumPy; under `jit`, `vmap` and `grad`, where `per_slot` is traced, an array of JAX.
+        The result is a NumPy array, or a JAX array if `per_slot` is traced (`jit`, `vmap`, `grad`).
+
+        Raises:
+            InputError: `per_slot` has another shape.
+
         """
         found = _values(per_slot)
         rows, _, slots = self.shape
         if found.ndim < 2 or (any(self.shape) and found.shape[:2] != (rows, slots)):
             raise InputError(
-                f"`per_slot` has shape {found.shape}; expected ({rows}, {slots}, ...), a value for each slot of "
-                "each row, such as `state.inverse_depth`"
+                f"`per_slot` must have shape ({rows}, {slots}, ...), got {found.shape}: a value for each slot of each "
+                "row, such as `state.inverse_depth`"
             )
         return found[self.host, self.slot]
 
@@ -162,48 +163,53 @@ class SlotIndex:
     @overload
     def gather_points(self, per_match: Array, observations: Observations) -> Any: ...
     def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> Any:
-        """Values of the point matches, `[A, ...]`, as `observations` lists them, from an array `[e, p, ...]`;
-        InputError for one of another shape. Works under `jit` like `gather`.
+        """Return values of the point matches, `[A, ...]`, in the order of `observations`, from an array `[e, p, ...]`.
+
+        Works under `jit` like `gather`.
+
+        Raises:
+            InputError: `per_match` has another shape.
+
         """
         found = _values(per_match)
         _, edges, slots = self.shape
         if found.ndim < 2 or (any(self.shape) and (found.shape[0] != edges or found.shape[1] > slots)):
             raise InputError(
-                f"`per_match` has shape {found.shape}; expected ({edges}, at most {slots}, ...), a value for each "
+                f"`per_match` must have shape ({edges}, at most {slots}, ...), got {found.shape}: a value for each "
                 "point of each edge, such as `problem.points.weight`"
             )
         landmark = observations.point_landmark
         return found[self.stored_edge(observations.point_edge, landmark), self.slot[landmark]]
 
     def scatter(self, values: ArrayLike, into: ArrayLike) -> Array:
-        """Write values of the landmarks to their places in `into`: the counterpart of `gather`.
+        """Write values of the landmarks to their slots in `into`: the inverse of `gather`.
 
         Pure: works under `jit`, `vmap` and `grad`.
 
         Args:
-            values: [D, ...], as `Observations.host` lists the landmarks.
-            into: [n, s, ...], `initial.inverse_depth` or `problem.depth.weight`, say. It gives shape and precision;
-                slots that hold no landmark keep its values.
+            values: [D, ...], in the order of `Observations.host`.
+            into: [n, s, ...], such as `initial.inverse_depth` or `problem.depth.weight`; it determines shape and
+                precision. Empty slots keep its values.
 
         Raises:
-            InputError: an array of another shape.
+            InputError: an array has a wrong shape.
 
         """
         return _scattered(values, into, (self.host, self.slot), self.shape[0])
 
     def scatter_points(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
-        """Write values of the point matches to their places in `into`: the counterpart of `gather_points`.
+        """Write values of the point matches to their slots in `into`: the inverse of `gather_points`.
 
         Pure: works under `jit`, `vmap` and `grad`.
 
         Args:
-            values: [A, ...], as `observations` lists the matches.
-            observations: what was packed.
-            into: [e, p, ...], `problem.points.weight` or `problem.points.target`, say. It gives shape and precision;
-                places that hold no match keep its values, so that a weight of 0 stays one.
+            values: [A, ...], in the order of `observations`.
+            observations: the packed observations.
+            into: [e, p, ...], such as `problem.points.weight` or `problem.points.target`; it determines shape and
+                precision. Slots without a match keep its values, so that a weight of 0 stays 0.
 
         Raises:
-            InputError: an array of another shape.
+            InputError: an array has a wrong shape.
 
         """
         landmark = observations.point_landmark
@@ -211,15 +217,15 @@ class SlotIndex:
         return _scattered(values, into, where, self.shape[1])
 
     def scatter_lines(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
-        """Write values of the line samples to their places in `into`, as `scatter_points` does.
+        """Write values of the line samples to their slots in `into`, like `scatter_points`.
 
         Args:
-            values: [B, ...], as `observations` lists the samples.
-            observations: what was packed.
-            into: [e, l, ...], `problem.lines.weight` or `problem.lines.coefficients`, say.
+            values: [B, ...], in the order of `observations`.
+            observations: the packed observations.
+            into: [e, l, ...], such as `problem.lines.weight` or `problem.lines.coefficients`.
 
         Raises:
-            InputError: an array of another shape.
+            InputError: an array has a wrong shape.
 
         """
         first = self.shape[2] - (np.shape(into)[1] if np.ndim(into) > 1 else 0)  # the slots of lines come last
@@ -229,39 +235,39 @@ class SlotIndex:
 
 
 def _scattered(values: ArrayLike, into: ArrayLike, where: tuple[np.ndarray, np.ndarray], rows: int) -> Array:
-    """`into` with each value at its row and column."""
+    """Return `into` with each value at its row and column."""
     given, whole, column = jnp.asarray(values), jnp.asarray(into), where[1]
     room = whole.ndim > 1 and whole.shape[0] == rows
     if not room or (column.size and not 0 <= column.min() <= column.max() < whole.shape[1]):
         raise InputError(
-            f"`into` has shape {whole.shape}; it must be ({rows}, slots, ...), an array of the problem that was packed "
-            "with this index, such as the `weight` of the term"
+            f"`into` must have shape ({rows}, slots, ...), got {whole.shape}: an array of the problem packed with this "
+            "index, such as the `weight` of the term"
         )
     if given.shape != (len(column), *whole.shape[2:]):
         raise InputError(
-            f"`values` has shape {given.shape}; it must be {(len(column), *whole.shape[2:])}, one row an observation, "
-            "in the order in which they were given to `pack`"
+            f"`values` must have shape {(len(column), *whole.shape[2:])}, got {given.shape}: a row an observation, in "
+            "the order of the arguments of `pack`"
         )
     return whole.at[where].set(given.astype(whole.dtype), unique_indices=True)
 
 
 def _values(given: Any) -> Any:
-    """A NumPy array, or one that is traced as it is."""
+    """Return a NumPy array; a traced array unchanged."""
     return given if isinstance(given, jax.core.Tracer) else np.asarray(given)
 
 
 class Slots(NamedTuple):
-    """Position of each landmark among the slots of its host, if that had one row, and what each host needs."""
+    """Position of each landmark among the slots of its host in a single row, and the slots that each host needs."""
 
     is_line: Bool[np.ndarray, " d"]
     within: Int[np.ndarray, " d"]
-    """Points and lines counted apart."""
+    """Points and lines are counted separately."""
     points: Int[np.ndarray, " n"]
     lines: Int[np.ndarray, " n"]
     samples: int | None
 
     def rows(self, points: int, lines: int) -> Int[np.ndarray, "*n"]:
-        """Rows of so many slots that each host needs, at least one."""
+        """Return the rows of this length that each host needs, at least one."""
         return np.maximum(1, np.maximum(-(-self.points // max(points, 1)), -(-self.lines // max(lines, 1))))
 
 
@@ -272,8 +278,8 @@ def count_slots(observations: Observations, keyframes: int, samples: int | None 
     both = np.intersect1d(observations.point_landmark, np.nonzero(is_line)[0])
     if len(both):
         raise InputError(
-            f"`point_landmark` and `line_landmark` both name landmark {both[0]} (and {len(both) - 1} others): a "
-            "landmark is a point or a line sample; give the sample a landmark of its own"
+            f"`point_landmark` and `line_landmark` must be disjoint, got landmark {both[0]} (and {len(both) - 1} "
+            "others) in both: use a separate landmark for each line sample"
         )
     host = np.asarray(observations.host)
     within = np.zeros(len(host), int)
@@ -290,13 +296,13 @@ def count_slots(observations: Observations, keyframes: int, samples: int | None 
 
 
 def needed_size(slots: Slots, edges: np.ndarray, size: PaddedSize | None = None) -> PaddedSize:
-    """The cheapest size that fits, or the least that one which was given must have."""
+    """Return the cheapest size that fits, or the minimum for a given `size`."""
     keyframes, need = len(slots.points), (int(slots.points.max(initial=0)), int(slots.lines.max(initial=0)))
     degrees = np.bincount(edges[:, 0], minlength=keyframes)
     degree = int(degrees.max(initial=0))
     if size is None:
         need = row_lengths(slots, degree)
-    elif size.rows is not None:  # rows of any length hold all, if there are enough of them
+    elif size.rows is not None:  # rows of any length suffice, if there are enough of them
         need = min(need[0], max(size.points, 1)), min(need[1], max(size.lines, slots.samples or 1))
     rows = slots.rows(*need)
     total = int(rows.sum())
@@ -307,7 +313,7 @@ def needed_size(slots: Slots, edges: np.ndarray, size: PaddedSize | None = None)
 
 
 def rows_of_keyframes(slots: Slots, size: PaddedSize) -> Int[np.ndarray, " n"]:
-    """Rows of landmarks of each keyframe; the last one has the spare ones."""
+    """Return the number of rows of landmarks of each keyframe; the last keyframe has the spare rows."""
     if size.rows is None:
         return np.ones(size.keyframes, int)
     rows = slots.rows(size.points, size.lines)
@@ -317,10 +323,11 @@ def rows_of_keyframes(slots: Slots, size: PaddedSize) -> Int[np.ndarray, " n"]:
 
 
 def row_lengths(slots: Slots, degree: int) -> tuple[int, int]:
-    """Points and line samples in a row, so that a problem stores the fewest numbers.
+    """Return the numbers of points and line samples in a row that minimise the memory of a problem.
 
-    Of a row a solve stores the cross terms with its `s` slots, `[t, s]`, and their products, `[t, t]`, where `t` is six
-    for each of its edges (and a few). So `rows (s + t)` is to be least. Hosts of equal richness have one row each.
+    For each row a solve stores the cross terms with its `s` slots, `[t, s]`, and their products, `[t, t]`, where `t` is
+    six for each of its edges (and a few more). So `rows (s + t)` is minimised. Hosts with equal numbers of landmarks
+    have one row each.
     """
     unit, wide = slots.samples or 1, lie.TANGENT * degree + 2
     best, chosen = math.inf, (0, 0)
@@ -334,12 +341,12 @@ def row_lengths(slots: Slots, degree: int) -> tuple[int, int]:
 
 
 def _shares(count: int) -> list[int]:
-    """`count` divided into 1, 2, ... equal parts, rounded up: each size once, the largest first."""
+    """Return the distinct sizes of `count` divided into 1, 2, ... equal parts, rounded up, the largest first."""
     return np.unique(-(-count // np.arange(1, max(count, 1) + 1)))[::-1].tolist()
 
 
 def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Position of each landmark among those of its host, and how many each keyframe has."""
+    """Return the position of each landmark among those of its host, and the count of each keyframe."""
     order = np.argsort(host, kind="stable")
     starts = np.searchsorted(host[order], np.arange(keyframes))
     within = np.empty(len(host), int)
@@ -348,7 +355,7 @@ def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def sort_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges sorted by host, and the new position of each given edge."""
+    """Sort edges by host; return them and the new position of each edge."""
     order = np.argsort(edges[:, 0], kind="stable")
     position = np.empty(len(edges), int)
     position[order] = np.arange(len(edges))
@@ -356,7 +363,7 @@ def sort_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class StoredEdges(NamedTuple):
-    """The graph, where each sorted edge is at the first row of its host, and how much further at the next."""
+    """The graph, the position of each sorted edge at the first row of its host, and the step to the next row."""
 
     edges: Edges
     position: np.ndarray
@@ -364,7 +371,7 @@ class StoredEdges(NamedTuple):
 
 
 def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEdges:
-    """Sorted edges, once for each row of their hosts; `rows [n]` is how many each keyframe has."""
+    """Store sorted edges once for each row of their hosts; `rows [n]` is the number of rows of each keyframe."""
     source, target = edges[:, 0], edges[:, 1]
     host = np.repeat(np.arange(size.keyframes), rows)
     rank = np.arange(len(edges)) - np.searchsorted(source, np.arange(size.keyframes))[source]
@@ -376,7 +383,7 @@ def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEd
     row = np.repeat(np.arange(len(host)), of_row)
     index = np.arange(len(row)) - start[row]
     position, step = start[np.cumsum(rows) - rows][source] + rank, degree[source]
-    ends = host[row]  # padding goes from a keyframe to itself
+    ends = host[row]  # a padding edge joins a keyframe with itself
     for part in range(rows.max(initial=1)):
         there = rows[source] > part
         ends[(position + part * step)[there]] = target[there]

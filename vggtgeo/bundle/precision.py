@@ -1,4 +1,4 @@
-"""What the precision of a problem can hold: a finite number given must not become infinite, or a positive one zero."""
+"""Range of the precision of a problem: finite numbers must not overflow, and positive numbers must not underflow."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vggtgeo.io.errors import InputError
 
 
 def check_precision(given: Mapping[str, Any], dtype: DTypeLike | None, positive: tuple[str, ...] = ()) -> None:
-    """Refuse numbers beyond those of `dtype` (None: JAX's own type), and of `positive` names those that are zero there.
+    """Check that numbers are in the range of `dtype` (None: JAX's default), and those in `positive` not zero in it.
 
     Raises:
-        InputError: names the first such number, and the range that there is.
+        InputError: a number is out of range; the message has its position and the range.
 
     """
     dtype = jnp.result_type(float) if dtype is None else dtype
@@ -37,23 +37,23 @@ def check_precision(given: Mapping[str, Any], dtype: DTypeLike | None, positive:
             place = tuple(map(int, np.unravel_index(int(np.argmax(wrong)), wrong.shape)))
             where = f"[{', '.join(map(str, place))}]" if place else ""
             raise InputError(
-                f"`{name}{where}` is {found[place]}; {jnp.dtype(dtype)} holds numbers from {smallest:.2g} to "
-                f"{largest:.2g}: give another unit, or double precision"
+                f"`{name}{where}` must be from {smallest:.2g} to {largest:.2g}, the range of {jnp.dtype(dtype)}, got "
+                f"{found[place]}: use another unit, or double precision"
             )
 
 
 def weight_of(name: str, sigma: Any, dtype: DTypeLike) -> Any:
-    """`1 / sigma^2` of the argument `name`; a deviation so large that its square is no number weighs nothing.
+    """Return `1 / sigma^2` of the argument `name`; 0 if `sigma^2` overflows.
 
     Raises:
-        InputError: a deviation so small that its weight is infinite.
+        InputError: `sigma` is so small that the weight is infinite.
 
     """
     with np.errstate(over="ignore", divide="ignore"):
         weight = 1 / np.square(np.asarray(sigma, np.float64))
     if not np.all(weight <= float(jnp.finfo(dtype).max)):
         raise InputError(
-            f"`{name}` is {sigma}; 1 / sigma^2 is beyond the numbers of {jnp.dtype(dtype)}: give a larger one, or hold "
-            "what is exact (`fixed_intrinsics`)"
+            f"`{name}` must be so large that 1 / sigma^2 is finite in {jnp.dtype(dtype)}, got {sigma}: use a larger "
+            "one, or `fixed_intrinsics` for exact values"
         )
     return weight

@@ -1,9 +1,9 @@
 """The bundle-adjustment problem: a state, a graph, and a sum of terms. All shapes are static, absence is weight 0.
 
 Sizes: `n` keyframes, `h` rows of `s` inverse depths ("slots"), `e` directed edges `(i, j)`: slots of a row of keyframe
-i observed in keyframe j. A keyframe has one row, so `h = n`; one that hosts far more landmarks than others has several
-(`Problem.host`), so that arrays are not padded to the richest. `q` parameters of the camera that all keyframes share,
-or of all `g` cameras, `k` each.
+i observed in keyframe j. Usually each keyframe has one row, so `h = n`. A keyframe that hosts far more landmarks than
+others has several (`Problem.host`), which limits the padding. `q` parameters of the shared camera, or of all `g`
+cameras, `k` each.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
 MIN_INVERSE_DEPTH = 1e-6
-"""1/m: the bound of positive inverse depths (1000 km)."""
+"""Lower bound of positive inverse depths, 1/m (1000 km)."""
 
 
 _ONE_OF_EACH = (PointTerm, LineTerm, DepthPrior, HostPixel, IntrinsicsPrior, MarginalPrior)
-"""Kinds of terms that a problem has one of."""
+"""Kinds of terms that a problem has at most one of."""
 
 
 class State(eqx.Module):
-    """What bundle adjustment estimates: `n` poses, the camera they share, `s` inverse depths a keyframe.
+    """The unknowns of bundle adjustment: `n` poses, camera parameters, and `s` inverse depths a keyframe.
 
     Fields:
         poses: World -> camera of each keyframe, batch `[n]`.
         intrinsics: Parameters of the camera, `fx, fy, cx, cy` in pixels, then those of its distortion: `[k]`, or
             `[g, k]` of `g` cameras.
-        inverse_depth: 1/m, along the optical axis of the host keyframe, one a slot.
-        pixel_offset: Pixels from where a landmark was observed in its host to where it is, of the first `p` slots (the
-            points); None: the observed pixels are exact.
+        inverse_depth: 1/m, along the optical axis of the host keyframe, one for each slot.
+        pixel_offset: Estimated minus observed pixel of a landmark in its host, for the first `p` slots (the points);
+            None: the observed pixels are exact.
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
@@ -72,11 +72,11 @@ class State(eqx.Module):
         return self.intrinsics.reshape(-1)
 
     def moved(self, step: Float[Array, " t"]) -> State:
-        """The state that a step leads to, in the coordinates of every Hessian and covariance of this package.
+        """Return the state after a step, in the coordinates of every Hessian and covariance of this package.
 
-        step: six a pose (`T` becomes `exp(xi) T`; metres, then radians), the cameras' parameters (pixels), the inverse
-        depths (1/m), row by row, then the pixel offsets, if there are any, in the order of their array. Pure;
-        the derivative at a zero step is the tangent map.
+        step: six for each pose (`T` becomes `exp(xi) T`; metres, then radians), the cameras' parameters (pixels), the
+        inverse depths (1/m), row by row, then the pixel offsets, if any, in the order of their array. Pure; the
+        derivative at a zero step is the tangent map.
         """
         poses = lie.TANGENT * len(self.poses.wxyz_xyz)
         dense = poses + self.intrinsics.size
@@ -106,9 +106,9 @@ class Edges(eqx.Module):
     index_at_host: Int[Array, " e"]
     """Position of the edge among the edges of its row, from 0."""
     of_host: Int[Array, "h k"]
-    """The edges of each row, in their order, and `e` where it has fewer than `k`: the inverse of `index_at_host`."""
+    """The edges of each row, in order, padded with `e`: the inverse of `index_at_host`."""
     row_of: Int[Array, " e"] | None = None
-    """Row of landmarks that each edge observes, ascending; None: that of its host's number."""
+    """Row of landmarks that each edge observes, ascending; None: `source`."""
 
     @property
     def row(self) -> Int[Array, " e"]:
@@ -122,25 +122,24 @@ class Edges(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A bundle-adjustment problem; every float leaf may be differentiated. `vggtgeo.pack` makes one.
+    """A bundle-adjustment problem, made by `vggtgeo.pack`; differentiable by every float leaf.
 
-    Pixels, 1/m for inverse depths, poses world -> camera. Weight 0 means that an observation is not there, so that a
-    kind can be left out without another shape. A term is also an attribute by its name: `problem.points`.
+    Pixels, 1/m for inverse depths, poses world -> camera. An observation of weight 0 is absent, so that a kind can be
+    disabled without a change of shapes. A term is also an attribute by its name: `problem.points`.
 
     Fields:
-        pixels: Where each slot looks in its host keyframe: point slots first, then line samples.
+        pixels: Pixel of each slot in its host keyframe: point slots first, then line samples.
         edges: The covisibility graph.
-        terms: What is minimised: the sum of their energies.
-        fixed_pose: Keyframes whose pose is held (the gauge).
-        fixed_intrinsics: Parameters of the cameras that are held.
-        fraction: Two-ends lines: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a
+        terms: The terms; the sum of their energies is minimised.
+        fixed_pose: Keyframes with a fixed pose (the gauge).
+        fixed_intrinsics: Fixed parameters of the cameras.
+        fraction: For line segments: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a
             segment is an affine function of this position along it (0 and 1 at its ends). None: each sample has its
             own inverse depth.
-        camera_of: Which camera took each keyframe, a row of the state's intrinsics; None: one took all.
-        camera: Model of the cameras whose parameters the state holds.
-        positive_depth: Whether inverse depths stay positive. If not, one may pass through infinity, as in a solver
-            without bounds.
-        host: Keyframe that hosts each row of landmarks, ascending; None: row i is that of keyframe i.
+        camera_of: Camera of each keyframe, a row of the state's intrinsics; None: one camera for all.
+        camera: Model of the cameras.
+        positive_depth: Whether inverse depths are bounded to be positive. Otherwise one may pass through infinity.
+        host: Keyframe that hosts each row of landmarks, ascending; None: row i belongs to keyframe i.
 
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
@@ -173,19 +172,19 @@ class Problem(eqx.Module):
         raise AttributeError(f"`Problem` has no attribute and no term `{name}`")
 
     def with_term(self, term: AbstractTerm, *, replace: bool = False) -> Problem:
-        """Add a term as the last, or put it in place of the one of its name.
+        """Add a term, or replace the term of the same name.
 
-        What a problem has one of is replaced: points, lines, depth, the intrinsics' prior and the prior of a
-        marginalisation. Any other term of a name that is taken is refused, so that a second list of
-        measurements does not take the place of the first; `replace=True` says that it is to.
+        Points, lines, depth, the intrinsics' prior and the prior of a marginalisation replace the existing one. Any
+        other term with an existing name raises an error unless `replace=True`, so that a second list of measurements
+        does not silently replace the first.
 
         Args:
             term: in the padded shape of this problem.
-            replace: put it in place of the term of its name, if there is one.
+            replace: whether to replace a term of the same name.
 
         Raises:
-            InputError: it is no term, its name is taken, the term of its name is of another kind, or it is on
-                landmarks and not in the shape of this problem.
+            InputError: `term` is not a term, its name exists, the term of that name is of another kind, or it is on
+                landmarks and not in the padded shape of this problem.
 
         Example: two receivers, each with measurements of its own.
             >>> import jax.numpy as jnp
@@ -210,25 +209,25 @@ class Problem(eqx.Module):
             return self.with_terms((*self.terms, term))
         if not (isinstance(term, type(old)) or isinstance(old, type(term))):
             raise InputError(
-                f"`{term.name}` is the name of a `{type(old).__name__}` of the problem, which a "
-                f"`{type(term).__name__}` would replace; give its class another `name`"
+                f"`term` must not have the name `{term.name}` of a `{type(old).__name__}` of the problem, got a "
+                f"`{type(term).__name__}`: define another `name` in its class"
             )
         if not replace and not isinstance(old, _ONE_OF_EACH):
             raise InputError(
-                f"`term` is a second `{term.name}`; the problem has one of that name. Give `replace=True` to put it in "
-                "its place; for both, join their observations in one term, or derive a class with a `name` of its own"
+                f"`term` is a second `{term.name}`: pass `replace=True` to replace the first; to have both, join their "
+                "observations in one term, or derive a class with another `name`"
             )
         return self.with_terms(tuple(term if own is old else own for own in self.terms))
 
     def without_term(self, name: str) -> Problem:
-        """The problem without the term of that name, if it has one."""
+        """Return the problem without the term of that name; unchanged if there is none."""
         return self.with_terms(tuple(term for term in self.terms if term.name != name))
 
     def with_terms(self, terms: tuple[AbstractTerm, ...]) -> Problem:
-        """The problem with other terms.
+        """Return the problem with other terms.
 
         Raises:
-            InputError: they are no tuple of terms.
+            InputError: `terms` is not a tuple of terms.
 
         """
         check_kind("terms", terms, tuple, "a tuple of terms")
@@ -238,7 +237,7 @@ class Problem(eqx.Module):
 
     @property
     def edge_terms(self) -> tuple[EdgeTerm, ...]:
-        """Terms along edges that have room for an observation."""
+        """Terms along edges with at least one slot."""
         return tuple(term for term in self._of_kind(EdgeTerm) if term.weight.shape[-1])
 
     @property
@@ -263,7 +262,7 @@ class Problem(eqx.Module):
 
     @property
     def dense_terms(self) -> tuple[DenseTerm, ...]:
-        """Terms on everything dense."""
+        """Terms on all poses and the camera."""
         return tuple(self._of_kind(DenseTerm))
 
     def _of_kind(self, kind: type) -> Iterator[Any]:
@@ -285,7 +284,7 @@ class Problem(eqx.Module):
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Of the parameters, in the order of the dense state: `fx`, or `fx of camera 1` of several."""
+        """Names of the parameters in the order of the dense state: `fx`, or `fx of camera 1` for several cameras."""
         if self.camera_of is None:
             return self.camera.names
         groups = self.num_parameters // len(self.camera.names)
@@ -293,11 +292,11 @@ class Problem(eqx.Module):
 
     @property
     def num_camera(self) -> int:
-        """Size of the dense part of the state: six a keyframe, and the cameras' parameters."""
+        """Size of the dense part of the state: six for each keyframe, and the cameras' parameters."""
         return lie.TANGENT * self.num_keyframes + self.num_parameters
 
     @property
     def first_segment(self) -> int:
-        """First slot that belongs to a two-ends line."""
+        """First slot that belongs to a line segment."""
         slots = self.pixels.shape[1]
         return slots if self.fraction is None else slots - self.fraction.shape[1] * self.fraction.shape[2]

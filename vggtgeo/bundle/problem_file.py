@@ -18,7 +18,7 @@ from jax.typing import DTypeLike
 
 from vggtgeo.bundle import terms as term_package
 from vggtgeo.bundle.observations import Observations
-from vggtgeo.bundle.observed import check_tied
+from vggtgeo.bundle.observed import check_connected
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.packing_checks import check_dtype
 from vggtgeo.bundle.padding import SlotIndex
@@ -66,7 +66,7 @@ INDICES = ("edges", "var_kf", "pt_edge", "pt_var", "ln_edge", "ln_var", "var_seg
 def load_problem(
     path: Path, dtype: DTypeLike | None = None, *, terms: Sequence[type] = ()
 ) -> tuple[Problem, State, SlotIndex]:
-    """Load a problem: flat lists as other programs write them, or a file of `save_problem`.
+    """Load a problem: flat lists of another program, or a file of `save_problem`.
 
     Args:
         path: `.npz`; docs/reference/problem-file.md describes both layouts.
@@ -120,7 +120,7 @@ def load_problem(
         check_precision({"huber": arrays["huber"]}, dtype, positive=("huber",))
         kernel = Huber(jnp.asarray(float(arrays["huber"]), dtype))
         packed = pack(observations, *start, intrinsics_sigma=arrays["k_prior_sigma"], kernel=kernel, dtype=dtype)
-        check_tied(observations, len(arrays["T_init"]))
+        check_connected(observations, len(arrays["T_init"]))
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
     return packed
@@ -155,7 +155,7 @@ def save_problem(path: Path, problem: Problem, state: State, index: SlotIndex) -
 
     """
     check_kinds(problem, state)
-    check_kind("index", index, SlotIndex, "a `SlotIndex`, the third of what `vggtgeo.pack` gives")
+    check_kind("index", index, SlotIndex, "a `SlotIndex`, the third result of `vggtgeo.pack`")
     names = [term.name for term in problem.terms]
     if len(set(names)) < len(names):
         raise InputError(f"`terms` must have distinct names, got {names}")

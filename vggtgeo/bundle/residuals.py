@@ -1,4 +1,4 @@
-"""The residuals of a problem, term by term, and how large they are: the first thing to look at after a solve."""
+"""The residuals of a problem, term by term, and their root mean squares."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from vggtgeo.io.readable import Readable
 
 
 class ResidualSizes(Readable):
-    """Root mean square of each term's residuals, weighted as its robust kernel weighs them; NaN where a term has none.
+    """Root mean square of each term's residuals, weighted by its robust kernel; NaN for a term without observations.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> sizes = jax.jit(vg.analysis.residual_sizes)(problem, solution.state)
@@ -45,12 +45,12 @@ class ResidualSizes(Readable):
     rms: dict[str, Float[Array, ""]]
     """By name of the term, in its unit: pixels for points and lines, standard deviations for priors."""
     count: dict[str, Int[Array, ""]]
-    """Observations with a weight."""
+    """Number of observations of positive weight."""
     units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
-    """Of each term's residuals."""
+    """Name and unit of each term's residuals."""
 
     def to_dict(self) -> dict[str, float | int]:
-        """The same as plain numbers (outside `jit`); NaN where a term has no observation."""
+        """Return root mean squares and counts as plain numbers (outside `jit`); NaN for a term without observations."""
         sizes = {name: float(value) for name, value in self.rms.items()}
         return {**sizes, **{f"{name}_count": int(value) for name, value in self.count.items()}}
 
@@ -64,10 +64,12 @@ class ResidualSizes(Readable):
 
 
 def residual_sizes(problem: Problem, state: State) -> ResidualSizes:
-    """`sqrt(sum w rho' |r|^2 / sum w rho')` of each term of `problem` at `state`.
+    """Return `sqrt(sum w rho' |r|^2 / sum w rho')` of each term of `problem` at `state`.
 
-    With `rho'` of the term's kernel, so that mismatches count as little as they did in the solve. Pure: works under
-    `jit` and `vmap`.
+    `rho'` is that of the term's kernel, so outliers are weighted as in the solve. Pure: works under `jit` and `vmap`.
+
+    Raises:
+        InputError: `state` does not have the size or precision of `problem`.
 
     Example:
         >>> import jax, vggtgeo as vg
@@ -101,10 +103,10 @@ _sizes_jit = KeptProgram(_sizes, _sizes_like)
 
 
 def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."]]:
-    """Every residual of `problem` at `state`, before weights and kernel, by the name of its term.
+    """Return every residual of `problem` at `state`, before weights and kernel, by the name of its term.
 
-    The axes of the term's `weight` come first, then the entries of a residual where it has more than one: points
-    `[e, p, 2]`, lines `[e, l]`, depth `[h, s]`. Any finite number where an observation is absent. Pure: works under
+    The axes of the term's `weight` come first, then the entries of a residual if it has more than one: points
+    `[e, p, 2]`, lines `[e, l]`, depth `[h, s]`. Absent observations have an arbitrary finite value. Pure: works under
     `jit` and `vmap`.
 
     Example:
@@ -132,12 +134,12 @@ def _residuals_jit(problem: Problem, state: State) -> dict[str, Float[Array, "..
 
 
 def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[Array, "m *observations"]:
-    """Residuals of one term of a prepared problem, the residual's own axis first."""
+    """Return the residuals of one term of a prepared problem, the residual's own axis first."""
     cameras = cameras_of(problem, state)
     if isinstance(term, SlotTerm):
         return term.residuals(state.inverse_depth)
     if isinstance(term, HostPixel):
-        assert state.pixel_offset is not None  # `check_pair` has seen to it
+        assert state.pixel_offset is not None  # ensured by `check_pair`
         return term.residuals(state.pixel_offset)
     if isinstance(term, PoseTerm | PairTerm):
         return node_residuals(term, state.poses.wxyz_xyz, cameras)
@@ -159,7 +161,7 @@ def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[
 
 
 def count_rows(problem: Problem, term: AbstractTerm, state: State) -> Int[Array, ""]:
-    """Rows of residuals that a term of a prepared problem has, by its weights."""
+    """Return the number of residual rows of positive weight of a term of a prepared problem."""
     if isinstance(term, DenseTerm):
         return term.rows()
     entries = jax.eval_shape(lambda: term_residuals(problem, term, state)).shape[0]
@@ -173,7 +175,7 @@ def _size(term: AbstractTerm, residual: Float[Array, "m *b"]) -> tuple[Float[Arr
 
 
 def used_slots(problem: Problem) -> Bool[Array, "h s"]:
-    """Slots that any term has an observation of."""
+    """Return which slots have an observation of any term."""
     used = jnp.zeros(problem.pixels.shape[:2], bool)
     for slot in problem.slot_terms:
         used = used | slot.present()

@@ -1,4 +1,4 @@
-"""Consistency of a loaded problem: its file may have been written, cut or changed by any program.
+"""Validation of a loaded problem: its file may have been written, truncated or changed by another program.
 
 Without these checks JAX would clamp an index beyond an array to its last row, or fail far from the cause.
 """

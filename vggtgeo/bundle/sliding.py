@@ -1,8 +1,8 @@
-"""A step of a sliding window as a pure function of static shapes: with `solve` the body of a `lax.scan`.
+"""One step of a sliding window as a pure function of static shapes: with `solve` the body of a `lax.scan`.
 
-A window of `n` keyframes is solved; one keyframe leaves and is marginalised, the others move up, a new one takes the
-last place. What the new window observes is packed beforehand; what the old one found is carried over: the prior, the
-poses that stay, the cameras' parameters, and which poses are held.
+A window of `n` keyframes is solved. One keyframe leaves and is marginalised, the others move up, and a new one takes
+the last position. The observations of the new window are packed beforehand. The old window contributes the prior, the
+remaining poses, the cameras' parameters, and the flags of fixed poses.
 """
 
 from __future__ import annotations
@@ -31,28 +31,27 @@ def slide(
     leaving: Int[Array, ""] | int = 0,
     constant_velocity: bool = False,
 ) -> tuple[Problem, State]:
-    """Marginalise keyframe `leaving` of a solved window, and make the next window ready to be solved.
+    """Marginalise keyframe `leaving` of a solved window, and prepare the next window for `solve`.
 
     Pure, of static shapes and differentiable: the body of a `jax.lax.scan` together with `solve`, under `jit`, `vmap`
-    and `grad`. Keyframes of the next window: those that stay, in their order, and a new one in the last place.
+    and `grad`. Keyframes of the next window: the remaining ones in their order, and a new one in the last position.
 
     Args:
-        problem: the window that was solved, `n >= 2` keyframes, with a `marginal` term (`no_prior(n)` in the first).
+        problem: the solved window, `n >= 2` keyframes, with a `marginal` term (`no_prior(n)` in the first).
         state: its solution.
-        next_problem: what the next window observes, of the same shapes. It gets the prior, and poses that are held stay
-            so; its own `fixed_pose` counts for the new keyframe alone.
-        next_initial: where it starts: of it come the inverse depths (1/m), the pixel offsets if there are any, and the
-            new keyframe's pose (world -> camera, the last). The other poses and the cameras' parameters are those of
-            `state`.
-        leaving: which keyframe leaves; 0 is the oldest. May be traced.
-        constant_velocity: start the new pose where the motion between the last two keyframes of `state` leads, if it
-            went on; `next_initial` then counts for inverse depths alone.
+        next_problem: the observations of the next window, in the same shapes. The prior is added, and fixed poses stay
+            fixed; its own `fixed_pose` is used for the new keyframe only.
+        next_initial: its initial inverse depths (1/m), pixel offsets, and the new keyframe's pose (world -> camera, the
+            last). The other poses and the cameras' parameters are those of `state`.
+        leaving: index of the keyframe that leaves; 0 is the oldest. May be traced.
+        constant_velocity: initialise the new pose by constant velocity from the last two keyframes of `state`, instead
+            of from `next_initial`.
 
     Returns:
-        The next window's problem and initial state, as `solve` takes them.
+        The next window's problem and initial state, the arguments of `solve`.
 
     Raises:
-        InputError: windows of different shapes or cameras, fewer than two keyframes, or a keyframe that is not there.
+        InputError: windows of different shapes or cameras, fewer than two keyframes, or `leaving` out of range.
         ValueError: `problem` has no `marginal` term.
 
     Example:
@@ -88,7 +87,7 @@ def slide(
 
 
 def _staying(leaving: Any, keyframes: int) -> Int[Array, " m"]:
-    """Places of the keyframes that stay."""
+    """Return the indices of the keyframes that stay."""
     place = jnp.arange(keyframes - 1)
     return place + (place >= leaving)
 
@@ -101,7 +100,7 @@ def _extrapolated(poses: Float[Array, "n 7"]) -> Float[Array, "7"]:
 
 def _check_alike(problem: Problem, following: Problem) -> None:
     if problem.num_keyframes < 2:
-        raise InputError("`problem` has 1 keyframe; expected at least 2, one that leaves and one that stays")
+        raise InputError("`problem` must have at least 2 keyframes, got 1")
     if following.num_keyframes != problem.num_keyframes or following.fixed_intrinsics.shape != (
         problem.fixed_intrinsics.shape
     ):
@@ -110,11 +109,11 @@ def _check_alike(problem: Problem, following: Problem) -> None:
             for window in (following, problem)
         )
         raise InputError(
-            f"`next_problem` has {found}, `problem` {wanted}; "
+            f"`next_problem` must have {wanted}, as `problem`, got {found}: "
             "pack all windows to one shape with `vggtgeo.batches.pack_batch`"
         )
     if following.camera is not problem.camera:
         raise InputError(
-            f"`next_problem` has cameras of the kind `{following.camera.__name__}`, `problem` "
-            f"`{problem.camera.__name__}`; pack all windows with one `camera`"
+            f"`next_problem` must have the camera model of `problem`, `{problem.camera.__name__}`, got "
+            f"`{following.camera.__name__}`: pack all windows with one `camera`"
         )

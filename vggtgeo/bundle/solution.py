@@ -36,7 +36,7 @@ from vggtgeo.solvers.problem import energy_of
 
 
 class Solution(Readable):
-    """The outcome of `solve`; a pytree, so it passes through `jit` and `vmap`.
+    """The result of `solve`; a pytree, so it passes through `jit` and `vmap`.
 
     Example (of `solve`'s):
         >>> solution.to_dict()["converged"]
@@ -46,30 +46,30 @@ class Solution(Readable):
 
     state: State
     energy: Float[Array, ""]
-    """`1/2 sum rho` at `state`, and differentiable like it."""
+    """`1/2 sum rho` at `state`, differentiable like `state`."""
     history: Float[Array, " h"]
-    """Energy after each iteration, from the initial one; NaN beyond the last."""
+    """Energy after each iteration, starting with the initial one; NaN after the last."""
     iterations: Int[Array, ""]
-    """Tried steps, accepted or not."""
+    """Number of steps, accepted or not."""
     linearisations: Int[Array, ""]
     gradient_norm: Float[Array, ""]
     """Largest gradient entry of the last linearisation, scaled by its curvature (unit of the root of the energy)."""
     termination: Termination
     polished: Bool[Array, ""]
-    """Whether `state` was moved on to the optimum because it was differentiated; it is then the optimum even where the
-    iteration had not converged, and differs from what `solve` returns without differentiation."""
+    """Whether `state` was refined to the optimum for differentiation. It is then the optimum even if the iteration had
+    not converged, and differs from the result of `solve` without differentiation."""
     gradient_residual: Float[Array, ""]
-    """`gradient_norm` at `state` where it was polished; above `vggtgeo.solvers.adjoint.STATIONARY` the derivatives are
-    not those of an optimum."""
+    """`gradient_norm` at `state` if it was polished; above `vggtgeo.solvers.adjoint.STATIONARY` the derivatives are not
+    those of an optimum."""
     at_bound: Int[Array, ""]
-    """Landmarks that rest on the bound of positive inverse depths: they want to lie behind infinity."""
+    """Number of landmarks at the bound of positive inverse depths; their optimum is beyond infinity."""
     diagnosis: Diagnosis | None
-    """Observations at fault, term by term; `message` has them in words. None if it was not asked for."""
+    """Faulty observations, term by term; `message` describes them. None without `diagnosis=True`."""
     record: IterationRecord | None = None
-    """What each iteration did, with `SchurLevenbergMarquardt(record_iterations=True)`."""
+    """Data of each iteration, with `SchurLevenbergMarquardt(record_iterations=True)`."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Result, energies and counts as plain values (outside `jit`, for one solution)."""
+        """Return result, energies and counts as plain values (outside `jit`, for one solution)."""
         return {
             "result": self.result,
             "converged": bool(self.converged),
@@ -87,7 +87,7 @@ class Solution(Readable):
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether the iteration ended by itself; a traced boolean under `jit`."""
+        """Whether the iteration converged; a traced boolean under `jit`."""
         met = self.termination == CONVERGED[0]
         for code in CONVERGED[1:]:
             met = met | (self.termination == code)
@@ -100,14 +100,15 @@ class Solution(Readable):
 
     @property
     def message(self) -> str:
-        """Why the iteration ended and what to do, and which terms are at fault: residuals that are not finite, kernels
-        that reject most of a term, held poses that contradict one (outside `jit`, for one solution).
+        """Why the iteration ended, what to do, and which terms are faulty (outside `jit`, for one solution).
+
+        Faults are residuals that are not finite, kernels that reject most of a term, and inconsistent fixed poses.
         """
         ended = termination_message(self.termination)
         failed = not bool(self.converged) and self.result != "max_iterations"
         found = [] if self.diagnosis is None else self.diagnosis.sentences(failed)
         if self.result == "nonfinite_step" and not found:
-            found = ["Look for weights or standard deviations that are far too large or too small."]
+            found = ["Check for weights or standard deviations that are far too large or too small."]
         return " ".join([ended, *found])
 
 
@@ -123,28 +124,27 @@ def solve(
     """Minimise the energy of `problem` from `initial`.
 
     Pure: works under `jax.jit`, `jax.vmap`, `jax.grad` and `jax.jvp`. Derivatives of `Solution.state` with respect to
-    every float leaf of `problem`, and to the held coordinates of `initial`, are those of the optimum (implicit function
-    theorem, exact Hessian), and those of `Solution.energy` those of the least energy. History, record and counts carry
-    none. Nothing throws: see `Solution.termination`.
+    every float leaf of `problem`, and to the fixed coordinates of `initial`, are those of the optimum (implicit
+    function theorem, exact Hessian); those of `Solution.energy` are those of the minimal energy. History, record and
+    counts have zero derivative. A failed iteration raises no exception: see `Solution.termination`.
 
     Args:
-        problem: observations and priors, `vggtgeo.pack` makes one from flat lists.
-        initial: starting state, world -> camera poses, pixels, 1/m; lines of two ends start straight along them.
-        solver: iteration and linear algebra; default `SchurLevenbergMarquardt()` with the linear solver that
-            `choose_reduced_solver` finds for the graph. Of a `problem` that is an argument of a jitted function it
-            cannot see the graph: give it there for a large problem.
-        adjoint: how to differentiate; default `ArrowAdjoint()`. With `optimistix.RecursiveCheckpointAdjoint()` through
-            the iterates, in reverse mode only; the solver then runs with `differentiable_loop=True`.
-            `optimistix.ImplicitAdjoint()` cannot be used: its derivative needs a residual function of optimistix.
-        graduation: wider kernels to go through first, for a redescending kernel and a start that outliers dominate;
-            `history` and `iterations` are those of the last kernel, the one of `problem`.
-        diagnosis: look for observations at fault; without it, a program with terms on poses compiles in two thirds of
-            the time.
+        problem: observations and priors; `vggtgeo.pack` makes one from flat lists.
+        initial: initial state: world -> camera poses, pixels, 1/m. Line segments are first projected to straight lines.
+        solver: iteration and linear algebra; default `SchurLevenbergMarquardt()` with the linear solver of
+            `choose_reduced_solver`. If `problem` is traced, its graph is unknown and the default is dense: pass a
+            solver for a large problem.
+        adjoint: differentiation; default `ArrowAdjoint()`. `optimistix.RecursiveCheckpointAdjoint()` differentiates the
+            iterates, in reverse mode only; the solver then runs with `differentiable_loop=True`.
+            `optimistix.ImplicitAdjoint()` is not supported: it needs a residual function of optimistix.
+        graduation: iterations with wider kernels first, for a redescending kernel and initial residuals dominated by
+            outliers; `history` and `iterations` are those of the last kernel, the one of `problem`.
+        diagnosis: whether to search for faulty observations; without it, a program with terms on poses compiles in two
+            thirds of the time.
 
     Raises:
-        InputError: `initial` is of another size or precision; `adjoint` is an `optimistix.ImplicitAdjoint`; or nothing
-            is observed (where weights have values to look at; as the argument of a jitted function such a problem
-            converges where it starts).
+        InputError: `initial` has another size or precision; `adjoint` is an `optimistix.ImplicitAdjoint`; or there is
+            no observation (not checked if traced; such a problem converges at the initial state).
 
     Example:
         >>> import jax, vggtgeo as vg
@@ -165,19 +165,19 @@ def solve(
 
 
 def _differentiable_by(adjoint: optx.AbstractAdjoint, solver: SchurLevenbergMarquardt) -> SchurLevenbergMarquardt:
-    """The solver as the adjoint needs it."""
+    """Return the solver with the loop that the adjoint needs."""
     if isinstance(adjoint, optx.ImplicitAdjoint):
         raise InputError(
-            "`adjoint` is `optimistix.ImplicitAdjoint`, which differentiates a residual function that `solve` does not "
-            "have; it must be `vggtgeo.ArrowAdjoint()` (the same theorem with the exact Hessian; the default) or "
-            "`optimistix.RecursiveCheckpointAdjoint()` (the iterates)"
+            "`adjoint` must be `vggtgeo.ArrowAdjoint()` (implicit differentiation with the exact Hessian; the default) "
+            "or `optimistix.RecursiveCheckpointAdjoint()` (the iterates), got `optimistix.ImplicitAdjoint`, which "
+            "needs a residual function"
         )
     if isinstance(adjoint, optx.RecursiveCheckpointAdjoint):
         return dataclasses.replace(solver, differentiable_loop=True)
     return solver
 
 
-@eqx.filter_jit  # outside the caller's `jit`, every operation of the derivative would be compiled by itself
+@eqx.filter_jit  # without `jit`, JAX would compile every operation of the derivative separately
 def _solve_jit(
     problem: Problem,
     initial: State,
@@ -225,14 +225,14 @@ def _solve_jit(
 
 @eqx.filter_custom_jvp
 def _energy_at(energy: Float[Array, ""], problem: BundleAdjustment, state: State) -> Float[Array, ""]:
-    """`energy`, which the iteration knows, with its derivative by the problem and the state."""
+    """Return `energy`, computed by the iteration, with its derivative by the problem and the state."""
     del problem, state
     return energy
 
 
 @_energy_at.def_jvp
 def _energy_derivative(primals: Any, tangents: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """At an optimum the part by the state vanishes, but for what is held; near it, it takes the first error away."""
+    """Differentiate by problem and state: at an optimum the state matters by its fixed coordinates only."""
     _, *at = primals
     _, *moved = tangents
     absent = jax.tree.map(lambda leaf: leaf is None, moved, is_leaf=lambda leaf: leaf is None)
@@ -249,7 +249,7 @@ def _energy_derivative(primals: Any, tangents: Any) -> tuple[Float[Array, ""], F
 def solution_like(
     problem: Problem, initial: State, solver: SchurLevenbergMarquardt, diagnosis: bool = True
 ) -> Solution:
-    """A solution of the structure of the one of these, without its numbers: for what keeps programs."""
+    """Return a solution with the structure of the result of `solve` and placeholder values, for the JIT cache."""
     count, number = jnp.asarray(0), jnp.zeros(())
     tries = jnp.zeros(solver.max_iterations + 1)
     moved = jnp.zeros((len(tries), *initial.poses.wxyz_xyz.shape))

@@ -1,4 +1,4 @@
-"""Which linear solver suits a problem: decided outside `jit`, by its size and its graph."""
+"""Choice of the linear solver for a problem, by its size and its graph; outside `jit`."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_LIMIT = 40
-"""Keyframes up to which a dense factor costs no more than the linearisation before it."""
+"""Number of keyframes up to which a dense factor costs no more than the linearisation."""
 BAND_LIMIT = 24
-"""Longest reach of a band: a group of `2 * 24` keyframes has 288 coordinates."""
-MUCH_DENSE = 300
-"""Keyframes above which a dense factor inside `jit` is worth a warning: at 200 an iteration takes twice as long as with
-a band (docs/results/solver.md), and its cost grows with the cube."""
+"""Maximum reach of a band: a group of `2 * 24` keyframes has 288 coordinates."""
+DENSE_WARNING = 300
+"""Number of keyframes above which a dense factor inside `jit` causes a warning: at 200 an iteration takes twice as long
+as with a band (docs/results/solver.md), and its cost grows with the cube."""
 ORDERED_LIMIT = 12
-"""Longest reach for which no other order is looked for, and the longest of a band that only preconditions."""
+"""Maximum reach for which the order of keyframes is kept, and of a band used as preconditioner."""
 SHORT_SHARE = 0.5
-"""Least share of edges that a band must hold to be worth factorising."""
+"""Minimum share of edges inside a band for the band to be a useful preconditioner."""
 
 
 def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
-    """A linear solver for `SchurLevenbergMarquardt(reduced_solver=...)`.
+    """Choose a linear solver for `SchurLevenbergMarquardt(reduced_solver=...)`.
 
     Small problems and those with a marginalisation prior: dense Cholesky. Sequences, whose edges join keyframes near in
-    their order, and closed loops, whose edges do so in a folded order: block-banded Cholesky, linear in the number of
-    keyframes. Sequences with many loops: conjugate gradients with the band of their short edges as preconditioner. Any
-    other graph: conjugate gradients with one block a keyframe.
+    order, and closed loops, whose edges do so in a folded order: block-banded Cholesky, linear in the number of
+    keyframes. Sequences with many loops: conjugate gradients with the band of short edges as preconditioner. Any other
+    graph: conjugate gradients with one block for each keyframe.
 
     Args:
-        problem: concrete arrays (not traced); the choice holds for every problem with the same graph.
+        problem: concrete arrays (not traced); the choice is valid for every problem with the same graph.
 
     Example: a window is small.
         >>> vg.choose_reduced_solver(problem)
         DenseCholesky()
 
     """
-    check_kind("problem", problem, Problem, "a `Problem`, the first of what `vggtgeo.pack` gives")
+    check_kind("problem", problem, Problem, "a `Problem`, the first result of `vggtgeo.pack`")
     if problem.num_keyframes <= DENSE_LIMIT or problem.dense_terms:
         return DenseCholesky()
     ends, alone = coupled_pairs(problem)
@@ -65,16 +65,14 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
 
 
 def default_solver(problem: Problem) -> SchurLevenbergMarquardt:
-    """What `solve` takes without a word: the linear solver that suits the graph, or inside `jit`, where the graph
-    cannot be looked at, the dense one, with a warning where that is slow.
-    """
+    """Return the default solver: linear solver chosen from the graph; inside `jit` dense, with a warning if slow."""
     if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(problem)):
         with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
             return SchurLevenbergMarquardt(reduced_solver=choose_reduced_solver(problem))
-    if problem.num_keyframes > MUCH_DENSE and not problem.dense_terms:
+    if problem.num_keyframes > DENSE_WARNING and not problem.dense_terms:
         warnings.warn(
-            f"`solve` of {problem.num_keyframes} keyframes inside `jit` takes a dense linear solver, for the graph "
-            "cannot be looked at there: choose one outside, `solver=SchurLevenbergMarquardt(reduced_solver="
+            f"`solve` of {problem.num_keyframes} keyframes inside `jit` uses a dense linear solver, since the graph is "
+            "traced there: choose one outside, `solver=SchurLevenbergMarquardt(reduced_solver="
             "choose_reduced_solver(problem))`",
             stacklevel=3,
         )
@@ -82,10 +80,10 @@ def default_solver(problem: Problem) -> SchurLevenbergMarquardt:
 
 
 def coupled_pairs(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of every edge that observes anything and of every pair, `int [m, 2]`, and which of them are pairs alone.
+    """Return the nodes of every edge with observations and of every pair, `int [m, 2]`, and which are only pairs.
 
-    Two keyframes that one host sees are coupled through its landmarks, so a band of reach `r` holds blocks `2 r` apart,
-    and a pair, which no landmark takes part in, may be twice as long as an edge.
+    Two keyframes observed from one host are coupled through its landmarks, so a band of reach `r` has blocks `2 r`
+    apart. A pair has no landmarks, so it may be twice as long as an edge.
     """
     seen = np.zeros(len(problem.edges.source), bool)
     for term in problem.edge_terms:
@@ -99,6 +97,6 @@ def coupled_pairs(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reaches(place: np.ndarray, ends: np.ndarray, alone: np.ndarray) -> np.ndarray:
-    """The reach that each pair of nodes asks of a band in that order."""
+    """Return the reach of a band that each pair of nodes needs in that order."""
     apart = np.abs(place[ends[:, 0]] - place[ends[:, 1]])
     return np.where(alone, (apart + 1) // 2, apart)

@@ -1,4 +1,4 @@
-"""What `pack` asks of the terms that it is given; see `packing_checks.py`."""
+"""Validation of the argument `terms` of `pack`; see `packing_checks.py`."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, real_numbers
 
 _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsPrior))
-"""Names of the terms that `pack` makes of its other arguments."""
+"""Names of the terms that `pack` creates from its other arguments."""
 
 
 def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int) -> list[AbstractTerm | FlatTerm]:
-    """Terms of different names, with weights that are weights and indices that exist; a weight for each observation."""
-    check_kind("terms", terms, (list, tuple), "a list of terms, as `[vggtgeo.terms.RelativePose(...)]`")
+    """Check that terms have distinct names, valid weights and valid indices; broadcast their weights."""
+    check_kind("terms", terms, (list, tuple), "a list of terms, such as `[vggtgeo.terms.RelativePose(...)]`")
     names = list(_OWN)
     terms = [term.broadcast() if isinstance(term, AbstractTerm) else term for term in terms]
     for term in terms:
         if not isinstance(term, AbstractTerm | FlatTerm):
             raise InputError(
-                f"`terms` holds {term!r:.60}; expected terms, as `vggtgeo.terms.RelativePose`, or `FlatTerm`"
+                f"`terms` must have terms, such as `vggtgeo.terms.RelativePose`, or `FlatTerm`, got {term!r:.60}"
             )
         if term.name in names:
             raise InputError(
-                f"`terms` holds a second term `{term.name}`; join their observations in one term, or derive a class "
-                "with a `name` of its own"
+                f"`terms` must have distinct names, got `{term.name}` twice: join their observations in one term, or "
+                "derive a class with another `name`"
             )
         names.append(term.name)
         if not isinstance(term.weight, jax.core.Tracer):
@@ -47,7 +47,7 @@ def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int
         kernel = term.fields.get("kernel") if isinstance(term, FlatTerm) else getattr(term, "kernel", None)
         check_kernel(f"{term.name}.kernel", kernel)
         if isinstance(term, COUNTED) and np.ndim(term.weight) != 1:
-            raise InputError(f"`{term.name}.weight` has shape {np.shape(term.weight)}; give one weight an observation")
+            raise InputError(f"`{term.name}.weight` must have shape [m], got {np.shape(term.weight)}")
         if isinstance(term, FlatTerm):
             _check_flat(term, observations)
         elif isinstance(term, PoseTerm | PairTerm):
@@ -57,25 +57,25 @@ def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int
 
 def _check_flat(term: FlatTerm, observations: Observations) -> None:
     if not issubclass(term.kind, EdgeTerm | SlotTerm):
-        raise InputError(f"`FlatTerm` of `{term.kind.__name__}`: give a term that is on no landmark as it is")
+        raise InputError(f"`FlatTerm` must be of a term on landmarks, got `{term.kind.__name__}`: pass the term itself")
     if (term.edge is not None) != issubclass(term.kind, EdgeTerm):
         what = "an `edge` for each landmark" if term.edge is None else "no `edge`"
-        raise InputError(f"`FlatTerm` of `{term.kind.__name__}` needs {what}")
+        raise InputError(f"`FlatTerm` of `{term.kind.__name__}` must have {what}")
     count = len(term.landmark)
     for name, values in term.rows().items():
         for leaf in jax.tree.leaves(values):
             if np.shape(leaf)[:1] != (count,):
                 raise InputError(
-                    f"`{term.name}.{name}` has shape {np.shape(leaf)}; expected ({count}, ...), one row a landmark"
+                    f"`{term.name}.{name}` must have shape ({count}, ...), one row a landmark, got {np.shape(leaf)}"
                 )
     landmark = _check_range(f"{term.name}.landmark", term.landmark, len(observations.host), "landmarks")
     if term.edge is not None:
         edge = _check_range(f"{term.name}.edge", term.edge, len(observations.edges), "edges")
         if len(edge) != count:
-            raise InputError(f"`{term.name}.edge` has {len(edge)} entries; expected {count}, one a landmark")
+            raise InputError(f"`{term.name}.edge` must have {count} entries, one a landmark, got {len(edge)}")
         check_matches((f"{term.name}.edge", f"{term.name}.landmark"), edge, landmark, observations)
     elif len(np.unique(landmark)) < count:
-        raise InputError(f"`{term.name}.landmark` names a landmark more than once; give each one observation")
+        raise InputError(f"`{term.name}.landmark` must be distinct: at most one observation for each landmark")
 
 
 def _check_touched(term: PoseTerm | PairTerm, keyframes: int) -> None:
@@ -84,17 +84,17 @@ def _check_touched(term: PoseTerm | PairTerm, keyframes: int) -> None:
         if isinstance(index, jax.core.Tracer) or isinstance(term.weight, jax.core.Tracer):
             continue
         if np.shape(term.weight) != np.shape(index):
-            raise InputError(f"`{term.name}.weight` has shape {np.shape(term.weight)}; expected {np.shape(index)}")
-        # Room for observations to come has weight 0, and may name keyframes to come.
+            raise InputError(f"`{term.name}.weight` must have shape {np.shape(index)}, got {np.shape(term.weight)}")
+        # Placeholders of later observations have weight 0, and may refer to later keyframes.
         _check_range(f"{term.name}.{name}", np.asarray(index)[np.asarray(term.weight) > 0], keyframes, "keyframes")
 
 
 def _check_range(name: str, given: Any, limit: int, what: str) -> np.ndarray:
     values = real_numbers(name, given)
     if not np.issubdtype(values.dtype, np.integer):
-        raise InputError(f"`{name}` holds {values.dtype}; expected whole numbers")
+        raise InputError(f"`{name}` must be whole numbers, got {values.dtype}")
     if values.size and (values.min() < 0 or values.max() >= limit):
         raise InputError(
-            f"`{name}` goes from {values.min()} to {values.max()}; there are {limit} {what}: use 0 to {limit - 1}"
+            f"`{name}` must be from 0 to {limit - 1} ({limit} {what}), got {values.min()} to {values.max()}"
         )
     return values

@@ -1,6 +1,6 @@
-"""A term brought to the padded shape of a problem, by its kind: the one place that knows where a kind has its axes.
+"""Padding of a term to the shape of a problem, by its kind. Only this file depends on the axes of a kind.
 
-Padding is an observation of weight 0. Its data are ones, which `AbstractTerm.prepared` puts there anyhow.
+Padding is an observation of weight 0. Its data are ones, as in `AbstractTerm.prepared`.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from vggtgeo.io.errors import InputError
 
 
 def padded(term: GivenTerm, index: SlotIndex, size: PaddedSize, dtype: DTypeLike) -> AbstractTerm:
-    """The term in the shape of a problem of `size` whose landmarks and edges lie as `index` says.
+    """Return the term in the shape of a problem of `size`, with landmarks and edges positioned by `index`.
 
     Raises:
-        InputError: a term that is in another shape already, or has more observations than there is room for.
+        InputError: the term has another padded shape, or more observations than `size` allows.
 
     """
     if isinstance(term, FlatTerm):
@@ -42,7 +42,7 @@ def padded(term: GivenTerm, index: SlotIndex, size: PaddedSize, dtype: DTypeLike
 
 
 def placed(term: FlatTerm, index: SlotIndex, slots: tuple[int, int], dtype: DTypeLike) -> AbstractTerm:
-    """A flat term with each row at its landmark's slot, over the slots `[first, end)` of every row."""
+    """Return a flat term with each row moved to its landmark's slot, over the slots `[first, end)` of every row."""
     first, end = slots
     rows, edges, _ = index.shape
     on_edges = issubclass(term.kind, EdgeTerm)
@@ -66,18 +66,18 @@ def placed(term: FlatTerm, index: SlotIndex, slots: tuple[int, int], dtype: DTyp
 
 
 def _lengthened(term: AbstractTerm, count: int) -> AbstractTerm:
-    """A term whose observations are one list, with room for `count` of them."""
+    """Return a term of list form, padded to `count` observations."""
     own = len(term.weight)
     more = count - own
     if more < 0:
-        raise InputError(f"the term `{term.name}` has {own} observations; `size.terms` has room for {count}")
+        raise InputError(f"`size.terms` must allow the {own} observations of the term `{term.name}`, got {count}")
     if more == 0:
         return term
 
     def longer(leaf: Any) -> Any:
         if not eqx.is_array(leaf):
             return leaf
-        # An index of 0 exists in every problem, and what is absent touches nothing.
+        # Index 0 is valid in every problem, and an absent observation has no effect.
         filling = jnp.ones if eqx.is_inexact_array(leaf) else jnp.zeros
         return jnp.concatenate([leaf, filling((more, *leaf.shape[1:]), leaf.dtype)])
 

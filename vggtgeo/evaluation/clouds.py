@@ -74,5 +74,5 @@ def checked_points(name: str, given: Float[np.ndarray, "n 3"]) -> Float[np.ndarr
 
 
 def _tree(points: np.ndarray) -> cKDTree:
-    """A k-d tree without duplicates: it cannot split equal points, and each query would visit all of them."""
+    """Return a k-d tree without duplicates: it cannot split equal points, and each query would visit all of them."""
     return cKDTree(np.unique(points, axis=0))

@@ -33,7 +33,7 @@ class DriftNoise:
         return self._factored(rows)[0]
 
     def _factored(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
-        """Whitened rows, and the log determinant of the covariance for `sigma` 1."""
+        """Return whitened rows, and the log determinant of the covariance for `sigma` 1."""
         c, first = self.correlation, np.sqrt(1.0 - self.correlation**2)
         white = np.concatenate([first * rows[:1], rows[1:] - c * rows[:-1]])
         band = np.zeros((2, len(rows)))

@@ -172,7 +172,7 @@ class OffsetModel:
         return self._truth.covers(self._times - time)
 
     def _pair(self, time: float, every: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Poses of the estimate and of the truth at the same moments."""
+        """Return poses of the estimate and of the truth at the same moments."""
         chosen = np.flatnonzero(self._seen(time))[::every]
         return self._all.poses[self._rows[chosen]], self._truth.poses(self._times[chosen] - time)
 
@@ -187,8 +187,8 @@ class OffsetModel:
         return sum(np.log(one.sigma) for one in self._white(residuals))
 
     def _starts(self, time: float, free: np.ndarray) -> Iterator[Unknowns]:
-        """Initial values from positions alone, and from rotations: the latter are better for a straight path or a long
-        lever arm.
+        """Return initial values from positions alone, and from rotations: the latter are better for a straight path or
+        a long lever arm.
         """
         found, true = self._pair(time)
         turned, turns = true[:, :3, :3], bool(free[TURN].all())
@@ -248,13 +248,13 @@ class OffsetModel:
         return np.concatenate([true[:, :3, 3] - made[:, :3, 3], turned], axis=1)
 
     def _jacobian(self, unknowns: Unknowns) -> np.ndarray:
-        """Derivatives of the residuals, float64 [n, 6, 14]."""
+        """Return derivatives of the residuals, float64 [n, 6, 14]."""
         seen = self._seen(unknowns.time)
         made = self._predicted(unknowns, self._all.poses[self._rows[seen]])
         return self._columns(unknowns, made, self._truth.velocities(self._times[seen] - unknowns.time))
 
     def _other_jacobian(self, unknowns: Unknowns) -> np.ndarray:
-        """The Jacobian with the trajectories exchanged: equal motion, independent noise (an instrument, see
+        """Return the Jacobian with the trajectories exchanged: equal motion, independent noise (an instrument, see
         `_covariance`).
         """
         seen = self._seen(unknowns.time)
@@ -300,7 +300,7 @@ class OffsetModel:
         return first, second
 
     def _scaled(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Both Jacobians J and Z, whitened, in units of the prior, and a basis of the determined directions.
+        """Return both Jacobians J and Z, whitened, in units of the prior, and a basis of the determined directions.
 
         A direction is determined if `Z^T J` has four times the prior's information (half its standard deviation), and
         more than two independent noises would have by chance.
@@ -313,7 +313,8 @@ class OffsetModel:
         return own, other, vectors[:, (values > _MIN_GAIN) & (values > chance * lengths)]
 
     def _balanced(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:
-        """The solution of `Z^T r = 0` (instrumental variables, see `_covariance`), starting from that of `J^T r = 0`.
+        """Return the solution of `Z^T r = 0` (instrumental variables, see `_covariance`), starting from that of `J^T r
+        = 0`.
 
         The latter is biased: interpolation reduces the ground truth's noise between its poses, and noisy rotations
         shorten a lever arm.
@@ -331,9 +332,9 @@ class OffsetModel:
         return unknowns
 
     def _covariance(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray]:
-        """Covariance of the solution of `Z^T r = 0`: `(Z^T J)^-1 Z^T Z (Z^T J)^-T`, J and Z the Jacobians of the two
-        trajectories, whose noises are independent, so that `Z^T J` contains motion only. In undetermined directions the
-        covariance of the prior.
+        """Return the covariance of the solution of `Z^T r = 0`: `(Z^T J)^-1 Z^T Z (Z^T J)^-T`, J and Z the Jacobians of
+        the two trajectories, whose noises are independent, so that `Z^T J` contains motion only. In undetermined
+        directions the covariance of the prior.
         """
         own, other, basis = self._scaled(unknowns, free, noise)
         own, other = own @ basis, other @ basis
@@ -347,7 +348,7 @@ def _mean(rotations: np.ndarray) -> np.ndarray:
 
 
 def _turn_of_steps(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, float]:
-    """The rotation of the truth's body in the camera frame, and the mean square residual, rad^2.
+    """Return the rotation of the truth's body in the camera frame, and the mean square residual, rad^2.
 
     From rotation vectors between successive poses, which an alignment does not change (W. Kabsch, Acta Cryst. A 32,
     1976).

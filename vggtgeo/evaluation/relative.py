@@ -112,7 +112,7 @@ def pairs(
 
 
 def _consecutive(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of which each begins where the one before ended; `way` is non-decreasing."""
+    """Return pairs of which each begins where the one before ended; `way` is non-decreasing."""
     delta -= 1e-9 * delta  # `way` has rounding errors: an exact delta must count as reached
     ends, row = [], 0
     while row < len(way):
@@ -123,7 +123,7 @@ def _consecutive(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def _overlapping(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of each row with the later one whose distance is nearest to `delta`; the first of equals."""
+    """Return pairs of each row with the later one whose distance is nearest to `delta`; the first of equals."""
     first = np.arange(max(len(way) - 1, 0))
     after = np.clip(np.searchsorted(way, way[first] + delta), first + 1, len(way) - 1)
     before = np.maximum(np.searchsorted(way, way[np.maximum(after - 1, 0)]), first + 1)

@@ -1,4 +1,4 @@
-"""Learning through bundle adjustment: windows with known truth, and a network that says how far to trust each match.
+"""Learning through bundle adjustment: windows with known truth, and a network that estimates match confidence.
 
 An example of research on top of `vggtgeo.solve`; nothing else of the package uses it. Training needs optax (the extra
 `notebooks`).

@@ -132,7 +132,7 @@ def _determined(window: TrackedWindow) -> bool:
 
 
 def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Values at the nearest pixels, NaN outside."""
+    """Return values at the nearest pixels, NaN outside."""
     height, width = image.shape
     with np.errstate(invalid="ignore"):
         inside = np.all((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5), axis=1)

@@ -69,7 +69,7 @@ def stack_sequences(sequences: Sequence[TrackedWindow], keyframes: int, *, depth
 
 
 def _unit(window: TrackedWindow) -> BaselinePrior:
-    """The distance of the first two keyframes; `slid_error_and_gradient` keeps it of the first window alone."""
+    """Return the distance of the first two keyframes; `slid_error_and_gradient` keeps it of the first window alone."""
     centres = np.asarray(jaxlie.SE3(jnp.asarray(window.poses[:2])).inverse().translation())
     length, one = float(np.linalg.norm(centres[1] - centres[0])), jnp.ones(1)
     return BaselinePrior(
@@ -103,7 +103,7 @@ def slid_error_and_gradient(
 
 
 def _with_priors(windows: Batch, weight: Array) -> Problem:
-    """The stacked problems with these weights and an empty prior each; the baseline only in the first."""
+    """Return the stacked problems with these weights and an empty prior each; the baseline only in the first."""
     count, keyframes = windows.truth.shape[:2]
     empty = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), no_prior(keyframes, weight.dtype))
     problem = windows.problem.with_term(windows.problem.points.reweighted(weight)).with_term(empty)
@@ -114,7 +114,7 @@ def _with_priors(windows: Batch, weight: Array) -> Problem:
 
 
 def _slid(problems: Problem, initials: State) -> Solution:
-    """The solutions of all windows, `[w, ...]`."""
+    """Return the solutions of all windows, `[w, ...]`."""
 
     def step(window: Window, coming: Window) -> tuple[Window, Solution]:
         problem, initial = window

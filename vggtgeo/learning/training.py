@@ -42,7 +42,7 @@ class Batch(NamedTuple):
     right: Bool[Array, "b e p"]
 
     def select(self, rows: np.ndarray | np.integer | int) -> Batch:
-        """Some of the windows, or one, without the first axis."""
+        """Return some of the windows, or one, without the first axis."""
         chosen: Batch = jax.tree.map(lambda leaf: leaf[rows], self)
         return chosen
 
@@ -56,7 +56,7 @@ class PoseErrors(NamedTuple):
     oracle: Float[Array, " b"]
 
     def to_dict(self) -> dict[str, float]:
-        """The geometric mean over the windows, millimetres."""
+        """Return the geometric mean over the windows, millimetres."""
         return {name: 1e3 * float(jnp.exp(jnp.mean(jnp.log(getattr(self, name))))) for name in self._fields}
 
 
@@ -99,8 +99,8 @@ def _packed(window: TrackedWindow, size: PaddedSize, terms: Sequence[GivenTerm])
 
 @eqx.filter_jit
 def error_and_gradient(window: Batch, confidence: Float[Array, "e p"]) -> tuple[Float[Array, ""], Float[Array, "e p"]]:
-    """RMS error of the camera centres after adjustment with weights `GAIN * confidence`, metres, and the gradient of
-    its logarithm with respect to each match's confidence; NaN where the solve failed.
+    """Return the RMS error of the camera centres after adjustment with weights `GAIN * confidence`, metres, and the
+    gradient of its logarithm with respect to each match's confidence; NaN where the solve failed.
 
     Args:
         window: one window of a batch, `batch.select(i)`.
@@ -122,7 +122,7 @@ def error_and_gradient(window: Batch, confidence: Float[Array, "e p"]) -> tuple[
 
 
 def log_error(centres: Float[Array, "n 3"], truth: Float[Array, "n 3"]) -> Float[Array, ""]:
-    """Logarithm of the RMS distance of camera centres from the true ones, metres."""
+    """Return the logarithm of the RMS distance of camera centres from the true ones, metres."""
     return jnp.log(jnp.mean(jnp.sum((centres - truth) ** 2, 1)) + _SMALLEST**2) / 2
 
 

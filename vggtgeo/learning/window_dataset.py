@@ -159,7 +159,7 @@ class WindowDataset:
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str], terms: Sequence[type] = ()) -> Self:
-        """Reads the index that `WindowWriter` left; InputError where there is none, as a writer did not end."""
+        """Read the index of `WindowWriter`; raise InputError if it is missing, since the writer did not finish."""
         place = path_of("folder", folder)
         try:
             index = json.loads(whole_text(place / _INDEX, errors="strict"))
@@ -181,7 +181,7 @@ class WindowDataset:
         return self.count
 
     def __getitem__(self, row: int) -> LabelledWindow:
-        """Window `row`, read from the disk, with numpy leaves."""
+        """Return window `row`, read from the disk, with numpy leaves."""
         check_kind("row", row, numbers.Integral, "the number of a window")
         if not 0 <= row < self.count:
             raise IndexError(f"window {row} of {self.count}")
@@ -190,7 +190,7 @@ class WindowDataset:
         return LabelledWindow(problem, initial, labels)
 
     def order(self, seed: int, epoch: int = 0) -> np.ndarray:
-        """Every row once, int [n], shuffled; it follows from `seed` and `epoch` alone."""
+        """Return every row once, int [n], shuffled; it follows from `seed` and `epoch` alone."""
         check_whole("seed", seed)
         check_whole("epoch", epoch)
         return np.random.default_rng([seed, epoch, 13]).permutation(self.count)
@@ -198,7 +198,7 @@ class WindowDataset:
     def batches(
         self, size: int, *, seed: int | None = 0, epochs: int | None = 1, share: tuple[int, int] = (0, 1)
     ) -> Iterator[LabelledWindow]:
-        """Stacked windows, `size` at a time; two batches are in memory: the next one is read while one is used.
+        """Yield stacked windows, `size` at a time; two batches are in memory: the next one is read while one is used.
 
         Args:
             size: of a batch; what is left at the end of an epoch is left out, as another shape would be compiled anew.
@@ -247,7 +247,7 @@ class WindowDataset:
 
 
 def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
-    """Windows with a leading axis on every array: what a loader calls its collate function.
+    """Return windows with a leading axis on every array: what a loader calls its collate function.
 
     Example:
         >>> from torch.utils.data import DataLoader  # doctest: +SKIP
@@ -286,5 +286,5 @@ def _shapes(tree: Any) -> Any:
 
 
 def _padded(numbers: Sequence[int], length: int) -> np.ndarray:
-    """Numbers of the window's keyframes, -1 where it has room for more."""
+    """Return numbers of the window's keyframes, -1 where it has room for more."""
     return np.array([*numbers, *[-1] * (length - len(numbers))])

@@ -1,1 +1,1 @@
-"""Dense maps: depth of every keyframe, the cloud and the mesh that are fused of it."""
+"""Dense maps: depth of every keyframe, and the point cloud and mesh fused from it."""

@@ -104,7 +104,7 @@ def _dense_points(
     neighbours: Sequence[int],
     intrinsics: np.ndarray,
 ) -> _Points:
-    """Points of keyframe i that a neighbour confirms; all of them without neighbours."""
+    """Return points of keyframe i that a neighbour confirms; all of them without neighbours."""
     keyframe, own = keyframes[i], depth_maps[i]
     assert own is not None
     own = own.decoded()
@@ -129,7 +129,7 @@ def _dense_points(
 
 
 def _normals(points: np.ndarray, depth: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Unit normals [h, w, 3] of a grid of points, towards the camera; 0 at depth edges."""
+    """Return unit normals [h, w, 3] of a grid of points, towards the camera; 0 at depth edges."""
     normals = np.zeros_like(points)
     right, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     across = np.cross(down, right)
@@ -154,7 +154,7 @@ def _confirmed(points: np.ndarray, keyframe: Keyframe, depth: np.ndarray, intrin
 
 
 def _voxel_means(samples: _Points, voxel: float) -> _Points:
-    """Weighted mean of each voxel."""
+    """Return the weighted mean of each voxel."""
     cells = np.floor(samples.points / voxel).astype(np.int64)
     _, group = np.unique(cell_numbers(cells), return_inverse=True)
     total = np.bincount(group, samples.weight)

@@ -58,7 +58,8 @@ def confirm(own: PosedDepth, others: Sequence[PosedDepth], min_views: int) -> De
 
 
 def _depth_by(other: PosedDepth, own: PosedDepth, depth: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth along `own`'s rays as measured by `other` at each pixel's point, and its variance; NaN where not visible.
+    """Return the depth along `own`'s rays as measured by `other` at each pixel's point, and its variance; NaN where not
+    visible.
 
     The relative depth error is taken over from the other view: its ray through the point is nearly the same.
     """

@@ -108,7 +108,7 @@ def dense_map(slam: Slam, mode: str = "auto") -> DenseMap:
 
 
 def _voxel(depth_maps: Sequence[DepthMap | None], intrinsics: np.ndarray) -> float:
-    """Length of `VOXEL_PIXELS` at the median depth, in the map's unit; `VOXEL` without depth."""
+    """Return the length of `VOXEL_PIXELS` at the median depth, in the map's unit; `VOXEL` without depth."""
     medians = [float(np.nanmedian(depth_map.depth)) for depth_map in depth_maps if depth_map is not None]
     return VOXEL_PIXELS * float(np.median(medians)) / float(intrinsics[0]) if medians else VOXEL
 

@@ -86,7 +86,7 @@ class FrameDepths:
         return fill_holes(own, rendered_depth(self._poses[row], self._slam.intrinsics, near) if near else None)
 
     def _near(self, row: int) -> Iterator[PosedDepth]:
-        """The nearest keyframes with depth in the frame's submap."""
+        """Return the nearest keyframes with depth in the frame's submap."""
         submap, pose = self._submap[self._slam.frames[row].reference], self._poses[row]
 
         def distance(number: int) -> float:

@@ -65,7 +65,7 @@ class _Fused:
     source: object
 
     def moved(self, pose: np.ndarray) -> float:
-        """Largest motion of the visible surface, metres, if the view moves to `pose`."""
+        """Return the largest motion of the visible surface, metres, if the view moves to `pose`."""
         poses = rigid.invert(np.stack([self.view.pose, pose]))
         before, after = (self.corners @ to_world[:3, :3].T + to_world[:3, 3] for to_world in poses)
         return float(np.linalg.norm(after - before, axis=1).max())
@@ -108,7 +108,7 @@ class SurfaceFusion:
         self._fused: dict[int, _Fused] = {}
         self._touched: dict[Block, set[int]] = defaultdict(set)
         self._parts: dict[Block, Mesh] = {}
-        self._least = 0
+        self._min_count = 0
 
     def update(self, keyframes: Sequence[Keyframe], depth_maps: Sequence[DepthMap | None] | None = None) -> int:
         """Fuse views that are new or have moved; return the number of updated blocks.
@@ -169,9 +169,9 @@ class SurfaceFusion:
         return set(blocks)
 
     def _fuse(self, changed: set[Block]) -> int:
-        least = min(self._least_views, len(self._fused))
-        if least != self._least:
-            changed, self._least = set(self._touched), least
+        min_count = min(self._least_views, len(self._fused))
+        if min_count != self._min_count:
+            changed, self._min_count = set(self._touched), min_count
         # Blocks share layers of voxels, which must be fused from the same views in each.
         near = sorted({other for block in changed for other in neighbourhood(block)} & self._touched.keys())
         seen_by = {block: views_near(block, self._touched) for block in near}
@@ -180,10 +180,10 @@ class SurfaceFusion:
             self._parts.pop(block, None)
             if not self._touched[block]:
                 del self._touched[block]
-        todo = [block for block in near if block in self._touched and len(seen_by[block]) >= least]
+        todo = [block for block in near if block in self._touched and len(seen_by[block]) >= min_count]
         count = max(-(-len(todo) // BATCH), min(2, -(-len(todo) // GROUP)))  # at least two, for two threads
         batches = [todo[len(todo) * i // count : len(todo) * (i + 1) // count] for i in range(count)]
-        meshes = lambda batch: meshes_of(batch, seen_by, views, self._voxel, least)
+        meshes = lambda batch: meshes_of(batch, seen_by, views, self._voxel, min_count)
         for batch, parts in zip(batches, map_in_threads(meshes, batches), strict=True):
             self._parts |= {block: part for block, part in zip(batch, parts, strict=True) if part is not None}
         return len(todo)
@@ -199,7 +199,7 @@ def measured_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> Depth
 
 
 def _corners(view: View) -> np.ndarray:
-    """Image corners at the 95 % quantile of depth, camera frame, [4, 3]."""
+    """Return image corners at the 95 % quantile of depth, camera frame, [4, 3]."""
     depth = view.depth_map.depth
     height, width = depth.shape
     pixels = np.array([[x, y] for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])

@@ -89,7 +89,7 @@ def _slice(field: np.ndarray, layer: np.ndarray) -> np.ndarray:
 
 
 def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels, log depth corrections and weights of the key points that have both an estimate and a prior."""
+    """Return pixels, log depth corrections and weights of the key points that have both an estimate and a prior."""
     slots = keyframe.points
     height, width = log_depth.shape
     here = read_at(log_depth, slots.pixels)
@@ -143,7 +143,7 @@ def fused_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[
 def _neighbours(
     clouds: Sequence[np.ndarray | None], keyframes: Sequence[Keyframe], i: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Points of the neighbours that have any, with the motion from each to keyframe i."""
+    """Return points of the neighbours that have any, with the motion from each to keyframe i."""
     numbers = [i + sign * offset for offset in OFFSETS for sign in (-1, 1)]
     return [
         (cloud, keyframes[i].pose @ rigid.invert(keyframes[j].pose))
@@ -162,7 +162,7 @@ def _points(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 
 def _averaged(depth: np.ndarray, others: list[tuple[np.ndarray, np.ndarray]], intrinsics: np.ndarray) -> np.ndarray:
-    """The depth corrected by the mean difference to other keyframes; others: see `_neighbours`."""
+    """Return the depth corrected by the mean difference to other keyframes; others: see `_neighbours`."""
     height, width = depth.shape
     cells = (-(-height // STEP), -(-width // STEP))
     total, views = np.zeros(cells), np.ones(cells)  # the keyframe's own view counts as one, with correction 0

@@ -52,7 +52,7 @@ def semi_global(
 def _paths(
     cost: Float[Array, "h w k"], image: Float[Array, "h w"], shift: int, backward: bool, smooth: float, jump: float
 ) -> Float[Array, "h w k"]:
-    """Path costs from row to row, each step `shift` columns aside."""
+    """Return path costs from row to row, each step `shift` columns aside."""
     if backward:
         cost, image = cost[::-1], image[::-1]
     inside = jnp.ones(cost.shape[1], bool)

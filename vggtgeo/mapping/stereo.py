@@ -97,7 +97,7 @@ def stereo_depths(
 
 
 def _photo(keyframe: Keyframe, intrinsics: np.ndarray, size: int) -> Photo:
-    """The keyframe's image, reduced to a longer side of at most `size` pixels."""
+    """Return the keyframe's image, reduced to a longer side of at most `size` pixels."""
     grey = cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     height, width = grey.shape
     scale = min(1.0, size / max(height, width))
@@ -109,7 +109,9 @@ def _photo(keyframe: Keyframe, intrinsics: np.ndarray, size: int) -> Photo:
 
 
 def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo], settings: StereoSettings) -> DepthMap | None:
-    """Depth of one image, before it is confirmed by others. points: float64 [n, 3], world, sets the range of depths."""
+    """Return the depth of one image, before it is confirmed by others. points: float64 [n, 3], world, sets the range of
+    depths.
+    """
     planes = _planes(points, photo, settings.planes)
     if planes is None or not others:
         return None
@@ -131,7 +133,7 @@ def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo], settings:
 
 
 def _planes(points: np.ndarray, photo: Photo, count: int) -> np.ndarray | None:
-    """Inverse depths of the planes: from 0.6 of the smallest to 1.5 of the largest of the map's points in view."""
+    """Return inverse depths of the planes, 0.6 of the smallest to 1.5 of the largest of the points in view."""
     local = points @ photo.pose[:3, :3].T + photo.pose[:3, 3]
     inside, _, _ = pinhole.visible(local, photo.intrinsics, (photo.grey.shape[0], photo.grey.shape[1]))
     if np.count_nonzero(inside) < MIN_POINTS:

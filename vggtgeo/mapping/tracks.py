@@ -76,7 +76,7 @@ def make_tracks(keyframes: Sequence[Keyframe], pairs: Sequence[Pair], intrinsics
 
 
 def _connect(keyframes: Sequence[Keyframe], pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Track, view and pixel of each observation: connected components of matched key points."""
+    """Return track, view and pixel of each observation: connected components of matched key points."""
     first = np.cumsum([0, *(len(keyframe.features) for keyframe in keyframes)])
     place = {keyframe.number: i for i, keyframe in enumerate(keyframes)}
     own = [first[place[pair.first]] + pair.points.index_i for pair in pairs]
@@ -120,7 +120,7 @@ def _local(points: np.ndarray, point: np.ndarray, view: np.ndarray, poses: np.nd
 def _triangulate(
     track: np.ndarray, view: np.ndarray, pixel: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
-    """Points float64 [n, 3] that minimise the robust reprojection error, starting nearest to all rays.
+    """Return points float64 [n, 3] that minimise the robust reprojection error, starting nearest to all rays.
 
     All points are independent, so that a batched 3 x 3 solve is much faster than a general solver.
     """
@@ -154,7 +154,7 @@ def _solve_sums(count: int, track: np.ndarray, matrix: np.ndarray, vector: np.nd
 
 
 def _has_parallax(track: np.ndarray, view: np.ndarray, poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether two views of a point see it from different directions, bool [n]."""
+    """Return whether two views of a point see it from different directions, bool [n]."""
     centres = rigid.invert(poses)[view, :3, 3]
     ray = points[track] - centres
     ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
@@ -166,7 +166,7 @@ def _has_parallax(track: np.ndarray, view: np.ndarray, poses: np.ndarray, points
 
 
 def _colours(keyframes: Sequence[Keyframe], view: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Colour of each pixel [n, 2] in the image of its view [n], uint8 [n, 3]; each image is decoded once."""
+    """Return the colour of each pixel [n, 2] in the image of its view [n], uint8 [n, 3]; each image is decoded once."""
     colours = np.zeros((len(view), 3), np.uint8)
     for number in np.unique(view):
         here = view == number

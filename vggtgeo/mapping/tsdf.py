@@ -91,9 +91,9 @@ def meshes_of(
     seen_by: Mapping[Block, Sequence[int]],
     views: Mapping[int, View],
     voxel: float,
-    least: int,
+    min_count: int,
 ) -> list[Mesh | None]:
-    """Return the mesh of each of at most `BATCH` blocks, None without a surface. least: views a voxel needs."""
+    """Return the mesh of each of at most `BATCH` blocks, None without a surface. min_count: views of a voxel."""
     # A constant number of rows, so that the function compiles once; the padding of a group is added to the last row.
     sums = jnp.zeros((BATCH + 1, SIDE + 1, SIDE + 1, SIDE + 1, 6), jnp.float32)
     rows_of: dict[int, list[int]] = defaultdict(list)
@@ -113,11 +113,11 @@ def meshes_of(
             reach = np.float32(TRUNCATION * voxel)
             sums = _with_view(sums, group, corners[group], motion, pixels, intrinsics, reach)
     volume = np.asarray(sums)
-    return [_surface(volume[row], corners[row], voxel, least) for row in range(len(blocks))]
+    return [_surface(volume[row], corners[row], voxel, min_count) for row in range(len(blocks))]
 
 
 def _packed(view: View) -> Array:
-    """Depth (0 = unknown), weight and colour of each pixel, float32 [H, W, 5]: a single gather per voxel."""
+    """Return depth (0 = unknown), weight and colour of each pixel, float32 [H, W, 5]: a single gather per voxel."""
     depth_map = view.depth_map.decoded()
     sigma = np.maximum(depth_map.sigma * depth_map.depth, 1e-3)
     good = np.isfinite(depth_map.depth) & (depth_map.confidence >= MIN_CONFIDENCE)
@@ -166,10 +166,10 @@ def _with_view(
     return sums.at[rows].add(added, mode="promise_in_bounds")
 
 
-def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -> Mesh | None:
+def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, min_count: int) -> Mesh | None:
     """Marching cubes in one block, in cubes known at all corners; None without a surface."""
     weight = volume[..., 4]
-    known = volume[..., 5] >= least
+    known = volume[..., 5] >= min_count
     distance = np.where(known, volume[..., 0] / np.where(known, weight, 1), 1.0)
     if not ((distance[known] < 0).any() and (distance[known] > 0).any()):
         return None
@@ -191,7 +191,7 @@ def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, least: int) -
 
 
 def _in_known_cubes(centres: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Whether all corners of the cube around each face's centre [m, 3] are known.
+    """Return whether all corners of the cube around each face's centre [m, 3] are known.
 
     skimage's mask checks one corner only, which would close the surface at the border of the measured volume.
     """

@@ -88,7 +88,7 @@ def support(reference: Photo, others: Sequence[Photo], inverse_depth: np.ndarray
 
 
 def _bend(inverse_depth: np.ndarray, reach: int) -> np.ndarray:
-    """Deviation of the inverse depth from a plane (on which it is affine) within `reach` pixels."""
+    """Return the deviation of the inverse depth from a plane (on which it is affine) within `reach` pixels."""
     padded = cv2.copyMakeBorder(inverse_depth, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
     middle = slice(reach, -reach)
     across = np.abs(padded[middle, 2 * reach :] - 2 * inverse_depth + padded[middle, : -2 * reach])

@@ -1,1 +1,1 @@
-"""What a problem determines and how well: covariances, observability."""
+"""Analysis of a problem: covariances and observability."""

@@ -1,10 +1,10 @@
-"""How well bundle adjustment knows what it estimated: marginal covariances from the blocks of the solver.
+"""Marginal covariances of bundle adjustment, from the blocks of the solver.
 
 Residuals are in units where weight 1 means unit variance: a match of weight `w` has standard deviation `1 / sqrt(w)`
 pixels, a depth prior `sigma / sqrt(alpha weight)`. Then the Gauss-Newton matrix `sum J' w rho' J` at the solution is
 the information, and its inverse the covariance (see `solvers/covariance.py` for the blocks and their cost). Under a
-robust kernel the reweighted matrix stands in for the information: exact for `Square`; for Huber with delta 1.5 and
-Gaussian noise the variances come out 2.5 % too large for points and 2 % too small for lines and depths (asymptotic
+robust kernel the information is approximated by the reweighted matrix. This is exact for `Square`. For Huber with delta
+1.5 and Gaussian noise the variances are 2.5 % too large for points and 2 % too small for lines and depths (asymptotic
 variance of the M-estimator, Huber 1964, against `1 / E[rho']`).
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.analysis.redundancy import changing
-from vggtgeo.bundle.diagnosis import refuse_not_finite
+from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.observed import check_weights
@@ -37,21 +37,21 @@ from vggtgeo.solvers.finite import is_finite, unless
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600
-"""Most keyframes whose information is inverted as a dense matrix: 104 MB, some ten seconds (355 take 2.5)."""
+"""Largest number of keyframes for a dense inverse: 104 MB and about 10 s (2.5 s for 355 keyframes)."""
 ITERATIVE_KEYFRAMES = 32
-"""Most keyframes whose covariances are solved for column by column: some 60 systems each."""
+"""Largest number of keyframes for conjugate gradients, which solve about 60 systems for each keyframe."""
 
 
 class Covariances(Readable):
-    """Marginal covariances at a solution, by the stated weights; they are not scaled by the variance factor.
+    """Marginal covariances at a solution, by the given weights; they are not scaled by the variance factor.
 
-    What nothing determines has infinite variance (and zero covariance with the rest); what is held has zero. Without
-    metric depth the scale is free: the covariances are then those of the solution with the scale held where it is. All
-    are NaN only where the linearisation is not finite, which outside `jit` is an error.
+    Undetermined coordinates have infinite variance (and zero covariance with the rest), fixed coordinates have zero.
+    Without metric depth the scale is free: the covariances are then conditional on the current scale. All are NaN where
+    the linearisation is not finite; outside `jit` this is an error.
 
-    They are as right as the weights. A variance factor far above 1 says that residuals are larger than the weights
-    state: wrong weights, wrong matches, or data that contradict each other or the poses that are held. `scaled()` gives
-    the covariances times that factor; the printed line has both.
+    The covariances are only as good as the weights. A variance factor far above 1 means that residuals are larger than
+    the weights predict: wrong weights, wrong matches, or data that are inconsistent with each other or with fixed
+    poses. `scaled()` returns the covariances times that factor; the printed line has both.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.eval_shape(vg.covariances, problem, solution.state)
@@ -67,10 +67,10 @@ class Covariances(Readable):
     intrinsics: Float[Array, "q q"]
     """Of the parameters of all cameras, `Problem.parameter_names`: pixels^2 (distortion: no unit)."""
     inverse_depth: Float[Array, "r s"]
-    """Variances, 1/m^2; infinite for slots that hold nothing. Of the rows of these keyframes (`Problem.host`): `r = h`
-    unless one has several."""
+    """Variances, 1/m^2; infinite for empty slots. One row for each row of these keyframes (`Problem.host`): `r = h`
+    unless a keyframe has several rows."""
     neighbours: Float[Array, "r k 6 6"]
-    """Of the pose that hosts each row with that at the other end of each edge of the row, `edges.of_host`."""
+    """Cross covariance of the host pose of each row with the target pose of each edge of the row, `edges.of_host`."""
     variance_factor: Float[Array, ""]
     """Estimated variance of a residual of weight 1: `2 energy / (rows - unknowns)`, 1 without redundancy. About 1 if
     the weights are right; 4 to 7 % low under Huber with delta 1.5, which caps large residuals."""
@@ -78,7 +78,7 @@ class Covariances(Readable):
     """Names of the rows of `intrinsics`."""
 
     def scaled(self) -> Covariances:
-        """The covariances if only the ratios of the weights are trusted: times the variance factor."""
+        """Return the covariances times the variance factor, for weights that are known up to a common factor."""
         times = lambda values: jnp.where(jnp.isfinite(values), values * self.variance_factor, values)
         return Covariances(
             times(self.poses),
@@ -90,8 +90,9 @@ class Covariances(Readable):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Standard deviations as plain numbers (outside `jit`, for one solution): of each pose in its own camera's
-        axes, metres and radians, and of the intrinsics, pixels; None where nothing determines one.
+        """Return the standard deviations as plain numbers (outside `jit`, for one solution).
+
+        Poses are in the axes of their own camera, metres and radians; intrinsics in pixels; None if undetermined.
         """
         poses = np.sqrt(np.diagonal(np.asarray(self.poses, np.float64), axis1=1, axis2=2))
         intrinsics = np.sqrt(np.diagonal(np.asarray(self.intrinsics, np.float64)))
@@ -107,7 +108,7 @@ class Covariances(Readable):
     def _line(self) -> str:
         blocks = np.asarray(self.poses, np.float64)[:, :3, :3]
         known = np.isfinite(blocks).all((1, 2))
-        moving = blocks[known][np.any(blocks[known] != 0, (1, 2))]  # those that are held have no covariance
+        moving = blocks[known][np.any(blocks[known] != 0, (1, 2))]  # fixed poses have zero covariance
         worst, factor = 1e3 * np.sqrt(np.linalg.eigvalsh(moving).max(initial=0.0)), float(self.variance_factor)
         if known.all():
             centres = f"centres known to {worst:.1f} mm at worst, {worst * factor**0.5:.1f} mm by the residuals"
@@ -124,23 +125,23 @@ def covariances(
     reduced_solver: AbstractReducedSolver | None = None,
     keyframes: Int[np.ndarray, " h"] | Int[Array, " h"] | list[int] | None = None,
 ) -> Covariances:
-    """Marginal covariances of poses, of the intrinsics, and variances of the inverse depths at a solution.
+    """Return marginal covariances of poses and intrinsics, and variances of inverse depths, at a solution.
 
     Pure: works under `jit` and `vmap`. Cost: one linearisation and, with a dense solver, one Cholesky factor and its
-    inverse, of size `6 n + 4` (eigenvectors, where something is undetermined); with a band, a block elimination that
-    is linear in the keyframes; with conjugate gradients, a solve for each coordinate of every keyframe asked for and of
+    inverse, of size `6 n + 4` (eigenvectors if something is undetermined); with a band, a block elimination that is
+    linear in the keyframes; with conjugate gradients, a solve for each coordinate of every requested keyframe and of
     its neighbours.
 
     Args:
         problem: the problem that was solved.
         state: its solution (`solve(...).state`): the information is that of the linearisation there.
-        reduced_solver: whose linear algebra inverts the information, as `choose_reduced_solver` gives it; None: dense
-            for up to 600 keyframes.
-        keyframes: which ones, `h` indices; None = all, `h = n`. The intrinsics and the variance factor are always those
-            of the whole.
+        reduced_solver: linear solver that inverts the information, see `choose_reduced_solver`; None: dense, for up to
+            600 keyframes.
+        keyframes: `h` indices of keyframes; None = all, `h = n`. The intrinsics and the variance factor are always
+            those of the whole problem.
 
     Raises:
-        InputError: `state` is of another size or precision, or not finite (where it has values to look at).
+        InputError: `state` has another size or precision, or is not finite (checked unless traced).
         ValueError: too many keyframes for a dense matrix, or for conjugate gradients.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
@@ -152,27 +153,27 @@ def covariances(
     check_pair(problem, state)
     check_finite(state)
     check_weights(problem)
-    expected = "what `vggtgeo.choose_reduced_solver` gives"
+    expected = "a result of `vggtgeo.choose_reduced_solver`"
     check_kind("reduced_solver", reduced_solver, AbstractReducedSolver | None, expected)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
     rows, first = _rows(problem, keyframes)
     _check_size(solver, problem.num_keyframes, len(rows))
     found = _covariances_jit(problem, state, solver, rows, first)
-    refuse_not_finite(problem, state, jnp.isfinite(found.variance_factor))
+    check_linearisation(problem, state, jnp.isfinite(found.variance_factor))
     return found
 
 
 def _rows(problem: Problem, keyframes: Any) -> tuple[Int[Array, " r"], Int[Array, " h"] | None]:
-    """The rows of landmarks of the keyframes asked for, and which of them is the first of each keyframe; None: all."""
-    asked = None if keyframes is None else _numbers_of(keyframes, problem.num_keyframes)
+    """Return the rows of landmarks of the requested keyframes, and the first row of each keyframe; None: all."""
+    asked = None if keyframes is None else _keyframe_indices(keyframes, problem.num_keyframes)
     if problem.host is None:
         return jnp.arange(problem.num_keyframes) if asked is None else asked, None
     if asked is None:
         return jnp.arange(len(problem.host)), jnp.searchsorted(problem.host, jnp.arange(problem.num_keyframes))
     if isinstance(problem.host, jax.core.Tracer) or isinstance(asked, jax.core.Tracer):
         raise InputError(
-            "`keyframes` of a problem in which one has several rows of landmarks; expected arrays with values: call "
-            "`covariances` outside `jit`, ask for all, or give `pack` a `size`"
+            "`keyframes` must not be traced for a problem in which a keyframe has several rows of landmarks: call "
+            "`covariances` outside `jit`, pass `keyframes=None`, or pack with a `size`"
         )
     with jax.ensure_compile_time_eval():  # arrays that a jitted function closes over have values, too
         each = [np.flatnonzero(np.asarray(problem.host) == keyframe) for keyframe in np.asarray(asked)]
@@ -180,20 +181,19 @@ def _rows(problem: Problem, keyframes: Any) -> tuple[Int[Array, " r"], Int[Array
     return jnp.asarray(np.concatenate(each)), jnp.asarray(first)
 
 
-def _numbers_of(keyframes: Any, count: int) -> Int[Array, " h"]:
-    """Indices of keyframes that are there: of others JAX would give the last one."""
+def _keyframe_indices(keyframes: Any, count: int) -> Int[Array, " h"]:
+    """Return validated keyframe indices: JAX would clamp an index beyond the end to the last keyframe."""
     if isinstance(keyframes, jax.core.Tracer):
         return keyframes
     found = real_numbers("keyframes", keyframes)
     if found.ndim != 1 or not len(found) or found.dtype.kind not in "iu" or not ((found >= 0) & (found < count)).all():
         raise InputError(
-            f"`keyframes` is {found.tolist()!r:.60}; expected a list of at least one whole number, "
-            f"from 0 to {count - 1}"
+            f"`keyframes` must be a list of at least one whole number from 0 to {count - 1}, got {found.tolist()!r:.60}"
         )
     return jnp.asarray(found)
 
 
-@eqx.filter_jit  # one operation after the other, as outside `jit`, would be compiled one by one: for most of a minute
+@eqx.filter_jit  # without it, JAX compiles each operation by itself, which takes most of a minute
 def _covariances_jit(
     problem: Problem,
     state: State,
@@ -216,21 +216,21 @@ def _covariances_jit(
 
 
 def _check_size(solver: AbstractReducedSolver, keyframes: int, asked: int) -> None:
-    """Refuse what would fill the memory or take hours."""
+    """Raise ValueError for sizes that would fill the memory or take hours."""
     if isinstance(solver, DenseCholesky) and keyframes > DENSE_KEYFRAMES:
         raise ValueError(
             f"`covariances` of {keyframes} keyframes would invert a dense matrix of {lie.TANGENT * keyframes} rows; "
-            f"above {DENSE_KEYFRAMES} keyframes give `reduced_solver=choose_reduced_solver(problem)`, which needs none"
+            f"above {DENSE_KEYFRAMES} keyframes pass `reduced_solver=choose_reduced_solver(problem)`"
         )
     if isinstance(solver, ConjugateGradients) and asked > ITERATIVE_KEYFRAMES:
         raise ValueError(
             f"`covariances` of {asked} keyframes by conjugate gradients would solve a system for every coordinate of "
-            f"each; give `keyframes`, at most {ITERATIVE_KEYFRAMES} at a time"
+            f"each; pass `keyframes`, at most {ITERATIVE_KEYFRAMES} at a time"
         )
 
 
 def variance_factor(problem: Problem, state: State, rank: Int[Array, ""]) -> Float[Array, ""]:
-    """`2 E / (m - u)`: `m` rows that may change, `u` unknowns that they determine, `rank`. problem: prepared."""
+    """Return `2 E / (m - u)` of a prepared problem: `m` rows that depend on free unknowns, `u = rank`."""
     terms = tuple(changing(problem, term, state) for term in problem.terms)
     rows = jnp.asarray(sum(count_rows(problem, term, state) for term in terms))
     redundancy = rows - rank

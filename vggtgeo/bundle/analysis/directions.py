@@ -1,4 +1,4 @@
-"""Motions of poses and intrinsics that have a name, to say in words what a problem leaves open.
+"""Named motions of poses and intrinsics, to report which directions of a problem are weakly constrained.
 
 Frames: common motions of all free keyframes are given in the axes of the anchor, the first held camera (camera 0
 without one), and rotations turn about its centre; motions of one keyframe are in its own camera axes (x right, y down,
@@ -23,11 +23,11 @@ _INTRINSICS = {
     **{"f": "focal length", "fx": "focal length", "fy": "aspect ratio"},
     **{"cx": "principal point u", "cy": "principal point v"},
 }
-"""What moving a parameter of a camera is called, by the parameter's name; the others are its distortion."""
+"""Names of the motions of a camera's parameters, by parameter name; all others are distortion."""
 
 
 def direction_names(keyframes: int, parameters: tuple[str, ...] = Pinhole.names) -> tuple[str, ...]:
-    """Names of the rows of `common_directions`, for cameras with these parameters, then of each keyframe's motions."""
+    """Return the names of the rows of `common_directions` for cameras with these parameters, then of the keyframes'."""
     words = [name.partition(" ") for name in parameters]
     camera = tuple(f"{_INTRINSICS.get(name, f'distortion {name}')}{gap}{which}" for name, gap, which in words)
     each = tuple(f"keyframe {i}: {motion}" for i in range(keyframes) for motion in MOTIONS)
@@ -35,10 +35,10 @@ def direction_names(keyframes: int, parameters: tuple[str, ...] = Pinhole.names)
 
 
 def common_directions(problem: Problem, state: State) -> Float[Array, "g c"]:
-    """One row a global name (the first `g = 7 + q`), in the coordinates of the dense state: 1 m, 1 rad, 1 pixel, or
-    100 % of scale or focal length. The other names are the keyframes' own coordinates, in their order.
+    """Return one row for each global name (the first `g = 7 + q`), in the coordinates of the dense state.
 
-    Held coordinates are not masked. The aspect ratio changes `fx` by 100 % and `fy` by -100 %.
+    Units: 1 m, 1 rad, 1 pixel, or 100 % of scale or focal length. The other names are the keyframes' own coordinates,
+    in their order. Fixed coordinates are not masked. The aspect ratio changes `fx` by 100 % and `fy` by -100 %.
     """
     keyframes, tail = problem.num_keyframes, problem.num_parameters
     common = jnp.concatenate([_scale(problem, state)[None], _common(problem, state)])
@@ -49,7 +49,7 @@ def common_directions(problem: Problem, state: State) -> Float[Array, "g c"]:
 
 
 def _of_cameras(names: tuple[str, ...], values: Float[Array, " q"]) -> Float[Array, "q q"]:
-    """Each parameter alone, except the focal lengths: both together, and one against the other."""
+    """Return one row a parameter; focal lengths as their common change (size) and their difference (aspect ratio)."""
     rows = jnp.eye(len(names), dtype=values.dtype)
     for i, name in enumerate(names):
         kind = name.partition(" ")[0]
@@ -67,14 +67,14 @@ def _anchor(problem: Problem, state: State) -> jaxlie.SE3:
 
 
 def _scale(problem: Problem, state: State) -> Float[Array, " camera"]:
-    """All camera centres move away from the anchor's centre, by 100 %."""
+    """Return the motion of all camera centres away from the anchor's centre, by 100 %."""
     anchor = _anchor(problem, state).inverse().translation().astype(state.inverse_depth.dtype)
     outward = state.poses.translation() + state.poses.rotation().as_matrix() @ anchor
     return jnp.concatenate([outward, jnp.zeros_like(outward)], 1).reshape(-1)
 
 
 def _common(problem: Problem, state: State) -> Float[Array, "6 camera"]:
-    """All cameras move as one rigid body by a unit twist in the anchor's frame: `xi_i = Ad(T_i T_anchor^-1) e_a`."""
+    """Return the rigid motions of all cameras, a unit twist in the anchor's frame: `xi_i = Ad(T_i T_anchor^-1) e_a`."""
     anchor = _anchor(problem, state).wxyz_xyz
     transport = lambda pose: lie.adjoint(lie.relative(jaxlie.SE3(anchor), jaxlie.SE3(pose)))
     return jax.vmap(transport)(state.poses.wxyz_xyz).transpose(2, 0, 1).reshape(6, -1)

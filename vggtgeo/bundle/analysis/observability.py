@@ -1,22 +1,22 @@
-"""What a bundle-adjustment problem can tell, and which of its factors tell it.
+"""Observability of a bundle-adjustment problem: which directions are determined, and by which factors.
 
 The landmarks are eliminated: the information about poses and intrinsics is the Schur complement
 
     S = H - W V^-1 W',      for all terms, for one term alone (`S_k`), and for all but one (`S_-k`),
 
-each from the Hessian of just those terms (a landmark that they do not determine stays where it is).
-They do not add up: `S >= S_k + S_-k`, since a depth prior alone says nothing about a pose and a match alone nothing
-about the scale, but both together do. So what a term is worth along a direction `d` is what would be lost without it:
+each from the Hessian of just those terms (a landmark that they do not determine is kept fixed). They do not add up:
+`S >= S_k + S_-k`. A depth prior alone constrains no pose and a match alone no scale, but both together do. The
+contribution of a term along a direction `d` is therefore the information that would be lost without it:
 `1 - d' S_-k d / d' S d`, between 0 and 1; the shares of several terms may add up to more than 1.
 
-Spectra are those of `D^-1/2 S D^-1/2` with `D = diag(H)` of all factors: metres, radians and pixels become one unit,
-and an eigenvalue is the share of a direction's information that is left once everything else is estimated too. A
-direction is *weak* below `observability_report.WEAK` and *undetermined* below the rounding error `10 c eps` (`c` at
+Spectra are those of `D^-1/2 S D^-1/2` with `D = diag(H)` of all factors, which makes metres, radians and pixels
+comparable. An eigenvalue is the share of a direction's information that is left when everything else is estimated too.
+A direction is *weak* below `observability_report.WEAK` and *undetermined* below the rounding error `10 c eps` (`c` at
 most 1,800).
 
 Cost: one linearisation a term, and for `k` terms `2 k + 1` Schur complements and symmetric eigenvalue problems of size
-`c`. Above `DENSE_KEYFRAMES` the Schur complements are sparse and only their smallest eigenvalues are found
-(`weakest.py`): time and memory then grow with the edges.
+`c`. Above `DENSE_KEYFRAMES` the Schur complements are sparse and only their smallest eigenvalues are computed
+(`weakest.py`): time and memory then grow with the number of edges.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float
 from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import SHOWN, Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
-from vggtgeo.bundle.diagnosis import refuse_not_finite
+from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observed import check_weights
@@ -59,30 +59,29 @@ from vggtgeo.solvers.local_inverse import balance
 from vggtgeo.solvers.symmetric_eigen import symmetric_eigen
 
 DENSE_KEYFRAMES = 300
-"""Most keyframes whose spectra are computed whole: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
+"""Largest number of keyframes for full spectra: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
 KEPT = 24
-"""Smallest eigenvalues found of a larger map: the loss of three keyframes, or of a piece of the map, leaves 18 or 7."""
+"""Number of smallest eigenvalues for a larger map: three disconnected keyframes give 18, a disconnected part 7."""
 
 
 def observability(problem: Problem, state: State) -> Observability:
-    """What the factors of `problem` determine at `state`, by kind.
+    """Compute which directions the terms of `problem` determine at `state`.
 
-    `print` of the result names what is undetermined or weak, the three least known of the other directions with their
-    standard deviation in pixels, metres and radians (weights as 1 / variance), and keyframes between which the camera
-    only turned.
+    `print` of the result lists undetermined and weak directions, the three weakest of the others with their standard
+    deviation in pixels, metres and radians (weights are 1 / variance), and keyframe pairs with pure rotation.
 
-    Pure: works under `jit` and `vmap` for up to 300 keyframes. Larger maps go through scipy's sparse solvers, outside
-    `jit`: only their 24 weakest directions are found, all else is the same (1,000 keyframes with 8,000 edges and five
+    Pure: works under `jit` and `vmap` for up to 300 keyframes. Larger maps use scipy's sparse solvers outside `jit`:
+    only their 24 weakest directions are computed, all else is the same (1,000 keyframes with 8,000 edges and five
     terms: 4 s on one core, once compiled).
 
     Args:
-        problem: observations and priors; the kernel's weights at `state` count, so outliers say little.
-        state: where to linearise, best a solution.
+        problem: observations and priors. The kernel weights at `state` apply, so outliers have little influence.
+        state: linearisation point, normally a solution.
 
     Raises:
-        InputError: `state` is of another size or precision, or not finite (where it has values to look at).
-        ValueError: more than 300 keyframes, and inside `jit` or `vmap`, in single precision, with NaN, or with a term
-            that couples all keyframes, as a marginalisation prior does.
+        InputError: `state` has another size or precision, or is not finite (checked unless traced).
+        ValueError: more than 300 keyframes together with `jit` or `vmap`, single precision, NaN, or a term that couples
+            all keyframes, such as a marginalisation prior.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.jit(vg.observability)(problem, solution.state)
@@ -95,11 +94,11 @@ def observability(problem: Problem, state: State) -> Observability:
     check_weights(problem)
     if problem.num_keyframes <= DENSE_KEYFRAMES:
         known = _observability_jit(problem, state)
-        refuse_not_finite(problem, state, jnp.all(jnp.isfinite(known.landmark_information)))
+        check_linearisation(problem, state, jnp.all(jnp.isfinite(known.landmark_information)))
         return known
     _check_large(problem, state)
     systems, everything, coordinates = _linearise_jit(problem, state)
-    refuse_not_finite(problem, state, is_finite(everything))
+    check_linearisation(problem, state, is_finite(everything))
     layout = sparse_layout(everything)
     blocks = (_blocks_jit(systems, keep, problem.fraction, layout) for keep in _selections(len(systems), state))
     found = [_sparse_spectrum(own, layout, coordinates) for own in blocks]
@@ -117,7 +116,7 @@ def _observability_jit(problem: Problem, state: State) -> Observability:
 
 
 def _selections(count: int, state: State) -> Float[Array, "m k"]:
-    """Which terms are looked at together: all, each alone, all but each."""
+    """Return the selections of terms as rows of 0 and 1: all, each alone, all but each."""
     each = jnp.eye(count, dtype=state.inverse_depth.dtype)
     return jnp.concatenate([jnp.ones_like(each[:1]), each, 1 - each])
 
@@ -160,7 +159,7 @@ _found_jit = eqx.filter_jit(_found)
 def _depth_change(
     system: ArrowSystem, directions: Float[Array, "c w"], problem: Problem, state: State
 ) -> Float[Array, " w"]:
-    """Relative change of the inverse depths that follow each direction, root mean square over those in use."""
+    """Return the relative change of the inverse depths along each direction, root mean square over the used ones."""
     used = used_slots(problem)
 
     def following(direction: Float[Array, " c"]) -> Float[Array, ""]:
@@ -172,12 +171,12 @@ def _depth_change(
 
 
 def _edge_parallax(problem: Problem, state: State) -> Float[Array, " e"]:
-    """Largest `V d^2` of a landmark by one observation along each edge; infinite where there is none."""
+    """Return the largest `V d^2` of a landmark by one observation along each edge; infinite without an observation."""
     ready, depth = prepared(problem), state.inverse_depth
     largest, seen = jnp.zeros(len(problem.edges.source), depth.dtype), jnp.zeros(len(problem.edges.source), bool)
     for term in ready.edge_terms:
         residuals = lambda depth, term=term: term_residuals(ready, term, replace(state, inverse_depth=depth))
-        residual, slope = jax.jvp(residuals, (depth,), (jnp.ones_like(depth),))  # each sees one depth
+        residual, slope = jax.jvp(residuals, (depth,), (jnp.ones_like(depth),))  # each residual depends on one depth
         pull = term.weights * term.kernel.weight(term.weights * jnp.sum(residual**2, 0))
         own = depth[problem.edges.row, term.first_slot : term.first_slot + pull.shape[1]]
         largest = jnp.maximum(largest, jnp.max(pull * jnp.sum(slope**2, 0) * own**2, 1, initial=0.0))
@@ -186,41 +185,41 @@ def _edge_parallax(problem: Problem, state: State) -> Float[Array, " e"]:
 
 
 def _check_large(problem: Problem, state: State) -> None:
-    """Refuse what the sparse way cannot do."""
+    """Raise ValueError for cases that the sparse solver does not support."""
     asked = f"`observability` of {problem.num_keyframes} keyframes"
-    limit = f"look at a part of the map of at most {DENSE_KEYFRAMES} keyframes"
+    limit = f"analyse a part of the map of at most {DENSE_KEYFRAMES} keyframes"
     if problem.dense_terms:
         names = ", ".join(f"`{term.name}`" for term in problem.dense_terms)
         raise ValueError(
-            f"{asked} with the term {names}, which couples all of them; expected terms on edges, pairs and single "
-            f"keyframes: leave it out by `problem.without_term`, or {limit}"
+            f"{asked} does not support the term {names}, which couples all of them: remove it with "
+            f"`problem.without_term`, or {limit}"
         )
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((problem, state))):
         raise ValueError(
-            f"{asked} inside `jit` or `vmap`; expected arrays with values, since its sparse solver is not of JAX: call "
-            f"it outside, or {limit}"
+            f"{asked} cannot run inside `jit` or `vmap`, since its sparse solver is scipy's: call it outside, or "
+            f"{limit}"
         )
     if state.inverse_depth.dtype != jnp.float64:
         raise ValueError(
-            f"{asked} with a `state` in {state.inverse_depth.dtype}, whose rounding errors hide what so large a map "
-            "leaves open; expected float64: set `jax_enable_x64` and pack again"
+            f"{asked} needs a `state` in float64, got {state.inverse_depth.dtype}, whose rounding errors hide weak "
+            "directions of a map of this size: set `jax_enable_x64` and pack again"
         )
 
 
 class _Coordinates(NamedTuple):
-    """How every information is looked at."""
+    """Coordinates of the information matrices."""
 
     free: Bool[Array, " c"]
     scale: Float[Array, " c"]
     """`D^1/2`."""
     common: Float[Array, "g c"]
-    """The common directions, zero where held."""
+    """The common directions, zero for fixed coordinates."""
     poses: int
-    """How many of the coordinates belong to keyframes."""
+    """Number of coordinates that belong to keyframes."""
 
 
 def _linearise_each(problem: Problem, state: State) -> tuple[list[ArrowSystem], ArrowSystem, _Coordinates]:
-    """One system a term, landmarks of segments not joined yet; that of all terms, and its coordinates."""
+    """Return one system a term (segments not joined), the system of all terms, and its coordinates."""
     ready = prepared(problem)
     systems = [linearise(ready.with_terms((term,)), state, joined=False) for term in ready.terms]
     everything = _combine(systems, jnp.ones(len(systems), state.inverse_depth.dtype), problem.fraction)
@@ -242,7 +241,7 @@ def _blocks_jit(
 def _combine(
     systems: list[ArrowSystem], keep: Float[Array, " k"], fraction: Float[Array, "n g q"] | None
 ) -> ArrowSystem:
-    """The system of the terms that `keep` holds a 1 for: a kernel sees one residual at a time, so terms add up."""
+    """Return the system of the terms for which `keep` is 1; each kernel acts on one residual, so terms add up."""
     total = lambda leaves: jnp.tensordot(keep, jnp.stack(leaves), 1)
     largest = max(len(system.prior_hessian) for system in systems)
     priors = [jnp.pad(system.prior_hessian, (largest - len(system.prior_hessian), 0)) for system in systems]
@@ -269,7 +268,7 @@ def _spectrum(reduced: Reduced, coordinates: _Coordinates) -> Spectra:
     information, free, scale = reduced.hessian - reduced.schur, coordinates.free, coordinates.scale
     both = free[:, None] & free[None, :]
     balanced = jnp.where(both, (information + information.T) / 2, 0.0) / scale[:, None] / scale[None, :]
-    # No free direction reaches the trace: so the held ones come last, and apart.
+    # No eigenvalue of a free direction reaches the trace: so the fixed ones come last.
     beyond = 2 * len(scale)
     values, vectors = symmetric_eigen(balanced + jnp.diag(jnp.where(free, 0.0, beyond).astype(scale.dtype)))
     held = jnp.arange(len(scale)) >= jnp.sum(free)
@@ -282,12 +281,12 @@ def _spectrum(reduced: Reduced, coordinates: _Coordinates) -> Spectra:
 
 
 def _sparse_spectrum(blocks: Blocks, layout: SparseLayout, coordinates: _Coordinates) -> Spectra:
-    """The same of sparse blocks, for the weakest directions only."""
+    """Return the spectrum of sparse blocks, for the weakest directions only."""
     information, common = sparse_matrix(blocks, layout), np.asarray(coordinates.common)
     if not np.all(np.isfinite(information.data)):
         raise ValueError(
-            "the information at `state` has entries that are NaN or infinite; expected finite poses, intrinsics and "
-            "inverse depths: give the state of a solution that converged"
+            "the information at `state` has entries that are NaN or infinite: pass the state of a converged solution, "
+            "with finite poses, intrinsics and inverse depths"
         )
     free = np.nonzero(coordinates.free)[0]
     scaled = sp.diags_array(1 / np.asarray(coordinates.scale)[free])
@@ -305,6 +304,6 @@ def _sparse_spectrum(blocks: Blocks, layout: SparseLayout, coordinates: _Coordin
 def _along_all(
     common: Float[Array, " g"], diagonal: Float[Array, " c"], coordinates: _Coordinates
 ) -> Float[Array, " m"]:
-    """`d' S d` of all named directions: a coordinate of a keyframe has its entry of the diagonal."""
+    """Return `d' S d` of all named directions; for the coordinate of a keyframe this is its diagonal entry."""
     single = jnp.where(coordinates.free, diagonal, 0.0)[: coordinates.poses]
     return jnp.maximum(jnp.concatenate([common, single]), 0.0)

@@ -1,4 +1,4 @@
-"""What was found of a problem: the arrays, and in words the weak directions by name and a table by kind of factor."""
+"""Result of the observability analysis, and its report: weak directions by name and a table by kind of factor."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from vggtgeo.geometry import lie
 from vggtgeo.solvers.local_inverse import rank_tolerance
 
 WEAK = 1e-6
-"""Eigenvalue below which a direction is weak: its standard deviation is a thousand times what it were if all else were
-known. Well-posed windows lie above 1e-4 (tests/bundle/analysis/test_observability.py); the longer a chain, the weaker
-its bending: a sound loop of 80 keyframes has 9e-5, of 400 6e-7, of 1,000 2e-8."""
+"""Eigenvalue below which a direction is weak: its standard deviation is 1000 times that with all else known. Well-posed
+windows are above 1e-4 (tests/bundle/analysis/test_observability.py). The longer a chain, the weaker its bending mode: a
+well-posed loop of 80 keyframes has 9e-5, of 400 6e-7, of 1,000 2e-8."""
 ALIGNED = 0.9
-"""Squared cosine between a named direction and the weak subspace from which the name is used; else it is a mixture."""
+"""Minimum squared cosine between a named direction and the weak subspace to use the name; below, it is a mixture."""
 NEW = 0.1
-"""Squared part of a named direction that must lie outside what was named before it."""
+"""Minimum squared part of a named direction outside the span of the previously named ones."""
 UNKNOWN = 1.0
-"""Information per 100 % of an inverse depth (`V d^2`) or of a focal length, below which it counts as undetermined:
-known to no better than 100 %."""
+"""Information per 100 % of an inverse depth (`V d^2`) or focal length below which it counts as undetermined: standard
+deviation above 100 %."""
 ROUNDING_SIZE = 1800
-"""Coordinates up to which rounding errors of the eigenvalues are taken to grow: 300 keyframes."""
+"""Number of coordinates (300 keyframes) up to which the rounding error of eigenvalues is modelled as growing."""
 SHOWN = 12
-"""Weak directions spelled out in a report; the rest are counted."""
+"""Maximum number of weak directions listed in a report; the rest are counted."""
 _PARTS = 3
-"""Names by which a least known direction goes, at most."""
+"""Maximum number of names for a weakly constrained direction."""
 
 
 class Spectra(eqx.Module):
     """Eigenvalues of balanced information matrices, one a selection of factors."""
 
     values: Float[Array, "*k v"]
-    """Ascending: all `v = c`, infinite for held coordinates, which come last. Above 300 keyframes the `v = 24` smallest
-    of the free ones."""
+    """Ascending: all `v = c`, infinite for fixed coordinates, which come last. Above 300 keyframes only the `v = 24`
+    smallest of the free ones."""
     vectors: Float[Array, "*k c v"]
     """Columns, in balanced coordinates `D^1/2 x`."""
     along: Float[Array, "*k m"]
@@ -45,7 +45,7 @@ class Spectra(eqx.Module):
 
 
 class Observability(eqx.Module):
-    """What is determined and by what; a pytree of arrays, so it passes through `jit` and `vmap`. `print` it.
+    """Which directions are determined, and by which terms; a pytree of arrays, usable under `jit` and `vmap`.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> found = jax.eval_shape(vg.observability, problem, solution.state)
@@ -63,18 +63,18 @@ class Observability(eqx.Module):
     without: Spectra
     """All terms but each one."""
     common: Float[Array, "g c"]
-    """The global ones of the named directions in balanced coordinates, unit length; zero where held. The others are the
-    keyframes' coordinates themselves. Names: `direction_names()`."""
+    """The global named directions in balanced coordinates, unit length; zero for fixed coordinates. The other named
+    directions are the keyframes' coordinates. Names: `direction_names()`."""
     free: Bool[Array, " c"]
     landmark_information: Float[Array, "n s"]
     """`V d^2`: 1 / (relative variance of the inverse depth if poses and intrinsics were known)."""
     landmark_used: Bool[Array, "n s"]
     """Whether any term has weight on the slot."""
     scale: Float[Array, " c"]
-    """`D^1/2`: a vector in balanced coordinates over it is in metres, radians and pixels."""
+    """`D^1/2`: a vector in balanced coordinates divided by it is in metres, radians and pixels."""
     depth_change: Float[Array, " w"]
-    """Root mean square, over the landmarks in use, of the relative change of inverse depth that goes along with a unit
-    of each of the weakest directions of all terms (balanced); at most 12 of them."""
+    """Relative change of inverse depth per unit of each of the weakest directions of all terms (balanced), root mean
+    square over the used landmarks; at most 12 directions."""
     edges: Int[Array, "e 2"]
     """Keyframes of each edge."""
     edge_parallax: Float[Array, " e"]
@@ -86,18 +86,19 @@ class Observability(eqx.Module):
     """Names of the cameras' parameters."""
 
     def direction_names(self) -> tuple[str, ...]:
-        """Names of the directions of `along`: the rows of `common`, then six a keyframe."""
+        """Return the names of the directions of `along`: the rows of `common`, then six a keyframe."""
         return direction_names(self.keyframes, self.parameters)
 
     def report(self) -> str:
-        """The findings in words (outside `jit`, for one problem)."""
+        """Return the report as text (outside `jit`, for one problem)."""
         return report(self)
 
     def to_dict(self) -> dict[str, Any]:
-        """The findings as plain values (outside `jit`, for one problem): counts, eigenvalues, names of the weak
-        directions with all factors and without each kind, and the share of the information about each named direction
-        that would be lost without each kind. Above 300 keyframes only the 24 smallest eigenvalues are listed; where all
-        of them are weak, there may be more weak directions.
+        """Return the result as plain values (outside `jit`, for one problem).
+
+        Counts, eigenvalues, names of the weak directions with all terms and without each kind, and the share of the
+        information about each named direction that would be lost without each kind. Above 300 keyframes only the 24
+        smallest eigenvalues are listed; if all of them are weak, there may be more weak directions.
         """
         return as_dict(self)
 
@@ -120,7 +121,7 @@ class Observability(eqx.Module):
 
 @dataclass(frozen=True)
 class WeakDirection:
-    """A direction that a set of factors leaves open."""
+    """A direction that a set of terms constrains weakly or not at all."""
 
     name: str
     eigenvalue: float
@@ -128,7 +129,7 @@ class WeakDirection:
     alignment: float
     """Squared cosine between the direction and the weak subspace, 0 to 1."""
     determined: bool
-    """False where the eigenvalue is no more than rounding error."""
+    """False if the eigenvalue is within rounding error of zero."""
 
     def __str__(self) -> str:
         how = f"eigenvalue {self.eigenvalue:.1e}" if self.determined else "undetermined"
@@ -136,13 +137,12 @@ class WeakDirection:
 
 
 def weak_directions(found: Observability, without: str | None = None) -> list[WeakDirection]:
-    """Directions weaker than `WEAK` by all terms, or by all but one (a name of `found.terms`): the undetermined ones
-    first, of each kind the best named first.
+    """Return the directions weaker than `WEAK` by all terms, or by all but one (a name of `found.terms`).
 
-    A weak subspace has no eigenvectors of its own, so it is taken apart by names: the first name of
-    `direction_names` (the global motions come first) that lies in it is taken out of it, then the next that also lies
-    in it and says something new, and so on; what is left in the end goes by the nearest name. What is undetermined is
-    taken apart by itself: in a large map, mixed with what is merely weak, it would not show.
+    Undetermined directions come first. Eigenvectors of a weak subspace are not unique, so the subspace is decomposed by
+    names: the first name of `direction_names` (global motions come first) that lies in it is projected out, then the
+    next that lies in it and adds something new, and so on; the remainder gets the nearest name. Undetermined directions
+    are decomposed separately, since in a large map they would be hidden among those that are only weak.
     """
     spectra, row = (found.whole, 0) if without is None else (found.without, _index_of(found, without))
     values, vectors = np.asarray(spectra.values[row], float), np.asarray(spectra.vectors[row], float)
@@ -150,32 +150,32 @@ def weak_directions(found: Observability, without: str | None = None) -> list[We
     lost, weak = values < floor, (values >= floor) & (values < WEAK)
     along = np.asarray(spectra.along[row], float)
     return [
-        *_unknown_lenses(found, vectors[:, lost], along),
-        *_taken_apart(found, vectors[:, lost], values[lost], determined=False),
-        *_taken_apart(found, vectors[:, weak], values[weak], determined=True),
+        *_undetermined_focal_lengths(found, vectors[:, lost], along),
+        *_decomposed(found, vectors[:, lost], values[lost], determined=False),
+        *_decomposed(found, vectors[:, weak], values[weak], determined=True),
     ]
 
 
 @dataclass(frozen=True)
 class LeastKnown:
-    """A determined direction of small eigenvalue: how far one standard deviation along it goes, in every unit."""
+    """A determined direction of small eigenvalue, with its standard deviation in every unit."""
 
     names: tuple[str, ...]
-    """Named directions that it is made of, the largest part first."""
+    """Named directions that it consists of, the largest part first."""
     explained: float
-    """Squared part of it that they are, 0 to 1."""
+    """Squared part of it that these directions span, 0 to 1."""
     eigenvalue: float
     parameters: dict[str, float]
-    """Of the cameras, in pixels (distortion: no unit); those that are free."""
+    """Of the free parameters of the cameras, in pixels (distortion: no unit)."""
     centre: float
     """Metres, of the camera centre that moves most."""
     rotation: float
-    """Radians, of the camera that turns most."""
+    """Radians, of the camera that rotates most."""
     depth: float
-    """Relative, root mean square over the landmarks, which follow."""
+    """Relative, root mean square over the landmarks."""
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as plain values."""
+        """Return the direction as plain values."""
         return {
             "name": " against ".join(self.names),
             "explained": self.explained,
@@ -193,7 +193,7 @@ class LeastKnown:
         return f"{mixed}{' against '.join(self.names)} (eigenvalue {self.eigenvalue:.1e})"
 
     def sigma(self) -> str:
-        """One standard deviation in words."""
+        """Return one standard deviation as text."""
         unit = lambda name: " px" if name.partition(" ")[0] in ("f", "fx", "fy", "cx", "cy") else ""
         moved = [f"{name} {value:.2g}{unit(name)}" for name, value in self.parameters.items()]
         moved += [f"centres {1e3 * self.centre:.2g} mm", f"rotations {np.degrees(self.rotation):.2g} deg"]
@@ -201,9 +201,7 @@ class LeastKnown:
 
 
 def least_known(found: Observability, count: int = 3) -> list[LeastKnown]:
-    """The determined directions of smallest eigenvalue by all terms, whatever their size: the standard deviations say
-    whether one is known well enough.
-    """
+    """Return the `count` determined directions of smallest eigenvalue by all terms, weak or not."""
     values, free = np.asarray(found.whole.values[0], float), np.asarray(found.free)
     first = int(np.sum(values < undetermined_below(len(free), found.whole.values.dtype)))
     last = min(first + count, int(np.sum(np.isfinite(values))), len(found.depth_change))
@@ -230,16 +228,19 @@ def _described(found: Observability, column: int) -> LeastKnown:
 
 
 def _unknown_parameters(found: Observability) -> set[str]:
-    """Focal lengths without information: their part of an eigenvector has no standard deviation."""
+    """Return the focal lengths without information: their part of an eigenvector has no standard deviation."""
     values, vectors = np.asarray(found.whole.values[0], float), np.asarray(found.whole.vectors[0], float)
     lost = vectors[:, values < undetermined_below(len(found.free), found.whole.values.dtype)]
-    named = {direction.name for direction in _unknown_lenses(found, lost, np.asarray(found.whole.along[0], float))}
+    named = {
+        direction.name
+        for direction in _undetermined_focal_lengths(found, lost, np.asarray(found.whole.along[0], float))
+    }
     own = found.direction_names()[1 + lie.TANGENT : len(found.common)]
     return {parameter for parameter, name in zip(found.parameters, own, strict=True) if name in named}
 
 
 def _made_of(found: Observability, vector: Float[np.ndarray, " c"]) -> tuple[tuple[str, ...], float]:
-    """Up to three named directions, each the one that explains most of what is left, and what all explain."""
+    """Return up to three named directions, each explaining most of the remainder, and the share that all explain."""
     poses, free = lie.TANGENT * found.keyframes, np.asarray(found.free)
     single = np.eye(poses, len(free)) * free[:poses, None]
     rows = np.concatenate([np.asarray(found.common, float), single])
@@ -256,9 +257,7 @@ def _made_of(found: Observability, vector: Float[np.ndarray, " c"]) -> tuple[tup
 
 
 def rotation_pairs(found: Observability) -> list[tuple[int, int]]:
-    """Pairs of keyframes between which the camera only turned: matches join them, and no match of theirs alone knows
-    its depth to 100 %.
-    """
+    """Return the pairs of keyframes with pure rotation: no match between them determines its depth to 100 %."""
     parallax: dict[tuple[int, int], float] = {}
     for (i, j), size in zip(np.asarray(found.edges).tolist(), np.asarray(found.edge_parallax, float), strict=True):
         if np.isfinite(size):
@@ -271,16 +270,17 @@ def _spell_pairs(found: Observability) -> str:
     pairs = rotation_pairs(found)
     joined = {tuple(sorted(edge)) for edge in np.asarray(found.edges)[np.isfinite(found.edge_parallax)].tolist()}
     if len(pairs) == len(joined):
-        return "no match between any two keyframes has parallax, so that none determines a depth or a baseline"
+        return "no match between any two keyframes has parallax: depths and baselines are undetermined"
     listed = ", ".join(f"{i}-{j}" for i, j in pairs[:SHOWN]) + f" and {len(pairs) - SHOWN} more" * (len(pairs) > SHOWN)
     return f"no match between the keyframes {listed} has parallax"
 
 
-def _unknown_lenses(
+def _undetermined_focal_lengths(
     found: Observability, lost: Float[np.ndarray, "c w"], along: Float[np.ndarray, " m"]
 ) -> list[WeakDirection]:
-    """Focal lengths known to no better than 100 % even if all else were, beside the subspace that is lost. Such a one
-    has no part in any eigenvector of small value: its own curvature, which is the measure there, is as small.
+    """Return the focal lengths with a standard deviation above 100 % even with all else known, outside the subspace.
+
+    Balancing hides them from the small eigenvalues: their own curvature, by which they are scaled, is as small.
     """
     common, names = np.asarray(found.common, float), found.direction_names()
     inside = np.sum((common @ lost) ** 2, 1)
@@ -294,10 +294,10 @@ def _unknown_lenses(
     ]
 
 
-def _taken_apart(
+def _decomposed(
     found: Observability, basis: Float[np.ndarray, "c w"], values: Float[np.ndarray, " w"], determined: bool
 ) -> list[WeakDirection]:
-    """One named direction for each dimension of a subspace of eigenvectors."""
+    """Return one named direction for each dimension of a subspace of eigenvectors."""
     names, parts = found.direction_names(), _named_parts(found, basis)
     within, rest = np.sum(parts**2, 1), np.eye(parts.shape[1])
     result = []
@@ -315,20 +315,20 @@ def _taken_apart(
 
 
 def _named_parts(found: Observability, basis: Float[np.ndarray, "c w"]) -> Float[np.ndarray, "m w"]:
-    """The named directions in a subspace's own coordinates."""
+    """Return the coordinates of the named directions in a subspace."""
     poses = lie.TANGENT * found.keyframes
     single = np.where(np.asarray(found.free)[:poses, None], basis[:poses], 0.0)
     return np.concatenate([np.asarray(found.common, float) @ basis, single])
 
 
 def undetermined_landmarks(found: Observability) -> tuple[int, int]:
-    """`(undetermined, used)`: landmarks known to no better than 100 % even if all else were, and landmarks in use."""
+    """Return the numbers of landmarks undetermined (depth error above 100 % with all else known) and used."""
     used = np.asarray(found.landmark_used)
     return int(np.sum(used & (np.asarray(found.landmark_information) < UNKNOWN))), int(used.sum())
 
 
 def report(found: Observability) -> str:
-    """All findings as text."""
+    """Return the report as text."""
     free, size = int(np.sum(found.free)), len(found.free)
     values = np.asarray(found.whole.values[0])[:free]
     lost, used = undetermined_landmarks(found)
@@ -348,7 +348,7 @@ def report(found: Observability) -> str:
 
 
 def as_dict(found: Observability) -> dict[str, Any]:
-    """All findings as plain values."""
+    """Return the result as plain values."""
     free, size = int(np.sum(found.free)), len(found.free)
     lost, used = undetermined_landmarks(found)
     return {
@@ -367,7 +367,7 @@ def as_dict(found: Observability) -> dict[str, Any]:
 
 
 def lost_shares(found: Observability) -> dict[str, dict[str, float]]:
-    """Of the information along each free named direction, the share in [0, 1] that would be lost without each kind."""
+    """Return the share in [0, 1] of the information along each free named direction that is lost without each kind."""
     names = found.direction_names()
     along, without = np.asarray(found.whole.along[0], float), np.asarray(found.without.along, float)
     shares = 1 - without / np.where(along > 0, along, 1.0)
@@ -378,8 +378,9 @@ def lost_shares(found: Observability) -> dict[str, dict[str, float]]:
 
 
 def _table(found: Observability) -> list[str]:
-    """Information along each free named direction, and the share of it that would be lost without each kind; of a large
-    map only along the global ones.
+    """Return a table of the information along each free named direction and the share lost without each kind.
+
+    For a large map only the global directions are listed.
     """
     names = found.direction_names()
     along = dict(zip(names, np.asarray(found.whole.along[0], float), strict=True))
@@ -406,7 +407,7 @@ def _spell(weak: list[WeakDirection], found: Observability) -> str:
     lost, more_unknown = not any(direction.determined for direction in weak), _more_unknown(weak, found)
     if len(weak) >= free and lost:
         return f"everything ({free} directions undetermined)"
-    if lost and more_unknown:  # some of a subspace: they have no names of their own
+    if lost and more_unknown:  # only a part of a subspace is known, so the names are ambiguous
         return f"at least {len(weak)} directions undetermined"
     more = [f"and {len(weak) - SHOWN} more"] if len(weak) > SHOWN else []
     more += [f"perhaps others: only the {len(weak)} weakest were computed"] if more_unknown else []
@@ -418,25 +419,25 @@ def _counts(weak: list[WeakDirection]) -> tuple[int, int]:
 
 
 def _more_unknown(weak: list[WeakDirection], found: Observability) -> bool:
-    """Whether all that was computed is weak, and not all was."""
+    """Return whether all computed directions are weak and not all were computed."""
     return len(weak) == found.whole.values.shape[-1] < int(np.sum(found.free))
 
 
 def _complement(vector: np.ndarray) -> np.ndarray:
-    """Orthonormal columns that span what is orthogonal to a unit vector."""
+    """Return orthonormal columns that span the complement of a unit vector."""
     return np.linalg.svd(vector[None])[2][1:].T
 
 
 def _index_of(found: Observability, kind: str) -> int:
     if kind not in found.terms:
-        raise ValueError(f"`without` is {kind!r}; expected one of {', '.join(found.terms)}, or None")
+        raise ValueError(f"`without` must be one of {', '.join(found.terms)}, or None, got {kind!r}")
     return found.terms.index(kind)
 
 
 def undetermined_below(size: int, dtype: np.dtype) -> float:
-    """Eigenvalue below which a direction counts as undetermined, for a map of `size` coordinates.
+    """Return the eigenvalue below which a direction counts as undetermined, for a map of `size` coordinates.
 
-    The tolerance grows with the size only as far as rows of the matrix do, which are sparse in a large map. It matters
-    there: an open chain of 3,000 keyframes has an eigenvalue of 6e-12 that is determined, and null ones of 3e-17.
+    The tolerance grows with the size only up to `ROUNDING_SIZE`, since the rows of a large map are sparse. An open
+    chain of 3,000 keyframes has a determined eigenvalue of 6e-12, and null ones of 3e-17.
     """
     return rank_tolerance(min(size, ROUNDING_SIZE), dtype)

@@ -1,7 +1,7 @@
-"""Which observations can change: what speaks of held poses and parameters alone is no redundancy of an adjustment.
+"""Redundancy of an adjustment: observations of fixed poses and parameters alone do not count.
 
-Decided by derivatives, not by classes: an observation whose derivative by all free coordinates is zero has no part in
-the optimum, whatever its term is called.
+The decision uses derivatives, not classes: an observation whose derivatives by all free coordinates are zero has no
+influence on the optimum.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from vggtgeo.geometry import lie
 
 
 def changing(problem: Problem, term: AbstractTerm, state: State) -> AbstractTerm:
-    """A prepared term without the observations of what is held.
+    """Return a prepared term without the observations of fixed coordinates.
 
-    Landmarks always move, so terms on them stay as they are; a dense term couples everything.
+    Landmarks are always free, so terms on them are unchanged; a dense term couples everything.
     """
     free_parameters = ~problem.fixed_intrinsics
     free: Bool[Array, "m d"]

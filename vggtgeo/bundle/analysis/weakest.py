@@ -2,8 +2,8 @@
 
 The smallest eigenvalues of the balanced information `B` are the largest of `(B + shift)^-1`, which one sparse factor
 gives (shift-invert Lanczos: Lehoucq, Sorensen and Yang, "ARPACK Users' Guide", 1998, 3.2). The shift lies far above the
-rounding errors of `B`, so that the factor exists, and far below what is worth a look, so that few steps tell neighbours
-apart. A Rayleigh-Ritz step on `B` itself then gives back the digits of eigenvalues that are smaller than the shift.
+rounding errors of `B`, so that the factor exists, and far below the eigenvalues of interest, so that few steps separate
+neighbours. A Rayleigh-Ritz step on `B` itself then restores the digits of eigenvalues below the shift.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from vggtgeo.solvers.arrow import Blocks
 from vggtgeo.solvers.block_sparse import SparseLayout
 
 SHIFT = 1e-9
-"""With 1e-12 an eigenvalue of 1e-3 came out with two digits, with 1e-9 with nine; null directions stay below 1e-15
+"""With 1e-12 an eigenvalue of 1e-3 is accurate to two digits, with 1e-9 to nine; null directions stay below 1e-15
 (loops of 80 to 3,000 keyframes)."""
 
 
 def sparse_matrix(blocks: Blocks, layout: SparseLayout) -> sp.csr_array:
-    """The matrix over nodes and shared coordinates, `[c, c]` in double, without the gradient."""
+    """Return the matrix over nodes and shared coordinates, `[c, c]` in double, without the gradient."""
     values, corner = np.asarray(blocks.nodes, float), np.asarray(blocks.corner, float)[:-1, :-1]
     size = layout.nodes * values.shape[-1]
     starts = np.searchsorted(np.asarray(layout.row), np.arange(layout.nodes + 1))
@@ -33,11 +33,11 @@ def sparse_matrix(blocks: Blocks, layout: SparseLayout) -> sp.csr_array:
 
 
 def weakest(matrix: sp.csr_array, count: int) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, "c v"]]:
-    """The smallest `count` eigenvalues, ascending, and their eigenvectors; all of a matrix that has no more.
+    """Return the smallest `count` eigenvalues, ascending, and their eigenvectors; all if the matrix has fewer.
 
     Args:
         matrix: positive semidefinite up to rounding, entries of at most about one.
-        count: how many.
+        count: number of eigenvalues.
 
     """
     size = matrix.shape[0]
@@ -54,7 +54,7 @@ def weakest(matrix: sp.csr_array, count: int) -> tuple[Float[np.ndarray, " v"], 
 
 
 def definite_factor(matrix: sp.csr_array) -> SuperLU:
-    """A sparse factor of a positive definite matrix: without pivots off the diagonal, which would fill it."""
+    """Return a sparse factor of a positive definite matrix, with diagonal pivots only to limit fill-in."""
     return splu(
         sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )

@@ -1,1 +1,1 @@
-"""Hand-written derivatives that override derived ones where speed matters; the tests hold each equal to the derived."""
+"""Hand-written derivatives that override automatic ones where speed matters; the tests check that both are equal."""

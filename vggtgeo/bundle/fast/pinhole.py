@@ -1,4 +1,4 @@
-"""Derivatives of a pinhole projection along one edge, by hand: what `ImageTerm` uses in place of automatic ones.
+"""Hand-written derivatives of a pinhole projection along one edge, which `ImageTerm` uses instead of automatic ones.
 
 For a landmark of host i on edge (i, j), with `Y = R ray + d t`, `X = Y_x / Y_z`, `y = Y_y / Y_z` and a residual whose
 image gradient is `(a, b)`, put
@@ -58,7 +58,7 @@ class Projection(NamedTuple):
 
 
 class OneEdge(NamedTuple):
-    """What all slots of an edge share; rotation and translation are those of its relative pose."""
+    """Camera and relative pose of an edge, which all its slots share."""
 
     intrinsics: Float[Array, "4"]
     rotation: Float[Array, "3 3"]
@@ -79,7 +79,7 @@ def project(ray_x: Array, ray_y: Array, depth: Array, edge: OneEdge) -> Projecti
 
 
 def row(edge: OneEdge, at: Projection, a: Array, b: Array) -> list[Array]:
-    """Derivatives of one residual row with image gradient `(a, b)`: 6 relative pose, 4 intrinsics, inverse depth."""
+    """Return the derivatives of one row with image gradient `(a, b)`: 6 relative pose, 4 intrinsics, inverse depth."""
     fx, fy = edge.intrinsics[:2]
     rotation, translation = edge.rotation, edge.translation
     g0, g1 = a * fx * at.inverse_z, b * fy * at.inverse_z
@@ -107,7 +107,7 @@ class EnergyGradient(NamedTuple):
 
 
 def energy_gradient(edge: OneEdge, at: Projection, a: Array, b: Array) -> EnergyGradient:
-    """The sum over slots of `row`, as one product of moments: it compiles in a fraction of the time of ten sums."""
+    """Return the sum over slots of `row`, as one product of moments: this compiles much faster than ten sums."""
     intrinsics, rotation = edge.intrinsics, edge.rotation
     g0, g1 = a * intrinsics[0] * at.inverse_z, b * intrinsics[1] * at.inverse_z
     g = jnp.stack([g0, g1, -(g0 * at.x + g1 * at.y) * at.in_front])
@@ -116,7 +116,7 @@ def energy_gradient(edge: OneEdge, at: Projection, a: Array, b: Array) -> Energy
     moments = jnp.concatenate([g, jnp.stack([a, b])]) @ others.T
     point, by_ray = moments[:3, :3], rotation[:, :2].T @ moments[:3]
     turn = jnp.stack([point[i, j] - point[j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
-    # Of each axis: its force times the projection, less what moves the ray in the host.
+    # For each axis: its force times the projection, minus the part that moves the ray in the host.
     focal = jnp.stack([moments[3, 6], moments[4, 7]]) - jnp.stack([by_ray[0, 4], by_ray[1, 5]]) / intrinsics[:2]
     centre = moments[3:, 8] - by_ray[:, 8] / intrinsics[:2]
     shared = jnp.concatenate([moments[:3, 3], turn, focal, centre])
@@ -124,7 +124,7 @@ def energy_gradient(edge: OneEdge, at: Projection, a: Array, b: Array) -> Energy
 
 
 def row_of_third(edge: OneEdge, at: Projection) -> list[Array]:
-    """`P`: the derivatives of `Y_z`, over `Y_z`, in the order of `row`."""
+    """Return `P`: the derivatives of `Y_z`, divided by `Y_z`, in the order of `row`."""
     fx, fy = edge.intrinsics[:2]
     rotation, translation = edge.rotation, edge.translation
     inverse = at.inverse_z * at.in_front
@@ -138,8 +138,10 @@ def row_of_third(edge: OneEdge, at: Projection) -> list[Array]:
 def second_order(
     edge: OneEdge, at: Projection, force: tuple[Array, Array], third: list[Array]
 ) -> tuple[Float[Array, "10 10"], list[Array]]:
-    """`d2(a u' + b v')` but for `-(P D' + D P')`, which goes with the rows' own products: by the shared coordinates
-    (summed over slots), and mixed with inverse depth, in the order of `row`.
+    """Return `d2(a u' + b v')` without `-(P D' + D P')`, which is added with the products of the rows.
+
+    The first result is by the shared coordinates (summed over slots), the second mixed with inverse depth, in the order
+    of `row`.
 
     Args:
         edge: its relative pose and camera.
@@ -163,8 +165,9 @@ def second_order(
 def second_order_of_pixel(
     edge: OneEdge, at: Projection, force: tuple[Array, Array], pull: Array, axis: int
 ) -> list[Array]:
-    """`d2(a u' + b v')` by the pixel in the host along `axis`, mixed with the shared coordinates and inverse depth (in
-    the order of `row`), but for `-(P D~' + D~ P')`.
+    """Return `d2(a u' + b v')` by the pixel in the host along `axis`, mixed with shared coordinates and inverse depth.
+
+    In the order of `row`, without `-(P D~' + D~ P')`.
 
     Args:
         edge: its relative pose and camera.
@@ -185,7 +188,7 @@ def second_order_of_pixel(
 
 
 class _Moments(NamedTuple):
-    """Sums over slots of `G`, and of the force over `Y_z`, times what they meet."""
+    """Sums over slots of `G`, and of the force over `Y_z`, times the quantities of each field."""
 
     point: Float[Array, "3 3"]
     depth: Float[Array, "3"]
@@ -193,7 +196,7 @@ class _Moments(NamedTuple):
     ray_y: Float[Array, "3"]
     one: Float[Array, "3"]
     force: Float[Array, "2 7"]
-    """By the entries of the point, depth, rays, one; nothing where `Y_z` is bounded."""
+    """By the entries of the point, depth, rays, one; zero where `Y_z` is at its bound."""
 
 
 def _moments(g: Sequence[Array], force: tuple[Array, Array], at: Projection) -> _Moments:
@@ -204,7 +207,7 @@ def _moments(g: Sequence[Array], force: tuple[Array, Array], at: Projection) -> 
 
 
 def _centre_products(moments: _Moments, edge: OneEdge) -> Float[Array, "10 2"]:
-    """`sum P a` and `sum P b`: what `P D'` has too much, since the centre moves the pixel without `Y`."""
+    """Return `sum P a` and `sum P b`, to subtract from `P D'`: the centre moves the pixel without moving `Y`."""
     c0, c1 = -edge.rotation[2, 0] / edge.intrinsics[0], -edge.rotation[2, 1] / edge.intrinsics[1]
     x, y, _, depth, ray_x, ray_y, one = moments.force.T
     zero = jnp.zeros_like(one)
@@ -212,7 +215,7 @@ def _centre_products(moments: _Moments, edge: OneEdge) -> Float[Array, "10 2"]:
 
 
 def _focal_products(moments: _Moments, edge: OneEdge) -> Float[Array, "10 2"]:
-    """`sum (a / Y_z) y_0` and `sum (b / Y_z) y_1` over relative pose and intrinsics."""
+    """Return `sum (a / Y_z) y_0` and `sum (b / Y_z) y_1` over relative pose and intrinsics."""
     fx, fy = edge.intrinsics[:2]
     rotation = edge.rotation
     columns = []
@@ -228,7 +231,7 @@ def _focal_products(moments: _Moments, edge: OneEdge) -> Float[Array, "10 2"]:
 
 
 def _curvature_of_point(moments: _Moments, edge: OneEdge) -> Float[Array, "10 10"]:
-    """`G . d2Y` over relative pose and intrinsics, summed over slots."""
+    """Return `G . d2Y` over relative pose and intrinsics, summed over slots."""
     fx, fy = edge.intrinsics[:2]
     rotation = edge.rotation
     outer = moments.point
@@ -256,5 +259,5 @@ def _skew(v: Sequence[Array] | Array) -> Float[Array, "3 3"]:
 
 
 def _cross_product(u: Array, v: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """`u x v` of a constant vector with one vector a slot, as three rows."""
+    """Return `u x v` of a constant vector with one vector a slot, as three rows."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]

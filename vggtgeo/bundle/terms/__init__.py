@@ -1,6 +1,6 @@
 """The terms of the energy, one a file: a residual of ONE observation, its data, its weights, its robust kernel.
 
-| kind, by what it touches | residual | terms of the package |
+| kind, by its unknowns | residual | terms of the package |
 |---|---|---|
 | `SlotTerm`: a landmark | `residual(inverse_depth)` | `DepthPrior` |
 | `EdgeTerm`: a landmark seen along an edge | `residual(view)` | `PointTerm`, `LineTerm` |
@@ -9,5 +9,5 @@
 | `CameraTerm`: the camera | `residual(parameters)` | `IntrinsicsPrior` |
 | `DenseTerm`: all poses and the camera | `residual(poses, parameters)` | `MarginalPrior` |
 
-`vggtgeo/bundle/linearise.py` makes the normal equations of any tuple of them.
+`vggtgeo/bundle/linearise.py` builds the normal equations of any tuple of them.
 """

@@ -1,4 +1,4 @@
-"""A known distance between two cameras: the unit of a map without metric depth."""
+"""A known distance between two cameras, which determines the scale of a map without metric depth."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class BaselinePrior(PairTerm):
     """`r = log(|t_ij| / length) / sigma`: the distance of two camera centres.
 
     Fields:
-        length: Metres, or the map's own unit.
+        length: Metres, or the unit of the map.
         sigma: Relative standard deviation.
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
         first: int [m], keyframe i of each observation.
         second: int [m], keyframe j of each observation.

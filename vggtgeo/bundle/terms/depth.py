@@ -12,15 +12,15 @@ from vggtgeo.bundle.terms.term import shared_field
 class DepthPrior(SlotTerm):
     """`r = (d - mean) / sigma`, standard deviations of the prior.
 
-    The paper's raw difference (its equation 7) is `sigma = 1`; `sigma = sigma_rel * mean` makes it commensurable with
-    pixels. Its weight is `alpha * weight`: the energy and the covariances take a depth as known to
-    `sigma / sqrt(alpha weight)`. With both 1, `sigma` is its standard deviation; the paper has `alpha = 2`.
+    The paper's raw difference (its equation 7) is `sigma = 1`; `sigma = sigma_rel * mean` makes it comparable with
+    pixels. The weight is `alpha * weight`: energy and covariances use the standard deviation
+    `sigma / sqrt(alpha weight)`. The paper has `alpha = 2`.
 
     Fields:
         mean: 1/m; any finite number where `weight` is 0.
         sigma: Standard deviation, 1/m, > 0 (1 where `weight` is 0).
         alpha: Factor on the information of all depths (the paper's alpha, 2 there).
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
     Example:

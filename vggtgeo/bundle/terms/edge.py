@@ -1,15 +1,15 @@
-"""Terms on a landmark seen along an edge: what makes the arrow's cross terms.
+"""Terms on a landmark observed along an edge, which produce the arrow's cross terms.
 
-Local coordinates of one edge `(i, j)`: the left tangent `eta` of the relative pose (6), the parameters of the cameras
-that it sees (`c`), and the inverse depth of each landmark. One camera took all keyframes: `c = k`, its parameters.
-Several did: `c = 2 k`, those of the target's camera and those of the host's,
+Local coordinates of one edge `(i, j)`: the left tangent `eta` of the relative pose (6), the parameters of its cameras
+(`c`), and the inverse depth of each landmark. With one camera for all keyframes, `c = k`, its parameters. With several,
+`c = 2 k`, those of the target's camera and those of the host's,
 
     r(eta, p_j, p_i, d) = f_{p_j}(exp(eta) M (ray_{p_i}(pixel), d)),
 
-however many others there are; of one camera at both ends the derivative is the sum of both. Slots come last in every
-array, so that each quantity is contiguous: columns are `[6 + c + 2, m p]`, in the order eta, cameras, residual, inverse
-depth, for `m` residual rows after one another. Where the pixels of the slots in their host are unknowns, too
-(`terms/host_pixel.py`), two rows follow: by `u`, by `v`.
+independent of the number of other cameras; if both ends have the same camera, the derivative is the sum of both. Slots
+come last in every array, so that each quantity is contiguous: columns are `[6 + c + 2, m p]`, in the order eta,
+cameras, residual, inverse depth, for `m` consecutive residual rows. If the pixels of the slots in their host are also
+unknowns (`terms/host_pixel.py`), two rows follow: by `u`, by `v`.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Cameras, Pinhole, SquarePinhole
 
 Rows = tuple[Float[Array, " p"], ...]
-"""Entries of a residual, one array each: a stacked one keeps XLA from vectorising the loop around it."""
+"""Entries of a residual, one array each: XLA does not vectorise the loop around a stacked array."""
 
 
 class EdgeView(eqx.Module):
-    """All slots of one edge's host, as the edge sees them; `projection` only for the pinhole's fast path."""
+    """All slots of one edge's host, seen along the edge; `projection` only for the pinhole's fast path."""
 
     relative: jaxlie.SE3
     cameras: Cameras
@@ -54,29 +54,27 @@ class EdgeView(eqx.Module):
     fast: pinhole.OneEdge | None
     projection: Projection | None
     free_pixels: int = eqx.field(static=True, default=0)
-    """The first slots, so many, have a pixel that is an unknown."""
+    """Number of first slots whose pixel is an unknown."""
 
     @property
     def size(self) -> int:
-        """Coordinates that all slots of the edge share: relative pose and the parameters of its cameras."""
+        """Number of coordinates shared by all slots of the edge: relative pose and parameters of its cameras."""
         return lie.TANGENT + self.cameras.seen
 
     def parts(self, shared: Float[Array, " d"]) -> list[Array]:
-        """Those coordinates apart: relative pose, then the parameters of each camera that the edge sees."""
+        """Split the shared coordinates: relative pose, then the parameters of each camera of the edge."""
         size = self.cameras.size
         return [shared[: lie.TANGENT], *(shared[at : at + size] for at in range(lie.TANGENT, self.size, size))]
 
     def tied(self, rows: list[Array]) -> list[Array]:
-        """Derivatives by relative pose and the pinhole's four parameters as those by the camera's own: with one focal
-        length, those by both are added.
-        """
+        """Convert derivatives by the pinhole's four parameters to the camera's: for one focal length, add both."""
         if self.cameras.kind is Pinhole:
             return rows
         focal = lie.TANGENT
         return [*rows[:focal], rows[focal] + rows[focal + 1], *rows[focal + 2 :]]
 
     def slots(self, first: int, count: int) -> EdgeView:
-        """The same for some of the slots."""
+        """Return the view of some of the slots."""
         part = lambda leaf: leaf[..., first : first + count]
         projection = jax.tree.map(part, self.projection)
         own = part(self.pixels), part(self.inverse_depth)
@@ -85,14 +83,14 @@ class EdgeView(eqx.Module):
 
 
 class Gradient(NamedTuple):
-    """Of one edge's energy."""
+    """Gradient of one edge's energy."""
 
     shared: Float[Array, " d"]
     """By relative pose and camera."""
     depth: Float[Array, " p"]
     """By each inverse depth."""
     pixel: Float[Array, "2 p"] | None
-    """By each pixel in the host, where those are unknowns."""
+    """By each pixel in the host, if those are unknowns."""
 
 
 class LocalModel(NamedTuple):
@@ -103,11 +101,11 @@ class LocalModel(NamedTuple):
     coupled: Float[Array, "d+2 p"]
     """Mixed derivatives with each inverse depth, then its gradient and its curvature."""
     pixels: PixelModel | None = None
-    """The same for the pixels of the slots, where those are unknowns."""
+    """The same for the pixels of the slots, if those are unknowns."""
 
 
 class PixelModel(NamedTuple):
-    """What one edge says of the pixels of `p` slots in their host."""
+    """Second-order model of one edge's energy by the pixels of `p` slots in their host."""
 
     coupled: Float[Array, "d+2 2 p"]
     """Mixed derivatives by `u` and `v` with the shared coordinates, their gradient, and those with inverse depth."""
@@ -119,8 +117,8 @@ class EdgeTerm(AbstractTerm):
     """Observations of landmarks along edges: `weight` and data have the axes `[e, p]`, edge and slot of its row.
 
     Fields:
-        first_slot: Slot of the host that the first column is about.
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        first_slot: Slot of the host that the first column observes.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
     Example: a landmark lies on a plane that is known in the target camera.
@@ -140,10 +138,10 @@ class EdgeTerm(AbstractTerm):
 
     @abc.abstractmethod
     def residual(self, view: View) -> Float[Array, "*m"]:
-        """Of one landmark seen along one edge."""
+        """Return the residual of one landmark observed along one edge."""
 
     def restricted(self, of_edge: Float[Array, " e"] | Array) -> Self:
-        """The same term without the observations of some edges, where `of_edge` is False."""
+        """Return the term without the observations of edges where `of_edge` is False."""
         return self.reweighted(jnp.where(of_edge[:, None], self.weight, 0.0))
 
     def prepared(self) -> Self:
@@ -151,20 +149,20 @@ class EdgeTerm(AbstractTerm):
         return safe.holding(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, -1), safe.data()))
 
     def residuals(self, view: EdgeView) -> Float[Array, "m p"]:
-        """Of all slots of one edge; `self` holds the prepared data of that edge."""
+        """Return the residuals of all slots of one edge; `self` has the prepared data of that edge."""
         return self._moved(view, jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth)
 
     def along_all(self, view: EdgeView) -> tuple[Float[Array, "m p"], Float[Array, "m p"]]:
-        """Residuals of one edge, and their derivative along all coordinates together: not finite if one is not."""
+        """Return residuals of one edge, and the sum of their derivatives, which is not finite if one is not."""
         at = jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth
         return jax.jvp(lambda x, d: self._moved(view, x, d), at, jax.tree.map(jnp.ones_like, at))
 
     def energy(self, view: EdgeView) -> Float[Array, ""]:
-        """Of one edge."""
+        """Return the energy of one edge."""
         return robust_energy(self.kernel, self.weights, self.residuals(view))
 
     def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "c mp"]:
-        """Weighted derivatives, residual and depth derivative of one edge: their products are its normal equations."""
+        """Return weighted derivatives and residual of one edge: their products are its normal equations."""
         zeros = view.parts(jnp.zeros(view.size, view.inverse_depth.dtype))
 
         def by_part(at: int) -> Array:
@@ -172,7 +170,8 @@ class EdgeTerm(AbstractTerm):
             along = lambda tangent: jax.jvp(moved, (zeros[at],), (tangent,))[1]
             return jax.vmap(along)(jnp.eye(len(zeros[at]), dtype=zeros[at].dtype))
 
-        # Part by part, so that what one part leaves as it is, a host's viewing rays above all, is not carried along.
+        # Part by part, so that quantities independent of a part, such as the host's viewing rays, are not
+        # differentiated.
         shared = [by_part(at) for at in range(len(zeros))]
         ones = jnp.ones_like(view.inverse_depth)
         residual, depth = jax.jvp(lambda d: self._after(view, zeros, d), (view.inverse_depth,), (ones,))
@@ -181,7 +180,7 @@ class EdgeTerm(AbstractTerm):
         return jnp.concatenate([rows[: view.size], pull[None], rows[view.size :]]).reshape(len(rows) + 1, -1)
 
     def gradient(self, view: EdgeView) -> Gradient:
-        """Gradient of one edge's energy by relative pose and cameras, by each inverse depth, and by the pixels."""
+        """Return the gradient of one edge's energy by relative pose and cameras, inverse depths, and pixels."""
         zero = jnp.zeros(view.size, view.inverse_depth.dtype)
         by_shared, by_depth, by_pixel = jax.grad(self._energy_at, (1, 2, 3))(
             view, zero, view.inverse_depth, view.pixels
@@ -189,13 +188,13 @@ class EdgeTerm(AbstractTerm):
         return Gradient(by_shared, by_depth, by_pixel if view.free_pixels else None)
 
     def model(self, view: EdgeView) -> LocalModel:
-        """Exact Hessian and gradient of one edge."""
+        """Return the exact Hessian and gradient of one edge."""
         size, depth, pixels = view.size, view.inverse_depth, view.pixels
         gradient = lambda x, d, u: jax.grad(self._energy_at, (1, 2, 3))(view, x, d, u)
         at = jnp.zeros(size, depth.dtype), depth, pixels
         force, own, pull = gradient(*at)
-        # A residual sees the unknowns of one slot: one product with ones has the columns of all slots. All products in
-        # one `vmap`: a gradient that is traced once compiles once.
+        # A residual depends on the unknowns of one slot, so one product with ones has the columns of all slots. All
+        # products are in one `vmap`, so that the gradient is traced and compiled once.
         columns = 1 + 2 * bool(view.free_pixels)
         by_depth = jnp.zeros((size + columns, *depth.shape), depth.dtype).at[size].set(1.0)
         by_pixel = jnp.zeros((size + columns, *pixels.shape), depth.dtype)
@@ -212,7 +211,7 @@ class EdgeTerm(AbstractTerm):
         return LocalModel(gram, coupled, PixelModel(by_pixels, blocks))
 
     def _by_pixel(self, view: EdgeView, parts: list[Array]) -> list[Float[Array, "2 m p"]]:
-        """Derivatives of the residuals by `u` and `v` in the host, where those are unknowns."""
+        """Return derivatives of the residuals by `u` and `v` in the host, if those are unknowns."""
         if not view.free_pixels:
             return []
         residuals = lambda pixels: self._after(view, parts, view.inverse_depth, pixels)
@@ -223,7 +222,7 @@ class EdgeTerm(AbstractTerm):
         return robust_energy(self.kernel, self.weights, self._after(view, view.parts(shared), depth, pixels))
 
     def _moved(self, view: EdgeView, shared: Float[Array, " d"], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
-        """Residuals after a step of the shared coordinates, at the given depths."""
+        """Return residuals after a step of the shared coordinates, at the given depths."""
         return self._after(view, view.parts(shared), depth)
 
     def _after(
@@ -233,7 +232,7 @@ class EdgeTerm(AbstractTerm):
         depth: Float[Array, " p"],
         pixels: Float[Array, "2 p"] | None = None,
     ) -> Float[Array, "m p"]:
-        """Residuals after a step of each part, which is zero, at the given depths and, if any, pixels in the host."""
+        """Return residuals after a (zero) step of each part, at the given depths and optional pixels in the host."""
         relative = lie.move_at_zero(view.relative, parts[0])
         host, camera = view.cameras.along(view.ends, parts[1:])
 
@@ -245,21 +244,21 @@ class EdgeTerm(AbstractTerm):
 
 
 _CENTRE = lie.TANGENT + 2
-"""Where a row has its derivative by the principal point."""
+"""Index of the derivative by the principal point in a row."""
 _WITH_ENTRIES = 3
-"""Axes of prepared data that have entries beside edge and slot."""
+"""Number of axes of prepared data with entries besides edge and slot."""
 
 
 class ImageTerm(EdgeTerm):
     """A residual that is an affine function of the landmark's pixel in the target: a match, a line.
 
-    With one pinhole for all keyframes, its derivatives come from `fast/pinhole.py`, written by hand; with other cameras
-    from automatic differentiation. The tests hold the two equal.
+    With one pinhole for all keyframes, its derivatives are those of `fast/pinhole.py`, written by hand; with other
+    cameras they use automatic differentiation. The tests check that both are equal.
 
     Fields:
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
-        first_slot: slot of the host that the first column is about; `pack` sets it.
+        first_slot: slot of the host that the first column observes; set by `pack`.
 
     Example: only the column of a match is known.
         >>> class Column(vg.terms.ImageTerm):
@@ -273,10 +272,10 @@ class ImageTerm(EdgeTerm):
 
     @abc.abstractmethod
     def image_residual(self, u: Float[Array, ""], v: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
-        """Entries of the residual of one observation, given the projected pixel `(u, v)`.
+        """Return the entries of the residual of one observation, given the projected pixel `(u, v)`.
 
-        Data of an observation are read entry by entry (`self.target[0]`): in the loops each entry is an array of its
-        own, which XLA vectorises; a small axis inside them would keep it from that (1.9 times slower).
+        Data of an observation are read entry by entry (`self.target[0]`): in the loops each entry is a separate array,
+        which XLA vectorises; with a small inner axis it does not (1.9 times slower).
         """
 
     def prepared(self) -> Self:
@@ -324,7 +323,7 @@ class ImageTerm(EdgeTerm):
         squared = self.weights * squared_norm(entries)
         pull = self.weights * self.kernel.weight(squared)
         bend = 2 * self.weights**2 * self.kernel.curvature(squared)
-        # Whole arrays, not entry by entry as in `columns`: a hundred separate sums take seconds to compile.
+        # Stacked arrays, not entries as in `columns`: a hundred separate sums take seconds to compile.
         residual = jnp.stack(entries)
         normal = jnp.stack([jnp.stack(of) for of in normals])
         rows = jnp.stack(pinhole.row(edge, at, *normal), 1)
@@ -332,7 +331,7 @@ class ImageTerm(EdgeTerm):
         along = jnp.sum(residual[:, None] * rows, 0)  # the residual times its derivative: `D / (w rho')`
         force = pull * jnp.sum(normal * residual, 1)
         added, mixed = pinhole.second_order(edge, at, (force[0], force[1]), list(third))
-        # Half of what these rows make with the plain ones is `sum w rho' J'J + 2 w^2 rho'' (J'r)(J'r)' - P D'`.
+        # Half of the products of these rows with the plain ones is `sum w rho' J'J + 2 w^2 rho'' (J'r)(J'r)' - P D'`.
         bent = bend * along[:-1] - 2 * pull * third[:-1]
         left = jnp.concatenate([pull * rows[:, :-1] + residual[:, None] * bent, (pull * residual)[:, None]], 1)
         products = jnp.einsum("map,mbp->ab", left, rows[:, :-1])
@@ -354,7 +353,7 @@ class ImageTerm(EdgeTerm):
         weights: tuple[Float[Array, " p"], Float[Array, " p"]],
         third: Float[Array, "11 p"],
     ) -> PixelModel:
-        """Exact second derivatives by the pixels in the host, see `fast/pinhole.py`.
+        """Return exact second derivatives by the pixels in the host, see `fast/pinhole.py`.
 
         derivatives: residuals, their derivatives by the projected pixel, and by shared coordinates and inverse depth.
         weights: `w rho'` and `2 w^2 rho''`. third: `P`.
@@ -389,7 +388,7 @@ class ImageTerm(EdgeTerm):
         return PixelModel(coupled, blocks)
 
     def _image(self, view: EdgeView, at: Projection) -> tuple[Rows, tuple[Rows, Rows]]:
-        """Residuals, and their derivatives by the projected pixel's coordinates, row by row."""
+        """Return residuals and their derivatives by the projected pixel's coordinates, row by row."""
         assert view.fast is not None
         fx, fy, cx, cy = view.fast.intrinsics
         pixel = (fx * at.x + cx, fy * at.y + cy)
@@ -404,7 +403,7 @@ class ImageTerm(EdgeTerm):
         return residual, (right, jax.jvp(each, pixel, (zero, one))[1])
 
     def _force(self, view: EdgeView, at: Projection) -> tuple[Array, Array]:
-        """`w rho' r` on the projected pixel; zero where absent."""
+        """Return `w rho' r` on the projected pixel; zero for absent observations."""
         residual, normal = self._image(view, at)
         pull = self.weights * self.kernel.weight(self.weights * squared_norm(residual))
         along = [sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]
@@ -412,7 +411,7 @@ class ImageTerm(EdgeTerm):
 
 
 def _tied_model(view: EdgeView, model: LocalModel) -> LocalModel:
-    """A model by the pinhole's four parameters as one by the camera's own."""
+    """Convert a model by the pinhole's four parameters to one by the camera's."""
     if view.cameras.kind is Pinhole:
         return model
     once = jnp.stack(view.tied(list(model.gram)))
@@ -421,7 +420,7 @@ def _tied_model(view: EdgeView, model: LocalModel) -> LocalModel:
 
 
 def products(left: Float[Array, "... mp"], right: Float[Array, "... mp"], slots: int) -> Float[Array, "... p"]:
-    """Products of columns (each with that by the inverse depth, say), the rows of an observation added."""
+    """Return products of columns (such as each with that by inverse depth), summed over the rows of an observation."""
     parts = [
         left[..., start : start + slots] * right[..., start : start + slots]
         for start in range(0, left.shape[-1], slots)
@@ -430,7 +429,7 @@ def products(left: Float[Array, "... mp"], right: Float[Array, "... mp"], slots:
 
 
 def pinhole_parameters(cameras: Cameras) -> Float[Array, "4"] | None:
-    """`fx, fy, cx, cy` where the hand-written derivatives know the camera: one pinhole that took all keyframes."""
+    """Return `fx, fy, cx, cy` if the hand-written derivatives apply: one pinhole camera for all keyframes."""
     if cameras.group is not None or cameras.kind not in (Pinhole, SquarePinhole):
         return None
     own = cameras.parameters

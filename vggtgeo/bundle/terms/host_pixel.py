@@ -1,4 +1,4 @@
-"""The observation of a landmark in its host image, which has noise as its matches have."""
+"""The observation of a landmark in its host image, which has noise like its matches."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighting
 
 
 class HostPixel(AbstractTerm):
-    """`r = offset`, pixels: the landmark's pixel in its host, minus where it was observed (`Problem.pixels`).
+    """`r = offset`, pixels: the landmark's pixel in its host, minus the observed one (`Problem.pixels`).
 
-    Without it the bearing of a landmark is exact by construction, and the noise of the host's key point, which all its
-    matches share, is taken for theirs. With it a landmark has three unknowns: `State.pixel_offset` and its inverse
-    depth, which is bundle adjustment over points in space.
+    Without it the bearing of a landmark is exact by construction, and the noise of the host's key point, common to all
+    its matches, is attributed to the matches. With it a landmark has three unknowns, `State.pixel_offset` and its
+    inverse depth, as in bundle adjustment over 3D points.
 
     Fields:
-        weight: `[h, p]`, row of landmarks and point slot: 1 / variance of the pixel; 0 = nothing was observed.
+        weight: `[h, p]`, row of landmarks and point slot: 1 / variance of the pixel; 0 = absent.
         kernel: robust kernel of each observation.
 
     Example:
@@ -31,18 +31,18 @@ class HostPixel(AbstractTerm):
     unit = "px"
 
     def residual(self, offset: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Of one landmark, pixels."""
+        """Return the residual of one landmark, pixels."""
         return offset
 
     def residuals(self, offset: Float[Array, "h p 2"]) -> Float[Array, "2 h p"]:
-        """Of all of them, the residual's own axis first."""
+        """Return the residuals of all landmarks, the residual's own axis first."""
         each = lambda data, one: check_residual(self, self.holding(data).residual(one))
         return jax.vmap(jax.vmap(each, out_axes=-1), out_axes=1)(self.data(), offset)
 
     def model(
         self, offset: Float[Array, "h p 2"], correction: Float[Array, ""] | None, exact: bool
     ) -> tuple[Float[Array, "h 3 p"], Float[Array, "h 2 p"]]:
-        """Hessian, `uu, vv, uv`, and gradient of the energy of each landmark; of a prepared term.
+        """Return Hessian, `uu, vv, uv`, and gradient of the energy of each landmark; for a prepared term.
 
         The derivative of the residual is the unit matrix, so the Hessian is `pull I + bend r r'`, written out: products
         of 2 x 2 matrices, landmark by landmark, take ten times as long on a CPU.
@@ -59,6 +59,6 @@ class HostPixel(AbstractTerm):
         return hessian, jnp.stack([pull * u, pull * v], 1)
 
     def gradient(self, offset: Float[Array, "h p 2"]) -> Float[Array, "h p 2"]:
-        """First derivative of the energy, differentiable once more."""
+        """Return the first derivative of the energy, differentiable once more."""
         pull = self.weights * self.kernel.weight(self.weights * jnp.sum(offset**2, -1))
         return pull[..., None] * offset

@@ -1,4 +1,4 @@
-"""A Gaussian prior on the camera's parameters: a calibration and how far it is trusted."""
+"""A Gaussian prior on the camera's parameters: a calibration and its uncertainty."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class IntrinsicsPrior(CameraTerm):
     """`r = k - mean` for each parameter, weight `1 / sigma^2`; without a robust kernel.
 
     Fields:
-        index: Which parameter each observation is about, from 0.
+        index: Parameter of each observation, from 0.
         mean: Pixels (distortion: no unit).
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
     Example:

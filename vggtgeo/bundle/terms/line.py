@@ -12,9 +12,9 @@ class LineTerm(ImageTerm):
 
     Fields:
         coefficients: `(a, b, c)` with `a^2 + b^2 = 1`, of the line in keyframe j.
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
-        first_slot: slot of the host that the first column is about; `pack` sets it.
+        first_slot: slot of the host that the first column observes; set by `pack`.
 
     Example:
         >>> problem.lines.coefficients.shape  # edges, samples, (a, b, c)

@@ -1,4 +1,4 @@
-"""What marginalisation left behind: a Gaussian prior on all poses and the camera."""
+"""The prior of a marginalisation: a Gaussian on all poses and the camera."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class MarginalPrior(DenseTerm):
     Coordinates: six a keyframe (left tangent `log(T T_lin^-1)`, translation first), then the camera's.
 
     Fields:
-        root: [c, c], square root of the information; zero rows say nothing.
+        root: [c, c], square root of the information; zero rows have no information.
         offset: [c], the residual at the linearisation point.
-        poses: Linearisation points, batch `[n]`; kept as long as the prior lives (first estimates).
+        poses: Linearisation points, batch `[n]`; constant during the life of the prior (first estimates).
         intrinsics: [q], linearisation point of the cameras' parameters.
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
     Example:
@@ -54,7 +54,7 @@ class MarginalPrior(DenseTerm):
         known = len(self.poses.wxyz_xyz)
         more = keyframes - known
         if more < 0:
-            raise InputError(f"the term `{self.name}` is about {known} keyframes; this problem has {keyframes}")
+            raise InputError(f"`{self.name}` must have at most {keyframes} keyframes, as the problem, got {known}")
         if more == 0:
             return self
         new, split = lie.TANGENT * more, lie.TANGENT * known
@@ -68,9 +68,7 @@ class MarginalPrior(DenseTerm):
     def model(
         self, poses: jaxlie.SE3, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
     ) -> tuple[Float[Array, "c c"], Float[Array, " c"]]:
-        """By the chain rule, pose by pose: automatic differentiation of the whole would move all poses for each
-        coordinate.
-        """
+        """Return Hessian and gradient by the chain rule, pose by pose: cheaper than differentiating all poses."""
         if exact:
             return super().model(poses, parameters, correction, exact)
         size = len(parameters)

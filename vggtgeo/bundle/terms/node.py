@@ -1,4 +1,4 @@
-"""Terms on poses and the camera: no landmark takes part, so they live in the dense part of the arrow."""
+"""Terms on poses and the camera, without landmarks: they contribute to the dense part of the arrow."""
 
 from __future__ import annotations
 
@@ -30,21 +30,20 @@ ValueAndJacobian = tuple[Float[Array, " k"], Float[Array, "k d"]]
 
 
 def _indices(given: Any) -> Array:
-    """Numbers of keyframes; InputError for what is no whole numbers, of which the integer part would be taken."""
+    """Return keyframe indices; raise InputError unless they are whole numbers."""
     if not isinstance(given, jax.Array):
         found = np.asarray(given)
         if found.size and found.dtype.kind not in "iu":
-            raise InputError(f"the keyframes of a term are {given!r:.60}; expected whole numbers, one an observation")
+            raise InputError(f"keyframes of a term must be whole numbers, one an observation, got {given!r:.60}")
     return jnp.asarray(given, jnp.int32)
 
 
 class PoseTerm(AbstractTerm):
-    """Observations of single poses, and of the camera with them: `weight` and data have the axis `[m]`. One number as
-    weight counts for each.
+    """Observations of single poses and their camera: `weight` and data have the axis `[m]`; a scalar weight is for all.
 
     Fields:
-        keyframe: Which pose each observation is about.
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        keyframe: Keyframe of each observation.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
     Example: a position fix.
@@ -64,10 +63,10 @@ class PoseTerm(AbstractTerm):
 
     @abc.abstractmethod
     def residual(self, pose: jaxlie.SE3, camera: AbstractCamera) -> Float[Array, "*m"]:
-        """Of one observation; `pose` is world -> camera, `camera` the one that took the keyframe."""
+        """Return the residual of one observation; `pose` is world -> camera, `camera` that of the keyframe."""
 
     def local(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Local:
-        """The residual of one observation as a function of `(xi, parameters of the keyframe's camera)`."""
+        """Return the residual of one observation as a function of `(xi, parameters of the keyframe's camera)`."""
 
         def function(step: Array) -> Array:
             pose = lie.move_at_zero(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
@@ -77,14 +76,14 @@ class PoseTerm(AbstractTerm):
         return function
 
     def value(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Array:
-        """The residual of one observation."""
+        """Return the residual of one observation."""
         pose = jaxlie.SE3(poses[touched[0]])
         return check_residual(self, self.holding(data).residual(pose, cameras.of(touched[0])))
 
     def derivatives(
         self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
     ) -> ValueAndJacobian:
-        """The residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
+        """Return the residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
         return _differentiated(self, data, touched, poses, cameras)
 
     def touched(self) -> tuple[_Index, ...]:
@@ -100,16 +99,15 @@ class PoseTerm(AbstractTerm):
 
 
 class PairTerm(AbstractTerm):
-    """Observations of two poses: `weight` and data have the axis `[m]`. One number as weight counts for
-    each.
+    """Observations of two poses: `weight` and data have the axis `[m]`; a scalar weight is for all.
 
     Fields:
         first: Keyframe i of each observation.
         second: Keyframe j.
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
-    Example: what the wheels say of a motion.
+    Example: a motion measured by wheel odometry.
         >>> class Wheels(vg.terms.PairTerm):
         ...     step: jax.Array
         ...     def residual(self, first, second):
@@ -127,10 +125,10 @@ class PairTerm(AbstractTerm):
 
     @abc.abstractmethod
     def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, "*m"]:
-        """Of one observation; poses are world -> camera, so `second @ first.inverse()` maps camera i to camera j."""
+        """Return the residual of one observation; poses are world -> camera: `second @ first.inverse()` is i to j."""
 
     def local(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Local:
-        """The residual of one observation as a function of `(xi_i, xi_j)`."""
+        """Return the residual of one observation as a function of `(xi_i, xi_j)`."""
 
         def function(step: Array) -> Array:
             first = lie.move_at_zero(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
@@ -140,14 +138,14 @@ class PairTerm(AbstractTerm):
         return function
 
     def value(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Array:
-        """The residual of one observation."""
+        """Return the residual of one observation."""
         first, second = (jaxlie.SE3(poses[index]) for index in touched)
         return check_residual(self, self.holding(data).residual(first, second))
 
     def derivatives(
         self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
     ) -> ValueAndJacobian:
-        """The residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
+        """Return the residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
         return _differentiated(self, data, touched, poses, cameras)
 
     def touched(self) -> tuple[_Index, ...]:
@@ -166,13 +164,12 @@ NodeTerm = PoseTerm | PairTerm
 
 
 class CameraTerm(AbstractTerm):
-    """Observations of the camera's parameters: `weight` and data have the axis `[m]`. One number as weight counts for
-    each.
+    """Observations of the camera's parameters: `weight` and data have the axis `[m]`; a scalar weight is for all.
 
-    Several cameras: their parameters one camera after the other, `q = g k` of them.
+    For several cameras the parameters are concatenated, `q = g k`.
 
     Fields:
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
     Example: pixels are square.
@@ -187,21 +184,21 @@ class CameraTerm(AbstractTerm):
 
     @abc.abstractmethod
     def residual(self, parameters: Float[Array, " q"]) -> Float[Array, "*m"]:
-        """Of one observation."""
+        """Return the residual of one observation."""
 
     def observation_shape(self) -> tuple[int, ...]:
         rows = [np.shape(leaf)[:1] for leaf in jax.tree.leaves(self.data())]
         return next(iter(rows), (1,))
 
     def residuals(self, parameters: Float[Array, " q"]) -> Float[Array, "m k"]:
-        """Of all of them, the residual's own axis first."""
+        """Return the residuals of all observations, the residual's own axis first."""
         one = lambda data, _: check_residual(self, self.holding(data).residual(parameters))
         return jax.vmap(one, out_axes=-1)(self.data(), self.weight)
 
     def model(
         self, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
     ) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
-        """Hessian and gradient of the energy: of the sum, since each observation may see all parameters."""
+        """Return Hessian and gradient of the summed energy, since each observation may depend on all parameters."""
         if exact:
             gradient = jax.grad(lambda at: robust_energy(self.kernel, self.weights, self.residuals(at)))
             return jax.jacfwd(gradient)(parameters), gradient(parameters)
@@ -212,13 +209,13 @@ class CameraTerm(AbstractTerm):
 
 
 class DenseTerm(AbstractTerm):
-    """One observation of all poses and the camera together; it fills the matrix. `weight` is a scalar.
+    """One observation of all poses and the camera, with a dense Hessian. `weight` is a scalar.
 
     Fields:
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
-    Example: the one of the package is the prior of marginalisation.
+    Example: the prior of a marginalisation.
         >>> isinstance(vg.no_prior(3), vg.terms.DenseTerm)
         True
 
@@ -226,20 +223,20 @@ class DenseTerm(AbstractTerm):
 
     @abc.abstractmethod
     def residual(self, poses: jaxlie.SE3, parameters: Float[Array, " q"]) -> Float[Array, " m"]:
-        """Of the whole dense state: `poses` has a batch axis `[n]`."""
+        """Return the residual of the whole dense state: `poses` has a batch axis `[n]`."""
 
     @abc.abstractmethod
     def rows(self) -> Int[Array, ""]:
-        """Entries of the residual that say anything."""
+        """Return the number of residual entries with information."""
 
     @abc.abstractmethod
     def padded(self, keyframes: int) -> Self:
-        """The same term in a problem of so many keyframes, of which it says nothing about the last ones."""
+        """Return the term padded to `keyframes` keyframes, without information about the new ones."""
 
     def model(
         self, poses: jaxlie.SE3, parameters: Float[Array, " q"], correction: Float[Array, ""] | None, exact: bool
     ) -> tuple[Float[Array, "c c"], Float[Array, " c"]]:
-        """Hessian and gradient of the energy by all tangents, then the camera."""
+        """Return Hessian and gradient of the energy by all tangents, then the camera."""
         split = lie.TANGENT * len(poses.wxyz_xyz)
 
         def residual(step: Array) -> Array:
@@ -250,7 +247,7 @@ class DenseTerm(AbstractTerm):
 
 
 def node_residuals(term: NodeTerm, poses: Float[Array, "n 7"], cameras: Cameras) -> Float[Array, "k m"]:
-    """Residuals of all observations of a pose or pair term, the residual's own axis first."""
+    """Return residuals of all observations of a pose or pair term, the residual's own axis first."""
     one = lambda data, touched: term.value(data, touched, poses, cameras)
     return jax.vmap(one, out_axes=-1)(term.data(), term.touched())
 
@@ -258,7 +255,7 @@ def node_residuals(term: NodeTerm, poses: Float[Array, "n 7"], cameras: Cameras)
 def node_derivatives(
     term: NodeTerm, poses: Float[Array, "n 7"], cameras: Cameras
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k d"]]:
-    """Residuals of all observations of a pose or pair term, and their derivatives by the local coordinates of each."""
+    """Return residuals of all observations of a pose or pair term, and derivatives by the local coordinates of each."""
     one = lambda data, touched: term.derivatives(data, touched, poses, cameras)
     return jax.vmap(one)(term.data(), term.touched())
 
@@ -270,7 +267,7 @@ def node_models(
     correction: Float[Array, ""] | None,
     exact: bool,
 ) -> tuple[Float[Array, "m d d"], Float[Array, "m d"]]:
-    """Hessian and gradient of each observation of a pose or pair term by its local coordinates."""
+    """Return Hessian and gradient of each observation of a pose or pair term by its local coordinates."""
 
     def one(data: dict, weight: Array, touched: tuple[Array, ...]) -> tuple[Array, Array]:
         if exact:

@@ -1,4 +1,4 @@
-"""A measured relative pose of two keyframes: odometry, a loop, an alignment of surfaces."""
+"""A measured relative pose of two keyframes: odometry, a loop closure, an alignment of surfaces."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class RelativePose(PairTerm):
     Fields:
         measured: `M`: camera i -> camera j, `(qw, qx, qy, qz, tx, ty, tz)`.
         root: Square root of the information, translation first: 1/m and 1/rad.
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
         first: int [m], keyframe i of each observation.
         second: int [m], keyframe j of each observation.
 
-    Example: camera 1 stands where camera 0 does, to 1 cm and 0.01 rad.
+    Example: camera 1 has the pose of camera 0, with standard deviations of 1 cm and 0.01 rad.
         >>> import jax.numpy as jnp
         >>> root = 100.0 * jnp.eye(6)[None]
         >>> same = jnp.array([[1.0, 0, 0, 0, 0, 0, 0]])
@@ -47,9 +47,7 @@ class RelativePose(PairTerm):
     def derivatives(
         self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
     ) -> ValueAndJacobian:
-        """By the tangent of the relative pose, `eta = x_j - Ad(T_j T_i^-1) x_i`: half of the work, and of the
-        compilation.
-        """
+        """Differentiate by the tangent of the relative pose, `eta = x_j - Ad(T_j T_i^-1) x_i`: half of the cost."""
         if type(self).residual is not RelativePose.residual:
             return super().derivatives(data, touched, poses, cameras)
         relative = lie.relative(*(jaxlie.SE3(poses[index]) for index in touched))
@@ -64,13 +62,13 @@ class RelativePose(PairTerm):
 def quadratic(
     linearised_at: Float[Array, "m 7"], hessian: Float[Array, "m 6 6"], gradient: Float[Array, "m 6"]
 ) -> tuple[Float[Array, "m 7"], Float[Array, "m 6 6"]]:
-    """`measured` and `root` of quadratics in the left tangent of relative poses about `linearised_at`.
+    """Return `measured` and `root` of quadratics in the left tangent of relative poses about `linearised_at`.
 
-    Directions that the Hessian does not determine stay free: they have no row in the root.
+    Directions that the Hessian does not determine stay free: their row in the root is zero.
     """
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(hessian, axis1=-2, axis2=-1), 0.0))
     safe = jnp.where(scale > 0, scale, 1.0)
-    # Metres and radians differ in size: balance before cutting off what is rounding error.
+    # Metres and radians are not comparable: balance before the rank is decided.
     values, vectors = jnp.linalg.eigh(hessian / safe[..., :, None] / safe[..., None, :])
     kept = values > 1e-12
     roots = jnp.sqrt(jnp.where(kept, values, 1.0))
@@ -82,6 +80,6 @@ def quadratic(
 
 
 class SurfaceAlignment(RelativePose):
-    """What aligned surfaces of two keyframes say about their relative pose: a quadratic, made by `quadratic`."""
+    """Information of aligned surfaces about the relative pose of two keyframes: a quadratic, made by `quadratic`."""
 
     name = "surfaces"

@@ -1,4 +1,4 @@
-"""A measured rotation of a keyframe: the directions of a Manhattan world, gravity and a compass."""
+"""A measured rotation of a keyframe, from a Manhattan world, or gravity and a compass."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class RotationPrior(PoseTerm):
     Fields:
         measured: `M`: world -> camera, unit quaternion `(w, x, y, z)`.
         root: Square root of the information, 1/rad.
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
         keyframe: int [m], keyframe of each observation.
 
-    Example: the first camera stands upright, to a degree.
+    Example: the first camera is upright, with a standard deviation of one degree.
         >>> import jax.numpy as jnp
         >>> upright, root = jnp.array([[1.0, 0, 0, 0]]), 57.3 * jnp.eye(3)[None]
         >>> vg.terms.RotationPrior(keyframe=[0], measured=upright, root=root, weight=jnp.ones(1)).name

@@ -17,10 +17,10 @@ class SlotTerm(AbstractTerm):
     """Observations of inverse depths: `weight` and data have the axes `[h, s]`, row of landmarks and slot.
 
     Fields:
-        weight: 1 / variance of the residual of each observation; 0 = it is not there, and has no derivative.
+        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
-    Example: no landmark is nearer than it should be.
+    Example: a penalty on landmarks nearer than 0.5 m.
         >>> class NotNear(vg.terms.SlotTerm):
         ...     def residual(self, inverse_depth):
         ...         return jax.numpy.maximum(inverse_depth - 2.0, 0.0)
@@ -31,17 +31,17 @@ class SlotTerm(AbstractTerm):
 
     @abc.abstractmethod
     def residual(self, inverse_depth: Float[Array, ""]) -> Float[Array, "*m"]:
-        """Of one landmark, 1/m."""
+        """Return the residual of one landmark; inverse_depth: 1/m."""
 
     def residuals(self, inverse_depth: Float[Array, "h s"]) -> Float[Array, "m h s"]:
-        """Of all of them, the residual's own axis first."""
+        """Return the residuals of all landmarks, the residual's own axis first."""
         each = lambda data, depth: check_residual(self, self.holding(data).residual(depth))
         return jax.vmap(jax.vmap(each, out_axes=-1), out_axes=1)(self.data(), inverse_depth)
 
     def derivatives(
         self, inverse_depth: Float[Array, "h s"], correction: Float[Array, ""] | None, exact: bool
     ) -> Derivatives:
-        """First and second derivatives of the energy; of a prepared term."""
+        """Return first and second derivatives of the energy; for a prepared term."""
         ones = jnp.ones_like(inverse_depth)
         if exact:
             return jax.jvp(self._gradient, (inverse_depth,), (ones,))
@@ -50,7 +50,7 @@ class SlotTerm(AbstractTerm):
         return jnp.sum(rows[0] * pull, 0), jnp.sum(rows[0] * rows[0], 0)
 
     def gradient(self, inverse_depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
-        """First derivative of the energy, differentiable once more."""
+        """Return the first derivative of the energy, differentiable once more."""
         return self._gradient(inverse_depth)
 
     def _gradient(self, inverse_depth: Float[Array, "h s"]) -> Float[Array, "h s"]:

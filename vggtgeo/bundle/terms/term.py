@@ -1,8 +1,8 @@
-"""What all terms share: data with leading axes of observations, weights that say which are there, a robust kernel.
+"""Base of all terms: data with leading axes of observations, weights (0 = absent), a robust kernel.
 
-The energy of a term is `1/2 sum rho(w |r|^2)` over its observations. A subclass writes `residual` for ONE observation,
-with no mask, no batch and no weight: there `self` holds the data of that observation alone. Everything else (energy,
-gradient, normal equations, exact Hessian) is derived from it by automatic differentiation in local coordinates.
+The energy of a term is `1/2 sum rho(w |r|^2)` over its observations. A subclass defines `residual` for ONE observation,
+without mask, batch or weight: there `self` has the data of that observation only. Everything else (energy, gradient,
+normal equations, exact Hessian) is derived from it by automatic differentiation in local coordinates.
 """
 
 from __future__ import annotations
@@ -27,47 +27,46 @@ Local = Callable[[Array], Array]
 
 
 def check_width(name: str, kernel: Any) -> None:
-    """InputError for no kernel (its name, say), and for one whose width is not positive: at 0 any state is a solution.
-    A traced width is not looked at.
-    """
+    """Raise InputError unless `kernel` is a kernel object of positive width; a traced width is not checked."""
     if not isinstance(kernel, AbstractKernel):
-        raise InputError(f"`{name}` is {kernel!r}; expected a kernel object, as `vggtgeo.kernels.Huber(1.5)`")
+        raise InputError(f"`{name}` must be a kernel object, such as `vggtgeo.kernels.Huber(1.5)`, got {kernel!r}")
     width = getattr(kernel, "delta", None)
     known = isinstance(width, jax.Array | np.ndarray | float | int) and not isinstance(width, jax.core.Tracer)
     if known and not np.all(np.asarray(width) > 0):
-        raise InputError(f"`{name}` has the width {width}; it must be positive")
+        raise InputError(f"the width of `{name}` must be positive, got {width}")
     shape = getattr(kernel, "alpha", None) if isinstance(kernel, Barron) else None
     known = isinstance(shape, jax.Array) and not isinstance(shape, jax.core.Tracer)
     if known and not ((np.asarray(shape) < 2) & (np.asarray(shape) != 0)).all():
-        raise InputError(f"`{name}` has the shape {shape}; it must be below 2, and not 0, where `Cauchy` is its limit")
+        raise InputError(f"the shape of `{name}` must be below 2 and not 0 (use `Cauchy` for 0), got {shape}")
 
 
 def _weights(given: Any) -> Array:
-    """Weights as an array; InputError for what is no real numbers."""
+    """Convert weights to an array; raise InputError unless they are real numbers."""
     if not isinstance(given, jax.Array):
         real_numbers("weight", given)
-    return jnp.asarray(given)  # a number stays one of any precision
+    return jnp.asarray(given)  # a Python number stays weakly typed
 
 
 def check_residual(term: AbstractTerm, residual: Any) -> Array:
-    """The residual of one observation as an array [m], where it is traced; InputError for what is none, so that the
-    writer of a term reads of it and not of what JAX makes of it far below.
+    """Return the residual of one observation as an array [m]; raise InputError unless it is a float or such an array.
+
+    Without this check, a wrong residual of a user-defined term would cause an obscure error inside JAX.
     """
     kind, shape = getattr(residual, "dtype", None), getattr(residual, "shape", None)
     if isinstance(residual, float | int) and not isinstance(residual, bool):
         return jnp.asarray([float(residual)])
     if kind is None or shape is None or len(shape) > 1 or not jnp.issubdtype(kind, jnp.floating):
-        found = f"of the type `{type(residual).__name__}`" if kind is None else f"{kind} of shape {shape}"
+        found = f"of the type `{type(residual).__name__}`" if kind is None else f"of {kind} and shape {shape}"
         raise InputError(
-            f"`residual` of the term `{term.name}` gives something {found}; expected a number, or an array [m], of "
-            "floats"
+            f"`residual` of the term `{term.name}` must return a float or an array [m] of floats, got a value {found}"
         )
     return jnp.atleast_1d(residual)
 
 
 def check_padded(term: AbstractTerm, rows: tuple[int, ...], slots: int) -> None:
-    """InputError for a term on landmarks whose weights or data are not in the padded shape of a problem: `rows` (its
-    edges or keyframes), then at most `slots`; flat lists in particular.
+    """Raise InputError for a term on landmarks, such as flat lists, without the padded shape of a problem.
+
+    The shape is `rows` (its edges or keyframes), then at most `slots`.
     """
     shape = np.shape(term.weight)
     found = [("weight", shape, (*rows, slots))] if shape[:-1] != rows or shape[-1] > slots else []
@@ -77,13 +76,13 @@ def check_padded(term: AbstractTerm, rows: tuple[int, ...], slots: int) -> None:
         ]
     for name, own, expected in found:
         raise InputError(
-            f"`{term.name}.{name}` has shape {own}; it must begin with {expected}, the padded shape of the problem. "
-            "Give flat lists, one row an observation, as a `vggtgeo.terms.FlatTerm` to `vggtgeo.pack(..., terms=[...])`"
+            f"the shape of `{term.name}.{name}` must begin with {expected}, the padded size of the problem, got {own}: "
+            "pass flat lists, one row an observation, as a `vggtgeo.terms.FlatTerm` to `vggtgeo.pack(..., terms=[...])`"
         )
 
 
 def shared_field(**options: Any) -> Any:
-    """A field of a term that all its observations share (a scale, a calibration), not data with an axis of its own.
+    """Declare a field that all observations of a term share (a scale, a calibration), without an observation axis.
 
     Example:
         >>> class Height(vg.terms.PoseTerm):
@@ -98,15 +97,14 @@ def shared_field(**options: Any) -> Any:
 
 
 class AbstractTerm(eqx.Module):
-    """One kind of observation; see the kinds beside this file for what `residual` takes.
+    """One kind of observation; the subclasses define the arguments of `residual`.
 
-    The fields that a subclass adds are data: every array in them has the axes of `weight` first. What all observations
-    share is declared with `vggtgeo.terms.shared_field()`.
+    The fields of a subclass are data: every array in them has the axes of `weight` first. Fields that all observations
+    share are declared with `vggtgeo.terms.shared_field()`.
 
     Fields:
-        weight: 1 / variance of the residual of each observation. 0 means that it is not there, and what is not there
-            has no derivative: by a weight of exactly 0 the derivative of a solution is 0. To learn whether an
-            observation should count, give it a small positive weight.
+        weight: 1 / variance of the residual of each observation. 0 means absent, and the derivative of a solution by a
+            weight of exactly 0 is 0. To learn the weight of an observation, start with a small positive value.
         kernel: robust kernel of each observation; the square by default.
 
     Example: a term of a problem, without its first edge.
@@ -120,12 +118,12 @@ class AbstractTerm(eqx.Module):
     kernel: AbstractKernel = eqx.field(kw_only=True, default=Square())
 
     unit: ClassVar[str] = ""
-    """Of the residual, for reports: `px`, say."""
+    """Unit of the residual for reports, such as `px`."""
     structure: ClassVar[frozenset[str]] = frozenset({"weight", "kernel"})
-    """Fields that are no data of an observation: what it touches, and what this class holds itself."""
+    """Fields that are not data of an observation: indices, and the fields of this class."""
 
     def __check_init__(self) -> None:
-        """InputError for a kernel that is none."""
+        """Raise InputError for an invalid kernel."""
         check_width(f"{self.name}.kernel", self.kernel)
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -134,19 +132,18 @@ class AbstractTerm(eqx.Module):
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
     name: ClassVar[str] = "term"
-    """By which a problem finds it; a class without one of its own is called after itself, `PositionFix` is
-    `position_fix`."""
+    """Name of the term in a problem; by default the class name in snake case: `PositionFix` is `position_fix`."""
 
     @property
     def weights(self) -> Float[Array, "*observations"]:
-        """What the energy multiplies squared residuals with."""
+        """Factors of the squared residuals in the energy."""
         return self.weight
 
     def reweighted(self, weight: Float[Array, "*observations"]) -> Self:
-        """The same term with other weights.
+        """Return the same term with other weights.
 
         Raises:
-            InputError: they are no numbers, or have another shape.
+            InputError: `weight` is not numeric, or has another shape.
 
         """
         given: Any = weight
@@ -154,42 +151,42 @@ class AbstractTerm(eqx.Module):
             given = jnp.asarray(real_numbers("weight", given), self.weight.dtype)
         if given.shape != self.weight.shape:
             raise InputError(
-                f"`weight` has shape {given.shape}; expected {self.weight.shape}, that of `{self.name}.weight`"
+                f"`weight` must have shape {self.weight.shape}, that of `{self.name}.weight`, got {given.shape}"
             )
         return eqx.tree_at(lambda term: term.weight, self, given)
 
     def observation_shape(self) -> tuple[int, ...] | None:
-        """Shape of the observations, where their number is known without weights; None where it is not."""
+        """Return the shape of the observations if it is known without weights, else None."""
         return None
 
     def broadcast(self) -> Self:
-        """The same term with a weight for each observation, where one number is given for all."""
+        """Return the term with a scalar weight broadcast to all observations."""
         shape = self.observation_shape()
         if shape is None or self.weight.ndim:
             return self
         return eqx.tree_at(lambda term: term.weight, self, jnp.broadcast_to(self.weight, shape))
 
     def present(self) -> Bool[Array, "*observations"]:
-        """Which observations are there."""
+        """Return which observations are present (positive weight)."""
         return self.weights > 0
 
     def data(self) -> dict[str, Any]:
-        """The fields that hold data of observations."""
+        """Return the fields that hold data of observations."""
         names = [field.name for field in dataclasses.fields(self) if not field.metadata.get("shared", False)]
         return {name: getattr(self, name) for name in names if name not in self.structure}
 
     def holding(self, data: dict[str, Any]) -> Self:
-        """The term with other data, one observation's in particular: what `residual` sees as `self`."""
+        """Return the term with other data, such as those of one observation: this is `self` in `residual`."""
         one = object.__new__(type(self))
         for field in dataclasses.fields(self):
             object.__setattr__(one, field.name, data.get(field.name, getattr(self, field.name)))
         return one
 
     def prepared(self) -> Self:
-        """Zero weights and harmless data where nothing was observed, so that padding never makes a NaN.
+        """Return the term with safe data for absent observations, so that padding never causes a NaN.
 
-        Ones, not zeros: they may be divided by, normalised, and taken the logarithm of. A weight that is NaN or below
-        zero is no weight: it becomes NaN, and with it the energy, which a solve under `jit` answers with its result.
+        The data become ones, not zeros, since a residual may divide by them, normalise them, or take their logarithm.
+        An invalid weight (NaN or negative) becomes NaN, and with it the energy, which a solve under `jit` reports.
         """
         present = self.present()
 
@@ -204,7 +201,7 @@ class AbstractTerm(eqx.Module):
 
 
 def squared_norm(residual: Float[Array, "m *b"] | tuple[Array, ...]) -> Float[Array, "*b"]:
-    """`|r|^2`; the residual's own axis comes first, or its entries are given one by one."""
+    """Return `|r|^2`; the residual's own axis comes first, or it is a tuple of entries."""
     if isinstance(residual, tuple):
         first, *others = (row * row for row in residual)
         return sum(others, first)
@@ -214,12 +211,12 @@ def squared_norm(residual: Float[Array, "m *b"] | tuple[Array, ...]) -> Float[Ar
 def robust_energy(
     kernel: AbstractKernel, weight: Array, residual: Float[Array, "m *b"] | tuple[Array, ...]
 ) -> Float[Array, ""]:
-    """`1/2 sum rho(w |r|^2)`; the residual as in `squared_norm`."""
+    """Return `1/2 sum rho(w |r|^2)`; the residual as in `squared_norm`."""
     return jnp.sum(kernel.rho(weight * squared_norm(residual))) / 2
 
 
 class Reweighting(NamedTuple):
-    """How residuals and derivatives of one observation are scaled; see `reweighting`."""
+    """Scale factors of residuals and derivatives of one observation; see `reweighting`."""
 
     root: Array
     """`a`."""
@@ -232,11 +229,12 @@ class Reweighting(NamedTuple):
 def reweighting(
     kernel: AbstractKernel, weight: Float[Array, "*b"], squared: Float[Array, "*b"], correction: Float[Array, ""] | None
 ) -> Reweighting:
-    """What makes rows `J' = a (I - (1 - b) r r^T / |r|^2) J` and residuals `r' = a r / b` whose normal equations
-    `J'^T J'`, `J'^T r'` are those of the robust energy: exact in the gradient, reweighted in the Hessian, with a part
-    `correction` of the kernel's own curvature (Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999, 4.3).
+    """Return the scale factors of the rows of a robust energy.
 
-    `a^2 = w rho'`, and `b` is that of `softened`, 1 without a correction.
+    Rows `J' = a (I - (1 - b) r r^T / |r|^2) J` and residuals `r' = a r / b` have the normal equations `J'^T J'`,
+    `J'^T r'` of the robust energy: exact in the gradient, reweighted in the Hessian, with a part `correction` of the
+    kernel's curvature (Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999, 4.3). `a^2 = w rho'`, and `b` is
+    that of `softened`, 1 without a correction.
     """
     root = _root(weight * kernel.weight(weight * squared))
     soft = jnp.ones_like(root) if correction is None else softened(kernel, weight * squared, correction)
@@ -250,7 +248,7 @@ def reweighted_rows(
     jacobian: Float[Array, "d m *b"],
     correction: Float[Array, ""] | None,
 ) -> tuple[Float[Array, "d m *b"], Float[Array, "m *b"]]:
-    """The rows and residuals of `reweighting`."""
+    """Return the rows and residuals scaled by `reweighting`."""
     scale = reweighting(kernel, weight, squared_norm(residual), correction)
     if correction is None:
         return scale.root * jacobian, scale.root * residual
@@ -259,9 +257,10 @@ def reweighted_rows(
 
 
 def softened(kernel: AbstractKernel, s: Array, correction: Float[Array, ""]) -> Array:
-    """Root of the ratio of the second derivative of `rho / 2` along the residual to that across it, which is all that
-    reweighting knows: `1 + 2 s rho'' / rho'` for the whole correction, here for a part of it and never below what the
-    same part leaves of 0.
+    """Return the square root of the ratio of the second derivatives of `rho / 2` along and across the residual.
+
+    Reweighting uses only the second derivative across it. The ratio is `1 + 2 s rho'' / rho'`, clipped to [0, 1]; here
+    `correction` interpolates between 1 and that ratio.
     """
     weight = kernel.weight(s)
     pulled = weight > 0
@@ -277,7 +276,7 @@ def local_model(
     correction: Float[Array, ""] | None,
     exact: bool,
 ) -> tuple[Float[Array, "d d"], Float[Array, " d"]]:
-    """Hessian and gradient of one observation's energy by its local coordinates, at zero."""
+    """Return Hessian and gradient of one observation's energy by its local coordinates, at zero."""
     zero = jnp.zeros(size, weight.dtype)
     if exact:
         energy: Local = lambda local: term.kernel.rho(weight * jnp.sum(residual(local) ** 2)) / 2
@@ -293,14 +292,14 @@ def reweighted_model(
     jacobian: Float[Array, "k d"],
     correction: Float[Array, ""] | None,
 ) -> tuple[Float[Array, "d d"], Float[Array, " d"]]:
-    """Reweighted Hessian and gradient of one observation's energy, of its residual and that one's derivatives."""
+    """Return reweighted Hessian and gradient of one observation's energy, from its residual and Jacobian."""
     rows, pull = reweighted_rows(term.kernel, weight, value, jacobian.T, correction)
     return rows @ rows.T, rows @ pull
 
 
 @jax.custom_jvp
 def _root(value: Array) -> Array:
-    """Square root whose derivative at zero is zero, so that an absent observation makes no NaN in it."""
+    """Return the square root, with a derivative of zero at zero, so that an absent observation causes no NaN."""
     return jnp.sqrt(value)
 
 

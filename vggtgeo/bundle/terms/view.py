@@ -1,4 +1,4 @@
-"""What a residual along an edge is given: one landmark of keyframe i, as keyframe j should see it."""
+"""Argument of a residual along an edge: one landmark of keyframe i, seen from keyframe j."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from vggtgeo.geometry.camera_models import AbstractCamera
 class View(eqx.Module):
     """A landmark of host camera i in target camera j.
 
-    The landmark is carried scaled by its inverse depth, `R ray + d t`, which stays finite for points at infinity.
+    The landmark is scaled by its inverse depth, `R ray + d t`, which stays finite for points at infinity.
 
-    Example: a landmark seen by two cameras at one place.
+    Example: a landmark seen by two cameras at the same pose.
         >>> import jax.numpy as jnp, jaxlie
         >>> camera = vg.cameras.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0]))
         >>> vg.terms.View(jaxlie.SE3.identity(), camera, jnp.array([100.0, 50.0]), jnp.asarray(0.5)).projected.tolist()
@@ -25,13 +25,13 @@ class View(eqx.Module):
     relative: jaxlie.SE3
     """`M = T_j T_i^-1`: host to target camera."""
     camera: AbstractCamera
-    """That sees it: of keyframe j."""
+    """Camera of keyframe j."""
     pixel: Float[Array, "2"]
-    """In the host."""
+    """Pixel in the host."""
     inverse_depth: Float[Array, ""]
     """1/m, in the host."""
     host: AbstractCamera | None = None
-    """The camera of keyframe i where it is another one."""
+    """Camera of keyframe i if it differs from that of keyframe j."""
 
     @property
     def ray(self) -> Float[Array, "3"]:
@@ -50,5 +50,5 @@ class View(eqx.Module):
 
     @property
     def projected(self) -> Float[Array, "2"]:
-        """Its pixel in the target (equation 5 of the paper)."""
+        """Pixel of the landmark in the target (equation 5 of the paper)."""
         return self.camera.project(self.scaled_point)
