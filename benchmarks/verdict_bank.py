@@ -302,9 +302,7 @@ def judged(options: argparse.Namespace) -> list[Judged]:
         word = outcome["outcome"] if np.isfinite(outcome["ate"]) else NO_MAP
         level, reasons = outcome["level"], outcome["reasons"]
         if not options.saved:
-            slam, evidence, of_input = (
-                pickle.loads((folder / f"{name}.pkl").read_bytes()) for name in ("slam", "evidence", "input")
-            )
+            slam, evidence, of_input = (_read(folder / f"{name}.pkl") for name in ("slam", "evidence", "input"))
             with warnings.catch_warnings(), program_settings():
                 warnings.simplefilter("ignore")
                 verdict = judge(slam, evidence, of_input)
@@ -317,6 +315,28 @@ def judged(options: argparse.Namespace) -> list[Judged]:
         if options.verbose and (one.level == "good") == (one.outcome in ("wrong", NO_MAP)):
             print(f"{one.name}: {one.outcome}, {one.level}: {'; '.join(one.reasons)[:300]}", flush=True)
     return found
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads banks that were made before a module was renamed."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The class of this name where it is now."""
+        return super().find_class(MOVED.get(module, module), name)
+
+
+MOVED = {"vggtgeo.geometry.cameras": "vggtgeo.geometry.camera"}
+
+
+def _read(path: Path) -> Any:
+    """What `make` kept. Fields that are newer than a bank have their default: no deviation of a depth is known."""
+    with path.open("rb") as file:
+        kept = _Unpickler(file).load()
+    for keyframe in kept.keyframes if isinstance(kept, Slam) else ():
+        for slots in (keyframe.points, keyframe.samples):
+            if not hasattr(slots, "deviation"):
+                object.__setattr__(slots, "deviation", np.full(slots.inverse_depth.shape, np.nan))
+    return kept
 
 
 def table(runs: list[Judged]) -> str:
