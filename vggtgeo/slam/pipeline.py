@@ -159,16 +159,13 @@ def _track(
         with clock.measure("relocalise"):
             found = relocalise(TrackingInput(data, slam.intrinsics, roles), slam.keyframes, slam.tracker) or found
     grows = bool(slam.window.members) and not settings.keyframes.localise_only
-    # Few points that agree by half are often wrong; where the frame shows more of the newest keyframe, that decides.
-    doubtful = found is not None and not (found.accepted and found.evidence.points_strong)
-    if grows and not slam.metric and doubtful:
+    if grows and not slam.metric and found is not None and not found.accepted:
         with clock.measure("track"):
             newest = slam.keyframes[slam.window.members[-1]]
             given = TrackingInput(data, slam.intrinsics, roles, _prior(slam, frame, roles))
             recorded = recorded_prior(slam, roles)
             length = None if recorded is None else recorded.length(newest, frame.timestamp)
-            by_rays = track_by_rays(given, newest, length or usual_step(slam.keyframes, frame.index))
-            found = by_rays if by_rays is not None and by_rays.accepted else found
+            found = track_by_rays(given, newest, length or usual_step(slam.keyframes, frame.index)) or found
     return slam, data, found
 
 
