@@ -229,7 +229,7 @@ def test_solve_says_what_is_wrong(tmp_path: Path) -> None:
         ((str(tmp_path / "no.npz"),), "no.npz` does not exist"),
         ((str(problem), "--max-steps", "0"), "--max-steps"),
         ((str(problem), "--dtype", "float16"), "--dtype"),
-        ((str(problem), "--max-steps", "3"), "problem.npz`: `poses[1]` is"),
+        ((str(problem), "--max-steps", "3"), "problem.npz`: `poses[1]` must be finite"),
     ]
     for arguments, message in cases:
         result = invoke("solve", *arguments, "-o", str(solution))
