@@ -178,3 +178,13 @@ def test_positions_beyond_the_digits_are_refused() -> None:
         found = _diagnosed(problem.with_term(fix), start)
         assert float(found.unresolved[-1]) == share
         assert float(found.unresolved[0]) == 0
+
+
+def test_a_solve_without_diagnosis_is_the_same_solve() -> None:
+    """The state is equal to the last digit, and the message is that of the termination; oracle: the solve with it."""
+    problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
+    expected, found = vg.solve(problem, initial), vg.solve(problem, initial, diagnosis=False)
+    assert found.diagnosis is None
+    assert found.message == expected.message
+    np.testing.assert_array_equal(found.state.inverse_depth, expected.state.inverse_depth)
+    np.testing.assert_array_equal(found.state.poses.wxyz_xyz, expected.state.poses.wxyz_xyz)
