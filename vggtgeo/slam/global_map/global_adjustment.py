@@ -285,11 +285,10 @@ def _terms(
 
 
 def _of_any_camera(slam: Slam) -> tuple[Factor, ...]:
-    """The factors that hold whatever the camera is: all but the tracked motions of keyframes that share matches.
+    """Return the factors that do not depend on the intrinsics: all but tracked motions of keyframes that share matches.
 
-    A motion was tracked with the camera of that moment, and would hold that: a lens that bends corners by 12 px was
-    found with 298 px in place of 266 (simulated), and without those motions with 268. The camera once estimated, they
-    are what keeps a map without depth together where it is seen least: corridor-office 4.2 -> 3.1 cm.
+    A motion was tracked with the intrinsics of that moment and would bias their estimate towards them. Once the
+    intrinsics are estimated, these motions are used again: they constrain weakly observed parts of a map without depth.
     """
     matched = {pair.key for pair in slam.map.pairs if len(pair.points)}
     tracked = {id(factor) for factor in slam.map.odometry_factors if tuple(sorted(factor.keyframes)) in matched}
