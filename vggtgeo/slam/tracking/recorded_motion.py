@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import GeometryResult
@@ -19,13 +18,12 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.sparse_map.units import longer
 from vggtgeo.slam.tracking.evidence import Evidence, tangent, worst_sigma
+from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
 from vggtgeo.slam.tracking.track import Track
 from vggtgeo.slam.tracking.tracker import FramePose
 
 LEAST, RECENT = 8, 20
 """Motions that are compared before anything is believed, and how many of the last decide."""
-GATE = float(chi_square.ppf(0.9999, 6))
-"""Squared Mahalanobis distance beyond which two motions contradict each other."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ def compare(recorded: RecordedPoses, known: Map) -> Comparison:
         measured = tie if known.metric else tie.of_free_length()
         noise = np.linalg.inv(measured.information) + recorded.covariance(scaled, seconds)
         off = tangent(tie.pose @ rigid.invert(scaled))
-        agreeing += bool(off @ np.linalg.solve(noise, off) < GATE)
+        agreeing += bool(off @ np.linalg.solve(noise, off) < AGREEMENT_GATE)
     return Comparison(unit, len(pairs[-RECENT:]), agreeing)
 
 
