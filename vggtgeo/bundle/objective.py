@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.bundle.fast import pinhole
+from vggtgeo.bundle.fast import any_camera, pinhole
 from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
@@ -128,7 +128,8 @@ class Hosts(NamedTuple):
     """Data of each row of landmarks for the loops over edges, slots last; computed once for all edges."""
 
     pixels: Float[Array, "h 2 s"]
-    rays: tuple[Float[Array, "h s"], Float[Array, "h s"]] | None
+    rays: tuple[Float[Array, "h s"], Float[Array, "h s"]] | any_camera.Rays
+    """Of a pinhole that all keyframes share; of other cameras with derivatives."""
     inverse_depth: Float[Array, "h s"]
     offset: Float[Array, "h p 2"] | None
     """Offsets of the free pixels, already included in `pixels` and `rays`."""
@@ -143,15 +144,17 @@ class Motions(NamedTuple):
 
 
 def hosts_of(problem: Problem, state: State) -> Hosts:
-    """Return the slots of all rows; with viewing rays if the hand-written derivatives support the camera."""
-    pixels, rays = problem.pixels, None
+    """Return the slots of all rows, with their viewing rays."""
+    pixels, cameras = problem.pixels, cameras_of(problem, state)
     if state.pixel_offset is not None:
         pixels = pixels.at[:, : state.pixel_offset.shape[1]].add(state.pixel_offset)
-    known = pinhole_parameters(cameras_of(problem, state))
-    if known is not None:
-        fx, fy, cx, cy = known
-        rays = ((pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy)
-    return Hosts(jnp.swapaxes(pixels, 1, 2), rays, state.inverse_depth, state.pixel_offset)
+    slots_last, known = jnp.swapaxes(pixels, 1, 2), pinhole_parameters(cameras)
+    if known is None:
+        rays = any_camera.rays_of(cameras.kind, cameras.of_all(problem.host_of_row), slots_last)
+        return Hosts(slots_last, rays, state.inverse_depth, state.pixel_offset)
+    fx, fy, cx, cy = known
+    rays_x, rays_y = (pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy
+    return Hosts(slots_last, (rays_x, rays_y), state.inverse_depth, state.pixel_offset)
 
 
 def motions_of(relative: jaxlie.SE3) -> Motions:
@@ -176,13 +179,16 @@ def places(problem: Problem) -> Place:
 def view_of(cameras: Cameras, hosts: Hosts, place: Place, motion: Motions) -> EdgeView:
     """Return the slots of a row, seen along the edge at `place` with that relative pose."""
     own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, place.row, keepdims=False), hosts)
-    fast, projection = None, None
-    known = pinhole_parameters(cameras)
-    if own.rays is not None and known is not None:
-        fast = pinhole.OneEdge(known, motion.rotation, motion.translation)
-        projection = pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, fast)
     free = 0 if hosts.offset is None else hosts.offset.shape[1]
-    return EdgeView(motion.relative, cameras, place.ends, own.pixels, own.inverse_depth, fast, projection, free)
+    motions = motion.rotation, motion.translation
+    seen = motion.relative, *motions, cameras, place.ends, own.pixels, own.inverse_depth
+    if isinstance(own.rays, any_camera.Rays):
+        target = cameras.of(place.ends[1])
+        return EdgeView(*seen, any_camera.project(target, own.rays, own.inverse_depth, *motions), free)
+    known = pinhole_parameters(cameras)
+    assert known is not None
+    edge = pinhole.OneEdge(known, *motions)
+    return EdgeView(*seen, (edge, pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, edge)), free)
 
 
 def edge_data(problem: Problem) -> EdgeData:

@@ -271,6 +271,12 @@ class Cameras(eqx.Module):
         own = self.parameters if self.group is None else self.parameters[self.group[keyframe]]
         return self.kind(own if step is None else own + step)
 
+    def of_all(self, keyframes: Int[Array, " h"]) -> Float[Array, "h k"]:
+        """Return the parameters of the cameras that took the keyframes."""
+        if self.group is None:
+            return jnp.broadcast_to(self.parameters, (len(keyframes), self.size))
+        return self.parameters[self.group[keyframes]]
+
     def along(
         self, ends: tuple[Int[Array, ""], Int[Array, ""]], steps: list[Array]
     ) -> tuple[AbstractCamera, AbstractCamera]:

@@ -110,6 +110,49 @@ def test_what_is_written_by_hand_is_what_is_derived(shape: float, camera: type[v
                 assert error < 1e-12, (name, number, error)
 
 
+@pytest.mark.parametrize("groups", [None, np.array([0, 1, 0])], ids=["one", "two"])
+@pytest.mark.parametrize(
+    ("camera", "lens"),
+    [
+        (vg.cameras.SquareRadialTangential, (-0.2, 0.05, 0.004, -0.003)),
+        pytest.param(vg.cameras.KannalaBrandt, (0.03, -0.01, 0.004, -0.001), marks=pytest.mark.long),
+    ],
+)
+def test_columns_with_any_camera_are_what_is_derived(
+    camera: type[vg.cameras.AbstractCamera], lens: tuple[float, ...], groups: np.ndarray | None
+) -> None:
+    # Proves energy and columns (with and without a correction) of points and lines, free pixels in the host and several
+    # cameras included, by chain rule and by automatic differentiation of the residual.
+    parameters = np.array([*SCENE.start_intrinsics, *lens])[-len(camera.names) :]
+    cameras = parameters if groups is None else np.stack([parameters, 1.05 * parameters])
+    scene = replace(SCENE, start_intrinsics=cameras).with_observations(pixel_sigma=0.5)
+    problem, state, _ = scene.pack(kernel=Cauchy(1.5), camera=camera, camera_of=groups)
+    state = eqx.tree_at(lambda s: s.pixel_offset, state, state.pixel_offset + 0.3)
+
+    @jax.jit
+    def both(problem: vg.Problem, state: vg.State, correction: jax.Array) -> Pairs:
+        ready = prepared(problem)
+        cameras, hosts = cameras_of(ready, state), hosts_of(ready, state)
+
+        def one(place: Place, motion: Any, data: Any) -> Pairs:
+            return [
+                pair
+                for term, seen in of_edge(ready, view_of(cameras, hosts, place, motion), data)
+                for pair in (
+                    (term.energy(seen), EdgeTerm.energy(term, seen)),
+                    (term.columns(seen, None), EdgeTerm.columns(term, seen, None)),
+                    (term.columns(seen, correction), EdgeTerm.columns(term, seen, correction)),
+                )
+            ]
+
+        return jax.vmap(one)(places(ready), motions_of(relative_poses(ready, state)), edge_data(ready))
+
+    for by_hand, derived in both(problem, state, jnp.asarray(0.7)):
+        assert bool(jnp.all(jnp.isfinite(by_hand)))
+        size = np.abs(derived).max(axis=(0, -1) if derived.ndim > 1 else 0, keepdims=True)
+        assert float((np.abs(by_hand - derived) / np.maximum(size, 1e-12)).max()) < 1e-11
+
+
 def test_the_prior_of_marginalisation_is_what_is_derived() -> None:
     # Proves `MarginalPrior.model`, pose by pose. Oracle: the derived one, which moves everything for every coordinate.
     _, state, _ = SCENE.pack()

@@ -24,7 +24,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.bundle.fast import pinhole
+from vggtgeo.bundle.fast import any_camera, pinhole
 from vggtgeo.bundle.fast.pinhole import Projection
 from vggtgeo.bundle.terms.term import (
     AbstractTerm,
@@ -43,16 +43,18 @@ Rows = tuple[Float[Array, " p"], ...]
 
 
 class EdgeView(eqx.Module):
-    """All slots of one edge's host, seen along the edge; `projection` only for the pinhole's fast path."""
+    """All slots of one edge's host, seen along the edge."""
 
     relative: jaxlie.SE3
+    rotation: Float[Array, "3 3"]
+    translation: Float[Array, "3"]
     cameras: Cameras
     ends: tuple[Int[Array, ""], Int[Array, ""]]
     """Keyframes `(i, j)`."""
     pixels: Float[Array, "2 p"]
     inverse_depth: Float[Array, " p"]
-    fast: pinhole.OneEdge | None
-    projection: Projection | None
+    projection: tuple[pinhole.OneEdge, Projection] | any_camera.Seen
+    """Of one pinhole for all keyframes, or of other cameras."""
     free_pixels: int = eqx.field(static=True, default=0)
     """Number of first slots whose pixel is an unknown."""
 
@@ -66,6 +68,30 @@ class EdgeView(eqx.Module):
         size = self.cameras.size
         return [shared[: lie.TANGENT], *(shared[at : at + size] for at in range(lie.TANGENT, self.size, size))]
 
+    @property
+    def projected(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Pixels of the slots in the target."""
+        if isinstance(self.projection, any_camera.Seen):
+            return self.projection.u, self.projection.v
+        edge, at = self.projection
+        fx, fy, cx, cy = edge.intrinsics
+        return fx * at.x + cx, fy * at.y + cy
+
+    def row(self, a: Float[Array, " p"], b: Float[Array, " p"]) -> tuple[list[Array], Array, list[Array]]:
+        """Return the derivatives of a row of residuals with image gradient `(a, b)`: by the shared coordinates, by
+        inverse depth, and by the pixel in the host, if it is an unknown.
+        """
+        if isinstance(self.projection, any_camera.Seen):
+            found = any_camera.row(self.rotation, self.translation, self.projection, a, b)
+            both = zip(found.target, found.host, strict=True)
+            one_camera = self.cameras.group is None
+            by_cameras = [j + i for j, i in both] if one_camera else [*found.target, *found.host]
+            return [*found.motion, *by_cameras], found.depth, found.pixel if self.free_pixels else []
+        *shared, depth = pinhole.row(*self.projection, a, b)
+        # The centre moves the pixel in the target and, the other way, the ray in the host.
+        pixel = [a - shared[_CENTRE], b - shared[_CENTRE + 1]] if self.free_pixels else []
+        return self.tied(shared), depth, pixel
+
     def tied(self, rows: list[Array]) -> list[Array]:
         """Convert derivatives by the pinhole's four parameters to the camera's: for one focal length, add both."""
         if self.cameras.kind is Pinhole:
@@ -76,10 +102,15 @@ class EdgeView(eqx.Module):
     def slots(self, first: int, count: int) -> EdgeView:
         """Return the view of some of the slots."""
         part = lambda leaf: leaf[..., first : first + count]
-        projection = jax.tree.map(part, self.projection)
+        of_slots: tuple[pinhole.OneEdge, Projection] | any_camera.Seen
+        if isinstance(self.projection, any_camera.Seen):
+            of_slots = jax.tree.map(part, self.projection)
+        else:
+            of_slots = self.projection[0], jax.tree.map(part, self.projection[1])
         own = part(self.pixels), part(self.inverse_depth)
         free = min(max(self.free_pixels - first, 0), count)
-        return EdgeView(self.relative, self.cameras, self.ends, *own, self.fast, projection, free)
+        motion = self.relative, self.rotation, self.translation
+        return EdgeView(*motion, self.cameras, self.ends, *own, of_slots, free)
 
 
 class Gradient(NamedTuple):
@@ -252,8 +283,9 @@ _WITH_ENTRIES = 3
 class ImageTerm(EdgeTerm):
     """A residual that is an affine function of the landmark's pixel in the target: a match, a line.
 
-    With one pinhole for all keyframes, its derivatives are those of `fast/pinhole.py`, written by hand; with other
-    cameras they use automatic differentiation. The tests check that both are equal.
+    With one pinhole for all keyframes, all derivatives are those of `fast/pinhole.py`, written by hand. With other
+    cameras, first derivatives are those of `fast/any_camera.py`, and exact second ones are automatic. The tests check
+    that all are equal to automatic ones.
 
     Fields:
         weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
@@ -287,39 +319,32 @@ class ImageTerm(EdgeTerm):
         return jnp.stack(self.image_residual(*view.projected))
 
     def energy(self, view: EdgeView) -> Float[Array, ""]:
-        if view.fast is None or view.projection is None:
-            return super().energy(view)
-        return robust_energy(self.kernel, self.weights, self._image(view, view.projection)[0])
+        return robust_energy(self.kernel, self.weights, self._image(view)[0])
 
     def columns(self, view: EdgeView, correction: Float[Array, ""] | None) -> Float[Array, "c mp"]:
-        if view.fast is None or view.projection is None:
-            return super().columns(view, correction)
-        residual, normal = self._image(view, view.projection)
+        residual, normal = self._image(view)
         scale = reweighting(self.kernel, self.weights, squared_norm(residual), correction)
         along = [scale.share * sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]
         parts = []
         for i, r in enumerate(residual):
             a, b = (scale.root * (of[i] - pulled * r) for of, pulled in zip(normal, along, strict=True))
-            row = pinhole.row(view.fast, view.projection, a, b)
-            # The centre moves the pixel in the target and, the other way, the ray in the host.
-            own = [a - row[_CENTRE], b - row[_CENTRE + 1]] if view.free_pixels else []
-            parts.append(jnp.stack([*view.tied(row[:-1]), scale.root * r / scale.soft, row[-1], *own]))
+            shared, depth, pixel = view.row(a, b)
+            parts.append(jnp.stack([*shared, scale.root * r / scale.soft, depth, *pixel]))
         return jnp.concatenate(parts, 1)
 
     def gradient(self, view: EdgeView) -> Gradient:
-        if view.fast is None or view.projection is None:
+        if isinstance(view.projection, any_camera.Seen):
             return super().gradient(view)
-        a, b = self._force(view, view.projection)
-        found = pinhole.energy_gradient(view.fast, view.projection, a, b)
+        found = pinhole.energy_gradient(*view.projection, *self._force(view))
         return Gradient(
             jnp.stack(view.tied(list(found.shared))), found.depth, found.pixel if view.free_pixels else None
         )
 
     def model(self, view: EdgeView) -> LocalModel:
-        if view.fast is None or view.projection is None:
+        if isinstance(view.projection, any_camera.Seen):
             return super().model(view)
-        edge, at = view.fast, view.projection
-        entries, normals = self._image(view, at)
+        edge, at = view.projection
+        entries, normals = self._image(view)
         squared = self.weights * squared_norm(entries)
         pull = self.weights * self.kernel.weight(squared)
         bend = 2 * self.weights**2 * self.kernel.curvature(squared)
@@ -358,8 +383,8 @@ class ImageTerm(EdgeTerm):
         derivatives: residuals, their derivatives by the projected pixel, and by shared coordinates and inverse depth.
         weights: `w rho'` and `2 w^2 rho''`. third: `P`.
         """
-        assert view.fast is not None
-        assert view.projection is not None
+        assert not isinstance(view.projection, any_camera.Seen)
+        edge, at = view.projection
         (residual, normal, rows), (pull, bend) = derivatives, weights
         centre = slice(_CENTRE, _CENTRE + 2)
         # The centre moves the pixel in the target and, the other way, the ray in the host.
@@ -368,8 +393,7 @@ class ImageTerm(EdgeTerm):
         force, gradient = pull * jnp.sum(normal * residual, 1), pull * of_pixel
         drawn = (pull * along).at[centre].add(-force)
         extra = [
-            pinhole.second_order_of_pixel(view.fast, view.projection, (force[0], force[1]), gradient[axis], axis)
-            for axis in range(2)
+            pinhole.second_order_of_pixel(edge, at, (force[0], force[1]), gradient[axis], axis) for axis in range(2)
         ]
         mixed = (
             pull * jnp.einsum("amp,mkp->kap", pixel, rows)
@@ -387,24 +411,22 @@ class ImageTerm(EdgeTerm):
         )
         return PixelModel(coupled, blocks)
 
-    def _image(self, view: EdgeView, at: Projection) -> tuple[Rows, tuple[Rows, Rows]]:
+    def _image(self, view: EdgeView) -> tuple[Rows, tuple[Rows, Rows]]:
         """Return residuals and their derivatives by the projected pixel's coordinates, row by row."""
-        assert view.fast is not None
-        fx, fy, cx, cy = view.fast.intrinsics
-        pixel = (fx * at.x + cx, fy * at.y + cy)
+        pixel = view.projected
 
         def each(u: Array, v: Array) -> Rows:
             return jax.vmap(lambda data, u, v: tuple(self.holding(data).image_residual(u, v)), in_axes=-1)(
                 self.data(), u, v
             )
 
-        one, zero = jnp.ones_like(at.x), jnp.zeros_like(at.x)
+        one, zero = jnp.ones_like(pixel[0]), jnp.zeros_like(pixel[0])
         residual, right = jax.jvp(each, pixel, (one, zero))
         return residual, (right, jax.jvp(each, pixel, (zero, one))[1])
 
-    def _force(self, view: EdgeView, at: Projection) -> tuple[Array, Array]:
+    def _force(self, view: EdgeView) -> tuple[Array, Array]:
         """Return `w rho' r` on the projected pixel; zero for absent observations."""
-        residual, normal = self._image(view, at)
+        residual, normal = self._image(view)
         pull = self.weights * self.kernel.weight(self.weights * squared_norm(residual))
         along = [sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]
         return pull * along[0], pull * along[1]
