@@ -4,8 +4,8 @@
     .venv/bin/python benchmarks/stage_times.py $D/redkitchen $D/icl-office $D/corridor-office $D/building-walk
     .venv/bin/python benchmarks/stage_times.py demo
 
-A column a run: c for cold or w for warm, then d with depth, r without, u without depth and calibration (`--runs d r
-u`). Stages marked "own thread" run beside the others; "processor" counts all threads, "memory" is the peak. `--end N`
+A column a run: d with depth, r without, u without depth and calibration (`--runs d r u`). Stages are those of the warm
+run; with a star they run in a thread beside the others. "processor" counts all threads, "memory" is the peak. `--end N`
 takes the first N frames. Clips are not mapped densely, the demo is.
 """
 
@@ -28,6 +28,10 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.jax_environment import jax_environment
 
+COUNTS = ("frames", "keyframes")
+WHOLE = ("whole", "processor", "memory, GB")
+BESIDE = " (own thread)"
+"""Ends the name of a stage that runs beside the others."""
 RUNS = {"d": "with depth", "r": "without depth", "u": "without depth, camera unknown"}
 
 
@@ -37,13 +41,13 @@ def main() -> None:
     if options.one:
         print(json.dumps(_summary(options.clips[0], options.one, options.end)))
         return
+    columns = {}
     for clip in options.clips:
-        columns = {}
         for kind in options.runs:
             with tempfile.TemporaryDirectory() as cache:
-                for state in ("c", "w"):
-                    columns[state + kind] = _measured(clip, kind, cache, options.end)
-        _print(clip, columns)
+                cold, warm = (_measured(clip, kind, cache, options.end) for _ in range(2))
+            columns[f"{Path(clip).name}, {kind}"] = warm | {f"{name}, cold": cold[name] for name in WHOLE}
+    _print(columns)
 
 
 def _summary(clip: str, kind: str, end: int | None) -> dict[str, Any]:
@@ -69,14 +73,8 @@ def _measured(clip: str, kind: str, cache: str, end: int | None) -> dict[str, fl
     summary = json.loads(printed.splitlines()[-1])
     stages: dict[str, float] = summary["seconds_by_stage"]
     inside = stages.pop("all")
-    counts = {"frames": summary["frames"], "keyframes": summary["keyframes"]}
-    ends = {
-        "imports, writing": whole - inside,
-        "whole": whole,
-        "processor": processor,
-        "memory, GB": summary["peak_memory_gb"],
-    }
-    return {**counts, **stages, **ends}
+    ends = dict(zip(WHOLE, (whole, processor, summary["peak_memory_gb"]), strict=True))
+    return {**{name: summary[name] for name in COUNTS}, **stages, "imports, writing": whole - inside, **ends}
 
 
 def _processor() -> float:
@@ -84,14 +82,18 @@ def _processor() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _print(clip: str, columns: dict[str, dict[str, float]]) -> None:
-    stages = list(dict.fromkeys(name for column in columns.values() for name in column))
-    last = ["imports, writing", "whole", "processor", "memory, GB"]
-    print(f"\n| {Path(clip).name} | {' | '.join(columns)} |\n|---" + "|---" * len(columns) + "|")
-    for name in [*(stage for stage in stages if stage not in last), *last]:
-        digits = 0 if name in ("frames", "keyframes") else 1
-        row = [f"{column.get(name, 0):.{digits}f}" for column in columns.values()]
-        print(f"| {name} | {' | '.join(row)} |", flush=True)
+def _print(columns: dict[str, dict[str, float]]) -> None:
+    last = [*WHOLE, *(f"{name}, cold" for name in WHOLE)]
+    names = dict.fromkeys(name.removesuffix(BESIDE) for column in columns.values() for name in column)
+    print(f"| seconds | {' | '.join(columns)} |\n|---" + "|---" * len(columns) + "|")
+    for name in [*(stage for stage in names if stage not in last), *last]:
+        row = []
+        for column in columns.values():
+            star = "*" if name + BESIDE in column else ""
+            value = column.get(name, 0.0) + column.get(name + BESIDE, 0.0)
+            row.append(f"{value:.0f}" if name in COUNTS else f"{value:.1f}{star}")
+        if any(cell.strip("*") != "0.0" for cell in row):
+            print(f"| {name} | {' | '.join(row)} |")
 
 
 def _options() -> argparse.Namespace:
