@@ -47,6 +47,7 @@ def rendered_depth(pose: np.ndarray, intrinsics: np.ndarray, views: Sequence[Pos
         relative = (pose @ rigid.invert(view.pose)).astype(np.float32)
         local = local @ relative[:3, :3].T + relative[:3, 3]
         inside, rows, columns = pinhole.visible(local, intrinsics, (height, width))
+        # A z-buffer: the nearest surface hides those behind it.
         np.minimum.at(coarse, (rows // COARSE, columns // COARSE), local[inside, 2])
     crude = np.repeat(np.repeat(coarse, COARSE, 0), COARSE, 1)[:height, :width]
     depth = np.where(np.isfinite(crude), crude, np.float32(np.nan))

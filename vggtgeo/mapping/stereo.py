@@ -138,7 +138,9 @@ def _planes(points: np.ndarray, photo: Photo, count: int) -> np.ndarray | None:
     inside, _, _ = pinhole.visible(local, photo.intrinsics, (photo.grey.shape[0], photo.grey.shape[1]))
     if np.count_nonzero(inside) < MIN_POINTS:
         return None
+    # Quantiles, since a few points are outliers; the margins leave room for surfaces without key points.
     low, high = np.quantile(1.0 / local[inside, 2], [0.02, 0.98])
+    # Equal steps in inverse depth are about equal steps in the image.
     return np.linspace(0.6 * low, 1.5 * high, count)
 
 

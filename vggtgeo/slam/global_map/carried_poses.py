@@ -42,6 +42,7 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             between = [] if gross else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
             span = max(times[row] - times[last], 1e-9)
             for k in between:
+                # Along the screw motion of the change, in proportion to time.
                 poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
         last = row
     return times, by_both(slam.map, slam.frames, poses)

@@ -110,8 +110,10 @@ def align(
     # Tukey's biweight, wide enough for a pose that is off by a few standard deviations.
     scale = max(float(np.median(np.abs(residual / sigma))) * 4.7, 3.0)
     weight = np.maximum(1 - (residual / sigma / scale) ** 2, 0.0) ** 2 / sigma**2
+    # Neighbouring depths share their errors, so the information of a surface does not grow with its number of pixels.
     weight *= min(effective / len(one), 1.0)
     (x, y, z), (a, b, c) = points.take(seen, 1), n
+    # Row of `n . (T p - q)` over the left tangent: `[n, p x n]`.
     jacobian = np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
     weighted = jacobian * weight
     return Alignment(first, second, weighted @ jacobian.T, weighted @ residual, len(one))
@@ -159,6 +161,7 @@ def _normals(points: np.ndarray) -> np.ndarray:
     normal = rigid.cross(down, right)
     with np.errstate(invalid="ignore", divide="ignore"):
         z = points[1:-1, 1:-1, 2]
+        # A difference across a depth jump is no tangent of either surface.
         smooth = (np.abs(right[..., 2]) < 0.1 * z) & (np.abs(down[..., 2]) < 0.1 * z)
         normal = normal / np.linalg.norm(normal, axis=2, keepdims=True)
     normals[1:-1, 1:-1] = np.where(smooth[..., None], normal, np.nan)

@@ -34,6 +34,7 @@ def frame_motions(slam: Slam) -> np.ndarray:
     tracked = np.array([record.tracked for record in slam.frames])
     near = lambda other: tracked[other] & (np.abs(times[other] - times) <= MOST_APART * frame_interval(slam))
     before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(times) - 1)
+    # A missing neighbour is replaced by the frame itself: a one-sided difference, or none.
     before, after = np.where(near(before), before, rows), np.where(near(after), after, rows)
     seconds = (times[after] - times[before])[:, None]
     still = np.zeros((len(times), lie.TANGENT))

@@ -44,6 +44,7 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     if not rows:
         return times, poses
     motions = _motions(slam)
+    # With metric depth the errors that frames share are in the tracked information already.
     as_one = 1.0 if slam.metric else SHARED_ERRORS
 
     def placed(row: int) -> np.ndarray:
@@ -123,6 +124,7 @@ def _resected(
         return pose
     current, before = pose, _energy(points, pixels, pose, intrinsics)
     for number in range(STEPS):
+        # Graduated non-convexity: from a pose that is off, right matches look like outliers to the final width.
         width = max(WIDEST / 2**number, WIDTH)
         local = points @ current[:3, :3].T + current[:3, 3]
         front = local[:, 2] > NEAREST
@@ -138,6 +140,7 @@ def _resected(
         current = rigid.moved(current[None], step[None])[0]
         if width == WIDTH and np.abs(step).max() < SETTLED:
             break
+    # A redescending kernel has other minima: a step away from the tracked pose must lower the energy.
     return rigid.orthonormal(current) if _energy(points, pixels, current, intrinsics) < before else pose
 
 

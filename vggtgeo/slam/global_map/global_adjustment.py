@@ -95,6 +95,7 @@ class _Whole:
             fixed_pose=np.isin(np.arange(len(slam.keyframes)), slam.map.roots),
             terms=_terms(slam, factors, self.surfaces, self.shape, settings),
         )
+        # Surfaces were unprojected with the current intrinsics and would hold them.
         problem = without_surfaces(adjustment.problem) if finds_camera else adjustment.problem
         problem, gauge = with_one_gauge(problem, adjustment.initial, len(slam.keyframes), slam.metric)
         notes = gauge_notes(gauge, adjustment.keyframes, "global adjustment")
@@ -113,6 +114,8 @@ class _Whole:
             return slam, self
         camera = replace(self.camera, mean=slam.intrinsics)
         if not slam.camera.calibrated:
+            # Once estimated with all its matches, the camera must not be pulled back by motions tracked with the old
+            # one.
             held = KNOWN_SIGMA * slam.intrinsics[0]
             camera = replace(camera, sigma=np.full(4, held), kind=_of_pixels(slam.intrinsics))
         return slam, replace(self, edges=_edges(slam), surfaces=_surfaces(slam), camera=camera)
@@ -266,6 +269,7 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
 def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
     """A word on distortion that is sure and moves corners of the image by more than the noise of matches."""
     (k1, sigma), focal = found.distortion, float(found.given[0])
+    # Displacement of a corner at normalised radius `r`: `f k1 r^3`.
     warp = abs(k1) * (float(np.hypot(shape[0], shape[1])) / 2 / focal) ** 3 * focal
     if abs(k1) < SURE * sigma or warp < MOST_WARP:
         return []

@@ -62,6 +62,7 @@ def scaled_piece(slam: Slam, ratio: float, inside: Callable[[int], bool]) -> Sla
     frames = tuple(scaled_record(record, ratio) if inside(record.reference) else record for record in slam.frames)
     own = lambda factor: all(inside(number) for number in factor.keyframes)
     factors = tuple(scaled_factor(factor, ratio) if own(factor) else factor for factor in slam.map.factors)
+    # The baseline fixed the old scale; the rest of the map fixes the new one.
     kept = tuple(f for f in factors if not (isinstance(f, MeasuredBaseline) and own(f)))
     velocity = longer(slam.tracker.velocity, ratio) if inside(len(keyframes) - 1) else slam.tracker.velocity
     return replace(
@@ -84,6 +85,7 @@ def _joined(slam: Slam, place: Track, held: tuple[int, ...]) -> Slam:
     held: members of the window that stay where they are; of free scale two, which hold the unit.
     """
     inside, newest = newest_piece(slam), slam.keyframes[-1]
+    # World -> camera poses change their world from the right.
     carried = rigid.invert(newest.pose) @ place.pose
     keyframes = tuple(
         replace(keyframe, pose=rigid.orthonormal(keyframe.pose @ carried)) if inside(keyframe.number) else keyframe

@@ -71,6 +71,8 @@ def _largest_growth(drifts: Sequence[float], gate: float) -> float:
     """Upper confidence limit of the variance of odometry over that of independent motions, at least 1, at the
     significance level of the gate. drifts: squared Mahalanobis distances that clusters measured, growth 1.
     """
+    # The sum of the distances over the variance is chi-square: its lower quantile gives the upper limit of the
+    # variance.
     level = chi_square.sf(gate, 6)
     return float(max(np.sum(drifts) / chi_square.ppf(level, 6 * len(drifts)), 1.0))
 
@@ -104,6 +106,7 @@ class _Tests:
         """Of each loop from that of the `taken` ones whose ends are nearest; left out where no way leads to any."""
         if not len(taken):
             return np.zeros(0)
+        # Number of keyframes stands for the length of the way, and so for the drift on it.
         apart = np.abs(self.ends[loops, None] - self.ends[taken]).sum(2)
         roots = self.odometry.root[self.ends]
         comparable = (roots[loops, None] == roots[taken]).all(2)

@@ -77,6 +77,7 @@ def _by_estimate(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]
                 continue
             share = overlap(samples[first.number], second, slam.intrinsics)
             if share > LEAST_VISIBLE:
+                # Matching fails with the angle between views: a radian costs as much as the whole overlap.
                 scored.append((share - turned, first.number))
         chosen += [
             (number, second.number) for _, number in sorted(scored, reverse=True)[: settings.refinement.loop_candidates]
@@ -125,6 +126,7 @@ def verify(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarr
     pair = Pair(first.number, second.number, agreed, LineMatches(empty, empty, np.zeros(0)))
     relative = rigid.orthonormal(guess.pose @ rigid.invert(first.pose))
     information = pose_information(guess.pose, points[guess.inliers], intrinsics, PIXEL_SIGMA)
+    # Covariances add: matching noise, and what all matches share.
     floor = np.diag(np.repeat(FLOOR, 3) ** 2)
     information = np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + floor)
     ratio = ratio_of_units(first, second, agreed.select(agreed.index_j >= 0), relative, intrinsics)

@@ -86,6 +86,7 @@ def solve_pose_graph(graph: PoseGraph) -> Untangled:
     count = len(graph.poses)
     padding = padded_count(count) - count
     motions = RelativePose(**relative_pose_rows(loosened, count + padding))
+    # Rounded up to a multiple, so that graphs of about the same size share a compiled program.
     room = -(-max(len(graph.loops), 1) // ROOM) * ROOM
     loops = LoopClosure(**relative_pose_rows(graph.loops, room), kernel=Cauchy(jnp.asarray(TIE_WIDTH)))
     problem, initial, _ = pack(
@@ -93,6 +94,7 @@ def solve_pose_graph(graph: PoseGraph) -> Untangled:
         rigid.to_quaternion(np.concatenate([graph.poses, np.tile(np.eye(4), (padding, 1, 1))])),
         np.array([1.0, 1.0, 0.0, 0.0]),
         np.zeros(0),
+        # Padding poses are fixed: without factors they would make the system singular.
         fixed_pose=np.concatenate([graph.held, np.ones(padding, bool)]),
         fixed_intrinsics=True,
         terms=(motions, loops),
@@ -135,6 +137,7 @@ def drift_variance(graph: PoseGraph) -> float:
         distances.append(off @ np.linalg.solve(drift + np.linalg.inv(loop.information), off))
     if not distances:
         return 1.0
+    # At least 1: few loops that agree by chance do not make odometry better than it states.
     return float(max(np.median(distances) / chi_square.ppf(0.5, 6), 1.0))
 
 

@@ -88,6 +88,7 @@ def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
     if not slam.metric:
         moved, turned = np.sqrt(SHARED_ERRORS) * moved, np.sqrt(SHARED_ERRORS) * turned
     turn = _unmeasured_turn(slam)
+    # Both move a place in proportion to its distance from the first pose.
     scale = np.hypot(DEPTH_SCALE if slam.metric else FREE_SCALE, turn)
     moved = np.hypot(moved, scale * np.linalg.norm(places - places[:1], axis=1))
     speed, rate = _speeds(times, poses, places)
@@ -95,6 +96,7 @@ def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
     sheared = rate * median_depths(slam)[[record.reference for record in records]]
     moved = np.sqrt(moved**2 + MOMENT**2 * (speed**2 + sheared**2))
     angles = _angles(poses)
+    # A rotation by `a` turned by a small `q` differs from itself by `2 q sin(a / 2)`.
     shared = np.hypot(CALIBRATION * angles, turn * 2 * np.sin(angles / 2))
     turned = np.sqrt(turned**2 + MOMENT**2 * rate**2 + shared**2)
     return PoseUncertainty(times, moved, turned)
@@ -149,6 +151,7 @@ def keyframe_sigma(problem: Problem, state: State, keyframes: int) -> np.ndarray
         every = jnp.arange(problem.num_keyframes)
         variances, found = sigma_jit(problem, state, solver, every)
         worst, factor = np.asarray(variances, np.float64), float(found)
+    # The variance factor only enlarges: few residuals, or residuals of a good fit, do not prove a smaller noise.
     sigma = np.sqrt(np.maximum(worst[:keyframes] * max(factor, 1.0), 0.0))
     return sigma if np.isfinite(sigma).all() else None
 
@@ -166,6 +169,7 @@ def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.
         return np.full((len(asked), 2), np.nan), 1.0
     free = np.flatnonzero(np.asarray(system.free))
     diagonal = information.diagonal()[free]
+    # Balanced to a unit diagonal, so that `FLOOR` is relative to each coordinate.
     unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scale = sp.diags_array(unit)
     # What nothing determines comes out as very uncertain, where the factor of a singular matrix would be an error.

@@ -61,6 +61,7 @@ def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     measured = (*closing, *(loop.motion for loop in loops))
     graph = _graph(slam, motions, measured, _units(slam, motions, loops))
     tracked = graph.motions if slam.metric else [motion.of_free_length() for motion in graph.motions]
+    # Before the solve: with several wrong loops even a robust kernel may settle on their consensus.
     sure = consistent_loops(graph.loops, tracked, BELIEF, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
@@ -99,6 +100,7 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
     for number in range(1, len(slam.keyframes)):
         if number in tree:
             tie = tree[number]
+            # Adjusted poses are more accurate than the tracked motion, unless an adjustment went wrong.
             agrees = distance(tie, poses) < BELIEF
             motions.append(replace(tie, pose=between(tie.first, tie.second)) if agrees else tie)
         elif (number - 1, number) in matched:

@@ -58,5 +58,6 @@ def solve_units(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios:
         logs = np.asarray(spsolve(normal, design.T @ target))
         logs -= logs[0]
         residual = (logs[second] - logs[first] - measured) / sigma
+        # Cauchy's weight, for the measured ratios only: nothing but them contradicts the drift model.
         weight[len(motions) :] = 1.0 / (1.0 + (residual[len(motions) :] / width) ** 2)
     return np.exp(logs)

@@ -217,6 +217,7 @@ def _aligned(
         level = jnp.maximum(carry.stage, 0)
         hessian, gradient, terms = at(carry.motion, level)
         diagonal = jnp.diag(hessian)
+        # Light Levenberg-Marquardt damping: the information that is returned is that of the undamped system.
         damped = hessian + jnp.diag(1e-3 * diagonal + 1e-9 * diagonal.sum() + 1e-9)
         change = -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(damped), True), gradient)
         count = carry.number + 1
@@ -258,6 +259,7 @@ def _brightness(edges: _Samples, target: _Target, level: jax.Array, motion: jax.
     value, reference = jnp.where(seen, value, 0), jnp.where(seen, edges.values[level], 0)
     both, square = value @ reference, reference @ reference
     correlation = both / (jnp.sqrt((value @ value) * square) + 1e-9)
+    # Ratio of the exposures by least squares, in closed form.
     exposure = jnp.clip(both / (square + 1e-9), 0.6, 1.7)
     along_x, along_y = fx * dx / z, fy * dy / z
     by_point = jnp.stack([along_x, along_y, -(along_x * x[0] + along_y * x[1]) / z])
@@ -280,6 +282,7 @@ def _planes(surface: _Samples, target: _Target, motion: jax.Array) -> _Term:
     cosine = jnp.sum(cell[3:6] * (motion[:3, :3].astype(jnp.float32) @ normals), 0)
     # A cell without a surface has no normal: the cosine of zero is below any level.
     seen = inside & (jnp.abs(residual) < FARTHEST) & (cosine > MIN_COSINE)
+    # Unseen samples divide by 1, not by zero.
     noise = jnp.where(seen, jnp.hypot(sigma, cell[6]), 1)
     return _Term(_by_motion(x, cell[3:6] / noise), residual / noise, seen)
 
@@ -287,6 +290,7 @@ def _planes(surface: _Samples, target: _Target, motion: jax.Array) -> _Term:
 def _by_motion(points: jax.Array, by_point: jax.Array) -> jax.Array:
     """The derivative by the motion, given that by the point it moves, both [3, m]: rotation turns it, `x cross row`."""
     (x, y, z), (a, b, c) = points, by_point
+    # Row of the left tangent, translation first: `[g, x cross g]`.
     return jnp.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
 
 
@@ -301,9 +305,11 @@ def _weighted(term: _Term, of: _Agreement, least: jax.Array, spread: jax.Array) 
     """Derivatives and residual [7, m] of a term, with their weights and without; zero where nothing is in view."""
     used = term.seen & of.enough
     rows = jnp.where(used, jnp.concatenate([term.jacobian, term.residual[None]]), 0)
+    # 1.4826: the standard deviation of a normal distribution over its median absolute deviation.
     usual = 1.4826 * _median(jnp.abs(term.residual), used, of.number)
     scale = jnp.where(of.enough, jnp.maximum(usual, least), 1)
     share = rows[6] / (TUKEY * scale)
+    # `spread` neighbouring samples share one error, so each has that part of its information.
     weight = jnp.maximum(1 - share * share, 0) ** 2 / (scale**2 * spread)
     return rows * weight, rows
 
@@ -312,6 +318,7 @@ def _median(values: jax.Array, used: jax.Array, number: jax.Array) -> jax.Array:
     """The middle one of non-negative values [m], the upper one of an even number; digit by digit, as sorting takes
     25 times as long.
     """
+    # Non-negative floats are ordered as their bit patterns, so the median is found by bisection of the bits.
     digits = jnp.where(used, lax.bitcast_convert_type(values, jnp.int32), jnp.iinfo(jnp.int32).max)
 
     def longer(place: jax.Array, found: jax.Array) -> jax.Array:

@@ -111,6 +111,7 @@ def _pyramid(gray: np.ndarray) -> tuple[np.ndarray, ...]:
     levels = []
     for level in range(LEVELS):
         image = _shrink(gray, 2**level)
+        # A high-pass filter, since exposure and shading change the mean.
         value = image - cv2.GaussianBlur(image, (0, 0), BACKGROUND)
         dx = cv2.Scharr(value, cv2.CV_32F, 1, 0, scale=1 / 32)
         dy = cv2.Scharr(value, cv2.CV_32F, 0, 1, scale=1 / 32)
@@ -132,6 +133,7 @@ def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.n
     safe = np.maximum(share, 1e-6)
     mean, square = mean / safe, square / safe
     spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
+    # A block across a depth jump has a mean on neither surface.
     good = (share >= 0.5) & (spread < 0.05 * mean)
     cells = np.where(good, 1.0 / np.maximum(mean, 1e-6), np.nan).astype(np.float32)
     noise = _zero_where(~known, np.array(sigma[:height, :width], np.float32))
@@ -184,6 +186,7 @@ def _edge_samples(levels: tuple[np.ndarray, ...], cells: np.ndarray, intrinsics:
     """
     finest = levels[0]
     strength = cv2.magnitude(*(np.ascontiguousarray(finest[..., side]) for side in (1, 2)))
+    # One sample a cell spreads them over the image, as a detailed object would otherwise take them all.
     height, width = (side // EDGE_CELL * EDGE_CELL for side in strength.shape)
     blocks = strength[:height, :width].reshape(height // EDGE_CELL, EDGE_CELL, width // EDGE_CELL, EDGE_CELL)
     flat = blocks.transpose(0, 2, 1, 3).reshape(height // EDGE_CELL, width // EDGE_CELL, -1)
@@ -202,6 +205,7 @@ def _edge_samples(levels: tuple[np.ndarray, ...], cells: np.ndarray, intrinsics:
     points = pinhole.rays(pixels, intrinsics) * z[:, None]
     values = np.zeros((LEVELS, len(good)), np.float32)
     for number, level in enumerate(levels):
+        # Pixel centres are integers, so the image begins at -0.5 at every level.
         x, y = ((pixels + 0.5) / 2**number - 0.5).astype(np.float32).T
         value = np.ascontiguousarray(level[..., 0])
         if len(x):

@@ -181,6 +181,7 @@ def _changed(gradients: list[np.ndarray], lengths: list[np.ndarray], where: np.n
 
 def _gradient(grey: np.ndarray) -> np.ndarray:
     """By x and y, grey levels a pixel, float32 [2, h, w]."""
+    # Derivatives amplify the noise of single pixels.
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
     return np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1 - axis, axis, ksize=3, scale=0.125) for axis in (0, 1)])
 

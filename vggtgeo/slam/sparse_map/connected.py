@@ -22,6 +22,7 @@ def piece_of(known: Map) -> np.ndarray:
     graph = coo_array((np.ones(len(first)), (first, second)), (count, count))
     _, label = connected_components(graph, directed=False)
     _, start, inverse = np.unique(label, return_index=True, return_inverse=True)
+    # Rank of each piece by its first keyframe: scipy's labels have no documented order.
     return np.asarray(np.argsort(np.argsort(start))[inverse])
 
 

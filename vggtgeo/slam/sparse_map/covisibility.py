@@ -116,6 +116,8 @@ def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Di
     )
     known = points.index_j >= 0
     slots = points.index_j[known]
+    # To first order both images move alike around a match, so the sub-pixel shift in one is that in the other,
+    # reversed.
     refined = points.pixels_j[known] - keyframes[pair.second].features.pixels[slots]
     backward = Directed(
         *(pair.second, pair.first, slots, points.pixels_i[known] - refined, points.confidence[known]),
@@ -132,6 +134,7 @@ def _consistent(points: PointMatches, first: Keyframe, relative: np.ndarray, int
     inverse = first.points.inverse_depth[points.index_i]
     ray = pinhole.rays(points.pixels_i, intrinsics)
     length, focal = float(np.linalg.norm(relative[:3, 3])), float(intrinsics[0])
+    # A depth too uncertain to predict the pixel within the gate would reject right matches.
     known = first.points.known_for(length, focal, REPROJECTION_GATE / GATE_SIGMA)[points.index_i]
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
     off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)

@@ -74,6 +74,8 @@ class MeasuredRelativePose:
         if self.recorded:
             return self
         length = np.append(FREE_LENGTH * self.pose[:3, 3], np.zeros(3))
+        # A rank-one addition along the translation: its length becomes uncertain, its direction and the rotation stay
+        # known.
         noise = np.linalg.inv(self.information) + np.outer(length, length)
         return replace(self, information=np.linalg.inv(noise))
 
@@ -111,6 +113,7 @@ def factor_terms(
     terms = []
     for kind, room in capacity.items():
         own = [factor for factor in inside if isinstance(factor, kind)]
+        # The newest factors are those between the newest keyframes, which need them most.
         terms.append(makers[kind](own[max(len(own) - room, 0) :], places, room))
     return tuple(terms)
 
@@ -124,6 +127,7 @@ def surface_term(
     at = jnp.asarray(rigid.to_quaternion(relative))
     measured, root = _quadratic_jit(at, jnp.asarray(hessians), jnp.asarray(gradients))
     first, second = np.asarray(pairs, int).reshape(-1, 2).T
+    # A zero Hessian has no minimum: its `measured` pose is a placeholder.
     aligned = np.any(hessians != 0, (1, 2)).astype(np.float64)
     return SurfaceAlignment(
         first=jnp.asarray(first, jnp.int32),
@@ -189,6 +193,7 @@ def _roots(information: Sequence[np.ndarray], size: int, room: int) -> Array:
     """Square roots `R' R` of information matrices, which may be singular."""
     whole = np.zeros((room, size, size))
     if len(information):
+        # Not Cholesky: the information of a motion may be singular.
         values, vectors = np.linalg.eigh(np.asarray(information))
         whole[: len(information)] = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
     return jnp.asarray(whole)

@@ -35,6 +35,7 @@ def ratio_of_units(
     ahead = depth > 0
     if np.count_nonzero(ahead) < MIN_SHARED:
         return None
+    # Ratios are symmetric in the logarithm: exchanging the keyframes changes the sign only.
     logs = np.log(depth[ahead] * after[ahead])
     middle = float(np.median(logs))
     # Standard error of a median: 1.25 sigma / sqrt(n), sigma from the median absolute deviation.
@@ -70,5 +71,6 @@ def scaled_motion(motion: MeasuredRelativePose, ratio: float) -> MeasuredRelativ
 
 def scaled_information(information: np.ndarray, ratio: float) -> np.ndarray:
     """The information [6, 6], translation first, of a motion that is `ratio` times as long."""
+    # Information is 1 / unit^2 in the translation, and without unit in the rotation.
     by = np.repeat([1.0 / ratio, 1.0], 3)
     return np.asarray(information * np.outer(by, by))

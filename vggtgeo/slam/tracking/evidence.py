@@ -91,6 +91,7 @@ class Evidence:
     @property
     def plausible(self) -> bool:
         """Whether the motion so far allows the step; true where there is no prediction."""
+        # NaN (no prediction) compares false, so the step is plausible then.
         return not self.chi2 > STEP_GATE
 
     @property
@@ -146,11 +147,15 @@ class Evidence:
     def accepted(self) -> bool:
         """Whether the pose is to be believed."""
         if self.by_rays or self.recorded:
+            # Without depth there is neither a surface nor a picture to compare: only the points can confirm the pose.
             return self.recorded or self.points_strong
         if self.sigma_translation > LARGEST_SIGMA * self.metre or self.correlation < CONTRADICTION:
             return False
         if not self.plausible:
+            # A step against the prediction may be a jerk or a wrong pose, so two independent kinds of evidence must
+            # confirm it.
             return self.points_strong and self.dense_fair
+        # A NaN correlation (nothing to compare) does not contradict.
         fair = self.points_fair and not self.correlation < LEAST_CORRELATION
         by_lines = self.lines_strong or (self.lines_fair and self.dense_fair)
         return self.points_strong or fair or self.dense_strong or self.bare_surface or by_lines
@@ -169,6 +174,7 @@ def step_chi2(pose: np.ndarray, predicted: np.ndarray, step: np.ndarray, waited:
     pose, predicted: float64 [4, 4], world -> camera. step: the last motion, camera -> camera. waited: frames since the
     prediction was last confirmed; each adds a step's variance.
     """
+    # Translation and rotation are compared by their lengths: the direction of a jerk is as unknown as its size.
     off = tangent(pose @ rigid.invert(predicted))
     last = tangent(step)
     sigma = [floor + STEP_GROWTH * np.linalg.norm(last[i : i + 3]) for floor, i in zip(STEP_FLOOR, (0, 3), strict=True)]
@@ -192,5 +198,6 @@ def tangent(motion: np.ndarray) -> np.ndarray:
 
 def worst_sigma(information: np.ndarray) -> tuple[float, float]:
     """Standard deviation in the worst direction of translation and of rotation, of information float64 [6, 6]."""
+    # The regulariser turns a direction without information into a very large, but finite, standard deviation.
     covariance = np.linalg.inv(information + 1e-9 * np.eye(6))
     return tuple(float(np.sqrt(np.linalg.eigvalsh(covariance[i : i + 3, i : i + 3])[-1])) for i in (0, 3))  # type: ignore[return-value]

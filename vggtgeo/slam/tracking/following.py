@@ -90,7 +90,9 @@ def located_by_flow(
     arrived = np.flatnonzero(np.isfinite(alike))
     if len(arrived) < max(MIN_FOLLOWED * len(seen), MIN_INLIERS):
         return None
+    # Followed points are not key points of the frame.
     nowhere = np.full(len(arrived), -1)
+    # A point is as good as the worse known of its two ends: the match in the image, and the depth in the keyframe.
     trust = np.clip(alike[arrived], 0.0, 1.0) * np.maximum(keyframe.points.prior_confidence[asked[arrived]], MIN_TRUST)
     matches = PointMatches(asked[arrived], nowhere, pixels[arrived], moved[arrived], trust)
     points = points[arrived]

@@ -99,6 +99,7 @@ def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.nd
     other = np.array([second.information for second in seconds])
     apart = placed @ rigid.invert(poses[rows])
     off = np.concatenate([apart[:, :3, 3], Rotation.from_matrix(apart[:, :3, :3]).as_rotvec()], 1)
+    # Mean of two Gaussians in the tangent space at the tracked pose: `(I1 + I2)^-1 I2 off`.
     share = np.linalg.solve(own + other, np.einsum("nij,nj->ni", other, off)[..., None])[..., 0]
     agreeing = squared_distance(off, own, other) < AGREEMENT_GATE
     found = poses.copy()

@@ -44,6 +44,7 @@ def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) 
     if by_points is None:
         return by_picture
     off = tangent(by_points.motion @ rigid.invert(dense.motion))
+    # With the errors that samples share: by their own noise alone two right poses would contradict each other.
     noise = [np.linalg.inv(with_systematic(one.information, one.motion)) for one in (by_points, by_picture)]
     if off @ np.linalg.solve(noise[0] + noise[1], off) < AGREEMENT_GATE:
         both = by_points.information + dense.information
@@ -61,6 +62,7 @@ def drawn_to(found: Motion, prior: Motion) -> Motion:
     """
     off = tangent(prior.motion @ rigid.invert(found.motion))
     step = np.linalg.solve(found.information + prior.information, prior.information @ off)
+    # The prior is no measurement: counted as one, it would make directions that nothing measured look measured.
     return Motion(exponential(step) @ found.motion, found.information)
 
 
@@ -82,6 +84,7 @@ def metre_of(points: np.ndarray, pose: np.ndarray) -> float:
     """
     if not len(points):
         return 1.0
+    # A mean of inverse depths, since image motion is proportional to it; far points then do not dominate.
     depth = points @ pose[2, :3] + pose[2, 3]
     return float(len(points) / (NOMINAL_DEPTH * np.sum(1.0 / depth)))
 
@@ -116,4 +119,5 @@ def _floor(motion: np.ndarray) -> np.ndarray:
     """Standard deviations float64 [6] of a motion that no number of samples removes."""
     length, angle = (np.linalg.norm(part) for part in np.split(tangent(motion), 2))
     metres, radians, share = SYSTEMATIC
+    # Calibration errors grow with the motion; rolling shutter and clock errors do not vanish without it.
     return np.repeat([metres + share * length, radians + share * angle], 3)

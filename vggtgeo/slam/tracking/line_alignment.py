@@ -71,8 +71,11 @@ class SpaceSegments:
         spread = n * tt - t * t
         index = np.nonzero((n >= 2) & (spread > 1e-9))[0]
         n, t, tt, d, td, spread = (values[index] for values in (n, t, tt, d, td, spread))
+        # Least-squares line through the samples: inverse depth is affine in the pixel along the image of a straight
+        # line.
         offset, slope = (tt * d - t * td) / spread, (n * td - t * d) / spread
         inverse = np.stack([offset, offset + slope], 1)
+        # An end behind the camera, or at infinity, comes from extrapolation.
         good = (inverse > 1e-3).all(1)
         index = index[good]
         rays = pinhole.rays(keyframe.lines.segments.endpoints[index], intrinsics)
@@ -173,6 +176,7 @@ def _rows(
     inverse = segments.inverse_depth[own][..., None]
     local = turned / inverse + motion[:3, 3]
     front = local[..., 2] > NEAREST
+    # Any point before the camera: the residual of this end is set to infinity below, and its weight is zero.
     safe = np.where(front[..., None], local, [0.0, 0.0, 1.0])
     line = line_coefficients(theirs)
     pixels = pinhole.project(safe, intrinsics)
@@ -184,6 +188,7 @@ def _rows(
     along = theirs[:, 1] - theirs[:, 0]
     squared = (along**2).sum(1)[:, None]
     u = ((pixels - theirs[:, :1]) * along[:, None]).sum(2) / squared
+    # `sigma^2` of the module docstring; the 1 is the end in the keyframe itself.
     variance = END_SIGMA**2 * ((1 - u) ** 2 + u**2 + 1.0) + (by_depth * segments.sigma[own]) ** 2
     sigma = np.sqrt(variance)
     sliding = (along[:, None, :1] * row_x + along[:, None, 1:] * row_y) * (np.sqrt(2.0) * END_SIGMA / squared)[
@@ -197,6 +202,7 @@ def _without_chance(hessian: np.ndarray, by_chance: np.ndarray) -> np.ndarray:
 
     Parallel lines, each turned a little by noise, would else seem to determine the motion along them.
     """
+    # Relative to the information of all lines, so that a direction is judged by its share of chance, whatever its unit.
     root = np.linalg.cholesky(hessian + 1e-12 * np.trace(hessian) * np.eye(6))
     half = np.linalg.solve(root, by_chance)
     share, basis = np.linalg.eigh(np.linalg.solve(root, half.T))
@@ -207,6 +213,7 @@ def _without_chance(hessian: np.ndarray, by_chance: np.ndarray) -> np.ndarray:
 def _weights(residual: np.ndarray) -> np.ndarray:
     """Tukey's biweight, wide enough for a start that is off; a residual larger than expected is also known less."""
     finite = np.isfinite(residual)
+    # 1.4826: the standard deviation of a normal distribution over its median absolute deviation.
     scale = max(1.4826 * float(np.median(np.abs(residual[finite]))), 1.0) if finite.any() else 1.0
     inside = np.where(finite, residual / (TUKEY * scale), 1.0)
     return np.maximum(1.0 - inside**2, 0.0) ** 2 / scale**2
@@ -217,6 +224,7 @@ def _step(rows: _Rows, motion: np.ndarray, start: np.ndarray, known: np.ndarray)
     safe = np.where(np.isfinite(rows.residual), rows.residual, 0.0)
     hessian = _normal(rows.jacobian, weight) + known
     gradient = np.einsum("mec,me->c", rows.jacobian, weight * safe) + known @ tangent(motion @ rigid.invert(start))
+    # Lines may leave a direction free: the regulariser gives it no step.
     return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
 
 

@@ -81,6 +81,8 @@ def refine_by_map(
         limited = [bound(own.hessian, own.motion) for own in equations]
         information = np.sum(limited, axis=0)
         gradient = known @ tangent(current @ rigid.invert(pose))
+        # Each keyframe pulls towards the pose that its points prefer, but only with the information that its own place
+        # leaves.
         gradient -= np.sum([known @ own.step() for known, own in zip(limited, equations, strict=True)], axis=0)
         step = -_solve(information + known, gradient)
         current = exponential(step) @ current
@@ -112,6 +114,7 @@ def in_view(keyframes: Sequence[Keyframe], pose: np.ndarray, but: int = -1) -> l
     others = [keyframe for keyframe in keyframes if keyframe.number != but]
     poses = np.array([keyframe.pose for keyframe in others]).reshape(-1, 4, 4)
     away = np.linalg.norm(rigid.invert(poses)[:, :3, 3] - rigid.centre(pose), axis=1)
+    # `trace(R1 R2') = 1 + 2 cos(angle)`.
     cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1) / 2
     turned = np.arccos(np.clip(cosine, -1.0, 1.0))
     order = [i for i in np.argsort(away + turned, kind="stable") if turned[i] < WIDEST_TURN]
@@ -141,6 +144,7 @@ class _Part:
 
     def equations(self, pose: np.ndarray, intrinsics: np.ndarray, sigma: float) -> _Equations:
         local = self.points @ pose[:3, :3].T + pose[:3, 3]
+        # Metres; the projection's derivative is unbounded at the camera.
         front = local[:, 2] > 0.1
         local = local[front]
         residual = (pinhole.project(local, intrinsics) - self.pixels[front]) / sigma

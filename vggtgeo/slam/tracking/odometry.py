@@ -60,6 +60,7 @@ class Odometry:
                 continue
             parent[here], root[here], depth[here] = before, root[before], depth[before] + 1
             poses[here] = rigid.orthonormal(motion.pose @ poses[before])
+            # As right tangents of the pose, errors of the motions on the way add up without further transport.
             carry = rigid.adjoint(rigid.invert(poses[here]))
             noise = np.linalg.inv(with_systematic(motion.information, motion.pose))
             spread[here] = spread[before] + carry @ noise @ carry.T
@@ -71,6 +72,7 @@ class Odometry:
         meeting = self._meeting(np.where(connected, start, 0), np.where(connected, end, 0))
         pose = self.poses[end] @ rigid.invert(self.poses[start])
         carry = rigid.adjoint(self.poses[end])
+        # The way between two nodes of a tree leaves out what both share: the way from the root to their meeting point.
         spread = carry @ (self.spread[start] + self.spread[end] - 2 * self.spread[meeting]) @ carry.mT
         motions = self.depth[start] + self.depth[end] - 2 * self.depth[meeting]
         return Way(pose, spread, motions, connected)

@@ -68,6 +68,7 @@ def revisit(given: TrackingInput, current: Track, known: Map, tracker: Tracker, 
     found = track(given, old[best], view_of(old[best], tracker, given.intrinsics, given.roles))
     if not (found.accepted and found.evidence.certain):
         return None
+    # Rooms that look the same pass the check by points; odometry bounds how far drift can have moved the camera.
     odometry = Odometry.of(known.odometry_factors, len(known.keyframes))
     return None if odometry.distances([tie_between(current, found)])[0] >= STEP_GATE else found
 
@@ -107,6 +108,7 @@ def place_waiting(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: R
     for number, waiting in enumerate(reversed(tracker.waiting)):
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
         data = frame_data(frame, Description.of(waiting.features), intrinsics, roles, known.metric)
+        # Backwards in time the motion of the last step continues as well as forwards.
         prior = MotionPrior(step @ pose, step, waited=min(number, 3))
         found = track(TrackingInput(data, intrinsics, roles, prior), keyframe, source)
         if not found.accepted:

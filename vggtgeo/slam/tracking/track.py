@@ -182,6 +182,7 @@ def track_by_rays(given: TrackingInput, keyframe: Keyframe, length: float) -> Tr
     metre = metre_of(found.points[found.inliers], np.eye(4))
     evidence = Evidence(matches=len(matches), inliers=agree, metre=metre, by_rays=True)
     motion = Motion(found.motion, found.information)
+    # Rays say little of the length of the motion, which the prior continues.
     motion = motion if given.prior is None else drawn_to(motion, given.prior.motion_from(keyframe))
     return _judged(rigid.orthonormal(motion.motion @ keyframe.pose), motion.information, evidence, keyframe, None)
 
@@ -193,6 +194,7 @@ def _placed(
     guess, lines = located.guess, given.roles.line_matches
     known = guess.result is GeometryResult.SUCCESS
     aligner, dense = given.roles.alignment, None
+    # Dense alignment converges from near poses only: with neither a pose nor a prediction there is no start.
     if aligner is not None and views is not None and (known or given.prior):
         dense = aligner.align(*views, guess.pose @ rigid.invert(keyframe.pose))
     by_points = None
@@ -203,9 +205,11 @@ def _placed(
     if known and not given.roles.metric:
         evidence = replace(evidence, metre=metre_of(located.points[guess.inliers], guess.pose))
     prior = None if given.prior is None else given.prior.motion_from(keyframe)
+    # The prior enters after the measurements were compared: it must not make wrong ones agree.
     found = agreed(by_points, dense, evidence)
     if found is not None and prior is not None:
         found = drawn_to(found, prior)
+    # Finding lines costs as much as the alignment, so it is done only where it can help.
     needed = prior is not None if found is None else wanting(found)
     if needed and given.data.lines is not None:
         found, evidence = with_lines(found, prior, evidence, keyframe, given.data.lines, given.intrinsics, lines)

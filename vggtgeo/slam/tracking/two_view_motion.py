@@ -47,10 +47,13 @@ def two_view_motion(
     if not (length > 0 and guess.inliers.any()):
         return None
     motion = guess.pose.copy()
+    # The essential matrix gives a unit translation.
     motion[:3, 3] *= length
     points = length * guess.points
     information = _without_length(points[guess.inliers], motion, intrinsics) / sigma**2
     along = np.append(motion[:3, 3], np.zeros(3))
+    # The prior of the length: its gradient by the translation is the unit vector `t / |t|`, and its sigma `STEP_GROWTH
+    # |t|`.
     information += np.outer(along, along) / (STEP_GROWTH * length * length) ** 2
     return TwoViewMotion(motion, information, guess.inliers, points)
 
@@ -69,5 +72,6 @@ def _without_length(points: np.ndarray, motion: np.ndarray, intrinsics: np.ndarr
     turned = points @ motion[:3, :3].T
     rows = np.stack(pinhole.projection_rows(turned + motion[:3, 3], intrinsics))  # [2, 6, n]
     column = np.einsum("rkn,nk->rn", rows[:, :3], turned)
+    # Schur complement of one scalar: the projection of the rows off the direction in which depth moves the pixel.
     reduced = rows - column[:, None] * (np.einsum("rkn,rn->kn", rows, column) / np.sum(column**2, 0))[None]
     return np.asarray(np.einsum("rkn,rln->kl", reduced, reduced))

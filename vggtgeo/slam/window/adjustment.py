@@ -133,6 +133,7 @@ def _observed(
     prior, sigma = read("prior"), read("sigma")
     has_prior = np.isfinite(prior) & np.isfinite(sigma)
     depths = np.concatenate([depths, read("inverse_depth")[len(points.host) :]])
+    # A slot without a prior needs finite placeholders; weight 0 removes its residual.
     weight = np.where(has_prior, _prior_trust(read("prior_confidence"), read("confidence"), settings), 0.0)
     observations = Observations(
         edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),
@@ -159,6 +160,7 @@ def write_back(
     depths = adjustment.index.gather(state.inverse_depth)
     updated = []
     for i, keyframe in enumerate(keyframes):
+        # Landmarks that are not `informed` keep their depth: the adjustment moved them along an unobserved direction.
         here = (adjustment.host == i) & adjustment.informed
         points = _updated(keyframe.points, adjustment, depths, here & ~adjustment.is_line)
         samples = _updated(keyframe.samples, adjustment, depths, here & adjustment.is_line)
@@ -226,6 +228,7 @@ def _line_rows(
     )
     for number, edge in enumerate(edges):
         host, target = local[edge.host], keyframes[local[edge.target]]
+        # All samples of a segment have the match of the segment.
         matched = np.full(len(keyframes[host].lines), -1)
         matched[edge.line_slots] = np.arange(len(edge.line_slots))
         of_sample = matched[keyframes[host].sample_segment]
@@ -287,6 +290,8 @@ def _initial_depths(
     determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (deviation < LARGEST_ERROR * triangulated)
     # Where a depth camera measures nothing there may be glass or a mirror: do not triangulate there.
     free = seen & ~np.array([np.isfinite(own.prior).any() for own in slots])[points.host]
+    # Far points whose depth is not determined still fix rotations, as long as their projection does not depend on
+    # depth.
     steady = free & (deviation * longest * intrinsics[0] < STEP_PIXELS) & ~(deviation > before)
     known = np.isfinite(current)
     some = current[known] if known.any() else triangulated[determined]
@@ -315,4 +320,5 @@ def _triangulated(
         np.add.at(weighted, landmark[chosen], weight * value)
         np.add.at(information, landmark[chosen], weight)
         np.maximum.at(longest, landmark[chosen], float(np.linalg.norm(relative[:3, 3])))
+    # Mean by information in inverse depth, where the error of a triangulation is nearly Gaussian.
     return weighted / np.maximum(information, 1e-12), information, longest

@@ -130,9 +130,11 @@ def make_room(window: Window, settings: SlamSettings, needed: int | None = None)
         return window
     leaving = next(number for number in window.members if number != needed)
     staying = tuple(number for number in window.members if number != leaving)
+    # Nothing was solved with it, so nothing can be kept of it.
     if window.solved is None or leaving not in window.solved[0].keyframes:
         return replace(window, members=staying)
     adjustment, state = window.solved
+    # The problem as it was solved: its linearisation point and its factors belong together.
     prior = marginalise_jit(adjustment.problem, state, jnp.asarray(adjustment.keyframes.index(leaving)))
     return replace(window, members=staying, prior=WindowPrior(adjustment.keyframes, prior))
 
@@ -155,6 +157,7 @@ def enter(
     matched = map_in_threads(match, window.members, alone=not can_search(keyframe.features))
     pairs = tuple(pair for pair in matched if pair is not None)
     inside = (*window.members, keyframe.number)
+    # Members are read at every adjustment; decoding them each time would cost more than the memory is worth.
     kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in known.keyframes)
     known = replace(known, keyframes=(*kept, keyframe), pairs=(*known.pairs, *pairs))
     return known, replace(window, members=inside)
@@ -169,6 +172,7 @@ def adjust(
     adjustment, gauge = window_problem(known, window, intrinsics, camera, settings)
     notes = gauge_notes(gauge, adjustment.keyframes, "window")
     solution = solve_jit(adjustment.problem, adjustment.initial, window_solver(settings))
+    # The keyframes before the solve are still valid: go on with them, and report.
     if not np.isfinite(float(solution.energy)):
         failure = f"window at keyframe {members[-1].number}: {solution.message}"
         return AdjustedWindow(known, window, intrinsics, (*notes, failure))
@@ -224,6 +228,7 @@ def _held(window: Window, roots: tuple[int, ...]) -> np.ndarray:
     the roots of submaps.
     """
     hung = np.isin(window.members, window.held)
+    # When the camera has returned to old keyframes, the old part must not move: the roots would be a second gauge.
     return hung if hung.any() else np.isin(window.members, roots)
 
 
