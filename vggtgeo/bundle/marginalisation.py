@@ -97,6 +97,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     check_linearisation(problem, point, finite)
     leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
     leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
+    # Known exactly, hence conditioned on; eliminating them would treat them as unknown.
     held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics.reshape(-1)])
     quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
     root, offset = unless(finite, square_root(quadratic, gradient))
@@ -148,6 +149,7 @@ def _order_of(given: Any, count: int) -> Int[Array, " n"]:
 
 def _linearisation_point(prior: MarginalPrior, state: State) -> State:
     """Return the prior's linearisation points where it has information, the current estimate elsewhere."""
+    # A column without entries has no information, so its linearisation point is free.
     weight, tail = jnp.sum(prior.root**2, 0), len(prior.intrinsics)
     pose_known = jnp.sum(weight[:-tail].reshape(-1, lie.TANGENT), 1) > 0
     intrinsics_known = weight[-tail:] > 0
@@ -191,11 +193,13 @@ def _eliminate(
     quadratic = jnp.where(free[:, None] & free[None, :], quadratic, 0.0)
     gradient = jnp.where(free, gradient, 0.0)
     inner = jnp.where(rows[:, None] & rows[None, :], quadratic, 0.0)
+    # A pseudo-inverse: the leaving pose may be undetermined by the terms that leave with it.
     inverse = jnp.linalg.pinv(inner, hermitian=True)
     coupling = jnp.where(~rows[:, None] & rows[None, :], quadratic, 0.0)
     remaining = jnp.where(~rows[:, None] & ~rows[None, :], quadratic, 0.0)
     remaining = remaining - coupling @ inverse @ coupling.T
     gradient = jnp.where(rows, 0.0, gradient - coupling @ inverse @ gradient)
+    # Products of a Schur complement are symmetric up to rounding only, and `eigh` below reads one triangle.
     return (remaining + remaining.T) / 2, gradient
 
 
@@ -209,6 +213,7 @@ def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) ->
     safe = _balance(quadratic)
     values, vectors = jnp.linalg.eigh(quadratic / safe[:, None] / safe[None, :])
     floor = len(values) * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), initial=0.0)
+    # A hundred times the rounding error: noise in the null space would become information along the gauge.
     kept = values > 100 * floor
     roots = jnp.sqrt(jnp.where(kept, values, 1.0))
     root = jnp.where(kept[:, None], roots[:, None] * vectors.T * safe[None, :], 0.0)

@@ -87,6 +87,7 @@ def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
         return sum_ + sum(term.energy(seen) for term, seen in of_edge(problem, view, data)), None
 
     edges = (places(problem), motions_of(relative_poses(problem, state)), edge_data(problem))
+    # A scan keeps one edge's projections in memory, not those of all edges.
     total, _ = jax.lax.scan(body, total, edges)
     return total
 

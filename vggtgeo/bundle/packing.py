@@ -162,6 +162,7 @@ def pack(
     if observations.segment is not None:
         present = _per_slot(index, np.ones(len(observations.host)), 0.0, dtype)
         problem, depths = _with_segments(problem, depths, present, size)
+    # Padding keyframes are fixed and unobserved, but a quaternion of length zero would be NaN when normalised.
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
     start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
     return problem, State(start, jnp.asarray(intrinsics, dtype), depths, offset), index
@@ -191,6 +192,7 @@ def _layout(
     rows = rows_of_keyframes(slots, size)
     edges, order = sort_edges(observations.edges)
     stored = pad_edges(edges, size, rows)
+    # At least 1, since a kind without slots has no landmark to divide for.
     length = np.where(slots.is_line, max(size.lines, 1), max(size.points, 1))
     part, within = (np.zeros_like(slots.within), slots.within) if size.rows is None else np.divmod(slots.within, length)
     slot = np.where(slots.is_line, size.points + within, within)

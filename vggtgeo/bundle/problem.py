@@ -166,6 +166,7 @@ class Problem(eqx.Module):
     host: Int[Array, " h"] | None = None
 
     def __getattr__(self, name: str) -> Any:
+        # `vars`, not `self.terms`: while Equinox builds or copies a module, fields are missing and this would recurse.
         for term in vars(self).get("terms", ()):
             if getattr(term, "name", None) == name:
                 return term

@@ -72,6 +72,7 @@ def slide(
     check_pair(next_problem, next_initial, "next_initial")
     _check_alike(problem, next_problem)
     staying = _staying(leaving, problem.num_keyframes)
+    # The last position is the new keyframe, about which the prior knows nothing.
     prior = reorder(marginalise(problem, state, leaving), jnp.append(staying, -1))
     poses = state.poses.wxyz_xyz
     newest = _extrapolated(poses) if constant_velocity else next_initial.poses.wxyz_xyz[-1]

@@ -106,6 +106,7 @@ class Camera:
         check_sides(width, height)
         across, down = width / self.width, height / self.height
         fx, fy, cx, cy = self.intrinsics
+        # Pixel centres are whole numbers, so the image begins at -0.5 at every size.
         centre = across * (cx + 0.5) - 0.5, down * (cy + 0.5) - 0.5
         return replace(self, intrinsics=(across * fx, down * fy, *centre), width=width, height=height)
 
@@ -177,6 +178,7 @@ class Undistorter:
         inside = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
         maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
         limits = np.iinfo(np.int16)
+        # A wide lens maps corners far outside, beyond the range of OpenCV's fixed-point maps.
         nearest = np.clip(np.rint(np.stack([x, y], axis=-1)), limits.min, limits.max).astype(np.int16)
         return cls(camera.pinhole, None if inside.all() else inside, (maps[0], maps[1]), nearest)
 

@@ -292,6 +292,7 @@ def _ray(flat: Float[Array, "2"]) -> Float[Array, "3"]:
 def _norm(flat: Float[Array, "2"]) -> Float[Array, ""]:
     """Length of a vector; its derivatives at zero are zero, not NaN."""
     squared = jnp.sum(flat * flat)
+    # Two `where`: the derivative of the root at zero is infinite, also in the branch that is not taken.
     somewhere = squared > 1e-12
     return jnp.where(somewhere, jnp.sqrt(jnp.where(somewhere, squared, 1.0)), 0.0)
 

@@ -72,6 +72,7 @@ def log(pose: jaxlie.SE3) -> Float[Array, "*n 6"]:
     jaxlie's own logarithm has NaN second derivatives there, where a prior is linearised and usually evaluated.
     """
     wxyz, t = pose.wxyz_xyz[..., :4], pose.wxyz_xyz[..., 4:]
+    # `q` and `-q` are one rotation; this sign gives the angle of at most pi.
     wxyz = jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
     cosine, axis = wxyz[..., :1], wxyz[..., 1:]
     squared = jnp.sum(axis * axis, -1, keepdims=True)

@@ -94,5 +94,6 @@ def straightened(inverse_depth: np.ndarray, fraction: np.ndarray, present: np.nd
     slope = mean((fraction - centre) * np.where(present, inverse_depth, 0.0)) / np.where(spread > 0, spread, 1.0)
     line = level + slope * (fraction - centre)
     ends = np.minimum(level - slope * centre, level + slope * (1 - centre))
+    # A line through noisy samples may cross infinity; the mean is positive.
     line = np.where(ends > 0, line, level)
     return np.where(count * level > 0, line, 1.0)

@@ -33,6 +33,7 @@ def centres(poses: np.ndarray) -> np.ndarray:
 def angle_between(first: np.ndarray, second: np.ndarray) -> float:
     """Return the angle of the relative rotation, radians."""
     cosine = (np.trace(first[:3, :3].T @ second[:3, :3]) - 1) / 2
+    # Rounding may leave the cosine of equal rotations above 1.
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 

@@ -131,6 +131,7 @@ def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
             f"{timestamps[row]:.6f}: sort them, and keep one pose for a time"
         )
     rotations = poses[:, :3, :3]
+    # `R R' = I` holds for reflections too, which the determinant below excludes.
     off = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
     bad = (off > _ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0)
     if bad.any():

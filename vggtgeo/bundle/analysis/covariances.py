@@ -202,6 +202,7 @@ def _covariances_jit(
     first: Int[Array, " h"] | None,
 ) -> Covariances:
     ready = prepared(problem)
+    # The reweighted Hessian: the exact one may be indefinite, and is no information matrix.
     system = linearise(ready, state)
     found = covariance(system, solver, rows)
     known = Covariances(
@@ -235,4 +236,5 @@ def variance_factor(problem: Problem, state: State, rank: Int[Array, ""]) -> Flo
     rows = jnp.asarray(sum(count_rows(problem, term, state) for term in terms))
     redundancy = rows - rank
     factor = 2 * prepared_energy(problem.with_terms(terms), state) / jnp.maximum(redundancy, 1)
+    # Without redundancy residuals vanish whatever the noise, so the weights are taken at their word.
     return jnp.where(redundancy > 0, factor, jnp.ones_like(factor))

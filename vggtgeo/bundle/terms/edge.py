@@ -233,6 +233,7 @@ class EdgeTerm(AbstractTerm):
         pixels: Float[Array, "2 p"] | None = None,
     ) -> Float[Array, "m p"]:
         """Return residuals after a (zero) step of each part, at the given depths and optional pixels in the host."""
+        # At zero in value: only the derivatives of the step matter, and this form compiles faster.
         relative = lie.move_at_zero(view.relative, parts[0])
         host, camera = view.cameras.along(view.ends, parts[1:])
 
