@@ -18,9 +18,9 @@ from vggtgeo.io.given import path_of, real_numbers
 from vggtgeo.io.text_files import whole_text
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
-SHORTEST, LONGEST = 0.5, 2.0
+MIN_QUATERNION, MAX_QUATERNION = 0.5, 2.0
 """Of a quaternion in a file: other columns have other lengths."""
-FARTHEST, LATEST = 1e15, 1e20
+MAX_COORDINATE, MAX_TIME = 1e15, 1e20
 """Lengths and times in a file, far beyond any: squares of them are numbers, and nanoseconds since 1970 are less."""
 _ROTATION_TOLERANCE = 1e-3
 
@@ -168,13 +168,13 @@ def _parse_row(where: str, text: str) -> list[float]:
         raise InputError(f"{where}: found {text!r}; expected 8 numbers: `timestamp tx ty tz qx qy qz qw`") from None
     if not np.isfinite(row).all():
         raise InputError(f"{where}: found a NaN or an infinity in {text!r}; leave such poses out of the file")
-    if max(map(abs, row[1:4])) > FARTHEST or abs(row[0]) > LATEST:
+    if max(map(abs, row[1:4])) > MAX_COORDINATE or abs(row[0]) > MAX_TIME:
         raise InputError(
             f"{where}: found a number that is no time or place in {text!r}; leave such poses out of the file"
         )
     if np.linalg.norm(row[4:]) < 1e-6:
         raise InputError(f"{where}: the quaternion has length zero; expected a unit quaternion `qx qy qz qw`")
-    if not SHORTEST <= np.linalg.norm(row[4:]) <= LONGEST:
+    if not MIN_QUATERNION <= np.linalg.norm(row[4:]) <= MAX_QUATERNION:
         raise InputError(
             f"{where}: the quaternion has length {np.linalg.norm(row[4:]):.3g}; expected about 1: are the columns "
             "`timestamp tx ty tz qx qy qz qw`?"

@@ -18,7 +18,7 @@ from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.state import Slam
 
-NEAREST = 4
+MAX_VIEWS = 4
 """Keyframes from which a frame's depth is taken."""
 DISTANCE_SCALE, ANGLE_SCALE = 0.3, np.deg2rad(20)
 """Metres and radians of equal weight in the distance between views."""
@@ -96,4 +96,4 @@ class FrameDepths:
             return float(metres) / DISTANCE_SCALE + float(rigid.angle_between(other, pose)) / ANGLE_SCALE
 
         same = sorted((number for number in self._views if self._submap[number] == submap), key=distance)
-        return (self._views[number] for number in same[:NEAREST])
+        return (self._views[number] for number in same[:MAX_VIEWS])

@@ -21,7 +21,7 @@ from vggtgeo.slam.state import Slam
 
 FIRST_VIEWS = 8
 """Keyframes whose mean is the direction of the axes; the path has hardly drifted by then."""
-LARGEST_DISAGREEMENT = np.deg2rad(3.0)
+MAX_DISAGREEMENT = np.deg2rad(3.0)
 """Between the measured and the tracked rotation; beyond it, the segments are taken to lie along other directions."""
 
 
@@ -44,7 +44,7 @@ def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
             map=replace(slam.map, axes=(*slam.map.axes, rotation.T @ nearest_frame(view.rotation, rotation @ axes))),
         )
     off = Rotation.from_matrix(rotation @ axes @ view.rotation.T).as_rotvec()
-    if np.linalg.norm(off) > LARGEST_DISAGREEMENT:
+    if np.linalg.norm(off) > MAX_DISAGREEMENT:
         return slam
     # `view.information` is that of `Log(R M^T)` at the tracked pose; degrees apart, the root at zero is the same.
     measured = MeasuredRotation(keyframe.number, view.rotation @ axes.T, view.information)

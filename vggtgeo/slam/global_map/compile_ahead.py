@@ -10,7 +10,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.global_map.global_adjustment import camera_of
-from vggtgeo.slam.global_map.global_shape import LARGEST_DENSE, GlobalShape, global_solver, padded_count, shape_for
+from vggtgeo.slam.global_map.global_shape import MAX_DENSE, GlobalShape, global_solver, padded_count, shape_for
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -20,7 +20,7 @@ from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit
 
 CHECKED = (0.3, 0.6, 0.85)
 """Shares of the frames at which the number of keyframes is foreseen: early, to have time, and again, to be right."""
-LEAST_KEYFRAMES = 8
+MIN_KEYFRAMES = 8
 """Where nobody knows how many frames will come: before the map has so many, it may stay small."""
 
 
@@ -43,7 +43,7 @@ class CompileAhead(Callback):
         if count is None or not slam.metric or not self._settings.refinement.global_adjustment:
             return
         padded = padded_count(count)
-        if padded <= LARGEST_DENSE and padded not in self._asked:
+        if padded <= MAX_DENSE and padded not in self._asked:
             shape = shape_for(padded, self._settings)
             self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, camera_of(slam))
 
@@ -59,7 +59,7 @@ def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | 
     is foreseen a few times only.
     """
     if total is None:
-        return keyframes if keyframes >= LEAST_KEYFRAMES else None
+        return keyframes if keyframes >= MIN_KEYFRAMES else None
     if frames not in {int(share * total) for share in CHECKED}:
         return None
     return keyframes * total // max(frames, 1)

@@ -22,10 +22,10 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 CELL = 4
 """Pixels a side of the blocks whose median depth makes one surface point."""
-FARTHEST = 0.10
+MAX_DISTANCE = 0.10
 """Metres between surfaces that can be one."""
-LEAST_COSINE = 0.8
-LEAST_POINTS = 150
+MIN_COSINE = 0.8
+MIN_POINTS = 150
 """Of the source's samples, that a surface of the target is near."""
 
 
@@ -101,8 +101,8 @@ def align(
     facing = (n * (turn @ source.normals.take(seen, 1))).sum(0)
     # A comparison with NaN, where the target has no surface, is false.
     with np.errstate(invalid="ignore"):
-        one = np.flatnonzero(((away * away).sum(0) < FARTHEST**2) & (facing > LEAST_COSINE))
-    if len(one) < LEAST_POINTS:
+        one = np.flatnonzero(((away * away).sum(0) < MAX_DISTANCE**2) & (facing > MIN_COSINE))
+    if len(one) < MIN_POINTS:
         return None
     seen, cell, away, n = seen.take(one), cell.take(one), away.take(one, 1), n.take(one, 1)
     sigma = np.hypot(source.sigma.take(seen), target.rows.sigma.take(cell))

@@ -8,7 +8,7 @@ from vggtgeo.geometry import lie
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.state import Slam
 
-MOST_APART = 3.0
+MAX_GAP = 3.0
 """Frames beside a keyframe say how it moves where they are at most this many usual intervals away."""
 
 
@@ -32,7 +32,7 @@ def frame_motions(slam: Slam) -> np.ndarray:
         return np.zeros((len(times), lie.TANGENT))
     rows = np.arange(len(times))
     tracked = np.array([record.tracked for record in slam.frames])
-    near = lambda other: tracked[other] & (np.abs(times[other] - times) <= MOST_APART * frame_interval(slam))
+    near = lambda other: tracked[other] & (np.abs(times[other] - times) <= MAX_GAP * frame_interval(slam))
     before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(times) - 1)
     # A missing neighbour is replaced by the frame itself: a one-sided difference, or none.
     before, after = np.where(near(before), before, rows), np.where(near(after), after, rows)

@@ -24,11 +24,11 @@ from vggtgeo.slam.tracking.tracker import FramePose
 
 MIN_POINTS = 20
 """With fewer points the pose stays as tracked."""
-WIDTH, WIDEST = 1.0, 8.0
+WIDTH, MAX_WIDTH = 1.0, 8.0
 """Width of the Geman-McClure kernel, pixels: final and initial, halved in each step. A redescending kernel, because
 matches may be off by as much as the gate of tracking, some pixels (`benchmarks/between_keyframes.py`)."""
-STEPS, SETTLED = 15, 1e-5
-NEAREST, FARTHEST = 0.1, 1e6
+STEPS, CONVERGED = 15, 1e-5
+MIN_DEPTH, MAX_DEPTH = 0.1, 1e6
 """Range of the depths that are used, in map units."""
 
 
@@ -69,7 +69,7 @@ def off_landmarks(slam: Slam, poses: np.ndarray) -> dict[int, np.ndarray]:
         points, pixels = _sight(slam, row, poses[row], motions)
         if len(points) >= MIN_POINTS:
             off = np.linalg.norm(rigid.project(points, poses[row], slam.intrinsics) - pixels, axis=1)
-            found[row] = np.where(points @ poses[row][2, :3] + poses[row][2, 3] > NEAREST, off, np.inf)
+            found[row] = np.where(points @ poses[row][2, :3] + poses[row][2, 3] > MIN_DEPTH, off, np.inf)
     return found
 
 
@@ -106,7 +106,7 @@ def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tupl
     assert record.seen is not None
     keyframe, slots = slam.keyframes[record.reference], record.seen.slots
     inverse = keyframe.points.inverse_depth[slots]
-    known = np.isfinite(inverse) & (inverse > 1 / FARTHEST)
+    known = np.isfinite(inverse) & (inverse > 1 / MAX_DEPTH)
     inverse, pixels = inverse[known], keyframe.points.pixels[slots[known]]
     if motion is not None and slam.camera.readout is not None:
         pixels = to_global_shutter(pixels, inverse, motion, slam.intrinsics, keyframe.size, slam.camera.readout)
@@ -125,9 +125,9 @@ def _resected(
     current, before = pose, _energy(points, pixels, pose, intrinsics)
     for number in range(STEPS):
         # Graduated non-convexity: from a pose that is off, right matches look like outliers to the final width.
-        width = max(WIDEST / 2**number, WIDTH)
+        width = max(MAX_WIDTH / 2**number, WIDTH)
         local = points @ current[:3, :3].T + current[:3, 3]
-        front = local[:, 2] > NEAREST
+        front = local[:, 2] > MIN_DEPTH
         if np.count_nonzero(front) < MIN_POINTS:
             return pose
         off = pinhole.project(local[front], intrinsics) - pixels[front]
@@ -138,7 +138,7 @@ def _resected(
         gradient = weighted @ off.T.ravel() + known @ tangent(current @ rigid.invert(pose))
         step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
         current = rigid.moved(current[None], step[None])[0]
-        if width == WIDTH and np.abs(step).max() < SETTLED:
+        if width == WIDTH and np.abs(step).max() < CONVERGED:
             break
     # A redescending kernel has other minima: a step away from the tracked pose must lower the energy.
     return rigid.orthonormal(current) if _energy(points, pixels, current, intrinsics) < before else pose

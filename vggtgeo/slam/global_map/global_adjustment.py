@@ -30,9 +30,9 @@ from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.window.sliding_window import solve_jit
 
-MUCH = 0.01
+REPORTED_CHANGE = 0.01
 """Relative change of the camera beyond which the user is told."""
-SURE, MOST_WARP = 5.0, 3.0
+DISTORTION_SIGMAS, MAX_WARP = 5.0, 3.0
 """Standard deviations, and pixels in the corners of the image, beyond which a distortion is told."""
 
 
@@ -229,7 +229,7 @@ def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, 
     always = settings.camera.refine_intrinsics == "always"
     if found.state is not None and (found.pays or always):
         slam = _taken(slam, adjustment, found.state)
-        if found.change > MUCH:
+        if found.change > REPORTED_CHANGE:
             cameras = [", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted)]
             change = 100 * found.change
             notes.append(f"the camera was refined by {change:.1f} %: fx, fy, cx, cy = {cameras[0]} -> {cameras[1]} px")
@@ -271,7 +271,7 @@ def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
     (k1, sigma), focal = found.distortion, float(found.given[0])
     # Displacement of a corner at normalised radius `r`: `f k1 r^3`.
     warp = abs(k1) * (float(np.hypot(shape[0], shape[1])) / 2 / focal) ** 3 * focal
-    if abs(k1) < SURE * sigma or warp < MOST_WARP:
+    if abs(k1) < DISTORTION_SIGMAS * sigma or warp < MAX_WARP:
         return []
     return [f"the lens distorts, and the calibration does not say so: k1 about {k1:.3f}, {warp:.0f} px in the corners"]
 

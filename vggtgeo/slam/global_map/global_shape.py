@@ -21,13 +21,13 @@ from vggtgeo.solvers.reduced import DenseCholesky
 
 SMALL = (16, 64)
 """Keyframes of the smallest shapes; beyond, 96, 128, 192, 256, ..."""
-MOST_PADDING = 2.0
+MAX_PADDING = 2.0
 """Stored edges for each that is there; a larger map of few edges keeps its own shape."""
 TIES, PAIRS = 2, 12
 """Tracked motions and pairs for each keyframe that there is room for. Redkitchen: 64 keyframes, 533 pairs."""
 MAX_NEIGHBOURS = 16
 """Edges of one keyframe, at most: they set the padded size, and so time and memory of the adjustment."""
-LARGEST_DENSE = 128
+MAX_DENSE = 128
 """Keyframes up to which the reduced system is factorised whole: at 64 that takes as long as conjugate gradients do, and
 16 s to compile in place of 24 s."""
 
@@ -62,7 +62,7 @@ def shape_of(
     """
     usual, counts = shape_for(keyframes, settings), Counter(type(factor) for factor in factors)
     size, edges = usual.size, sum(edges_of_host)
-    if keyframes > SMALL[-1] and size.keyframes * size.degree > MOST_PADDING * edges:
+    if keyframes > SMALL[-1] and size.keyframes * size.degree > MAX_PADDING * edges:
         size = replace(size, keyframes=keyframes, degree=max(edges_of_host), edges=edges)
     room = {kind: max(padded_count(count), usual.room.get(kind, 0)) for kind, count in counts.items()}
     return GlobalShape(size, tuple(room.items()), max(padded_count(pairs), usual.pairs))
@@ -81,7 +81,7 @@ def padded_count(count: int) -> int:
 
 def global_solver(problem: Problem, settings: SlamSettings) -> SchurLevenbergMarquardt:
     """The solver of the adjustment of a whole map, given as its problem."""
-    small = problem.num_keyframes <= LARGEST_DENSE
+    small = problem.num_keyframes <= MAX_DENSE
     return SchurLevenbergMarquardt(
         max_iterations=settings.refinement.global_iterations,
         rtol=1e-5,

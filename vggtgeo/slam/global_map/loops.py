@@ -22,7 +22,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.track import PIXEL_SIGMA
 
-LEAST_VISIBLE, MOST_TURNED = 0.4, np.deg2rad(40)
+MIN_VISIBLE, MAX_TURN = 0.4, np.deg2rad(40)
 """Share of one keyframe's points that another should see, and angle between them, for a pair to be proposed."""
 MIN_INLIERS = 50
 """A loop needs more inliers of PnP than this: keyframes far apart in time have no predicted pose to check them by."""
@@ -73,10 +73,10 @@ def _by_estimate(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]
             if (first.number, second.number) in known:
                 continue
             turned = rigid.angle_between(first.pose, second.pose)
-            if turned >= MOST_TURNED:
+            if turned >= MAX_TURN:
                 continue
             share = overlap(samples[first.number], second, slam.intrinsics)
-            if share > LEAST_VISIBLE:
+            if share > MIN_VISIBLE:
                 # Matching fails with the angle between views: a radian costs as much as the whole overlap.
                 scored.append((share - turned, first.number))
         chosen += [

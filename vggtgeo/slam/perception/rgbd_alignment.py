@@ -29,13 +29,13 @@ from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.perception.rgbd_view import LEVELS, Points, RgbdView
 from vggtgeo.slam.precision import in_double_precision
 
-FARTHEST = 0.15
+MAX_DISTANCE = 0.15
 """Largest distance of a point from its surface, metres."""
-NEAREST = 0.1
+MIN_DEPTH = 0.1
 """Smallest depth, metres: where depth sensors begin."""
 MIN_COSINE = 0.7
 MIN_SAMPLES = 60
-SETTLED = 1e-4
+CONVERGED = 1e-4
 """Convergence: step in metres and radians that ends the finest level; ten times that for coarser levels. A pose is
 known to a millimetre at best; a tenth of this takes twice the iterations (`benchmarks/alignment.py`)."""
 COARSE_SPREAD = 2.0
@@ -221,7 +221,7 @@ def _aligned(
         damped = hessian + jnp.diag(1e-3 * diagonal + 1e-9 * diagonal.sum() + 1e-9)
         change = -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(damped), True), gradient)
         count = carry.number + 1
-        settled = jnp.abs(change).max() < jnp.where(level == 0, SETTLED, 10 * SETTLED)
+        settled = jnp.abs(change).max() < jnp.where(level == 0, CONVERGED, 10 * CONVERGED)
         ends = settled | (count >= iterations[level]) | (carry.stage == JUDGED)
         lost = ~(terms.edges.enough | terms.surface.enough)
         return _Carry(
@@ -281,7 +281,7 @@ def _planes(surface: _Samples, target: _Target, motion: jax.Array) -> _Term:
     residual = jnp.sum((x - cell[:3]) * cell[3:6], 0)
     cosine = jnp.sum(cell[3:6] * (motion[:3, :3].astype(jnp.float32) @ normals), 0)
     # A cell without a surface has no normal: the cosine of zero is below any level.
-    seen = inside & (jnp.abs(residual) < FARTHEST) & (cosine > MIN_COSINE)
+    seen = inside & (jnp.abs(residual) < MAX_DISTANCE) & (cosine > MIN_COSINE)
     # Unseen samples divide by 1, not by zero.
     noise = jnp.where(seen, jnp.hypot(sigma, cell[6]), 1)
     return _Term(_by_motion(x, cell[3:6] / noise), residual / noise, seen)
@@ -350,7 +350,7 @@ def _moved(points: jax.Array, motion: jax.Array) -> jax.Array:
 
 def _projected(points: jax.Array, intrinsics: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Pixels u, v [n], and whether a point is in front of the camera."""
-    ahead = points[2] > NEAREST
+    ahead = points[2] > MIN_DEPTH
     z = jnp.where(ahead, points[2], 1)
     fx, fy, cx, cy = intrinsics
     return points[0] / z * fx + cx, points[1] / z * fy + cy, ahead

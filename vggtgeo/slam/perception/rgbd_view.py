@@ -20,7 +20,7 @@ EDGE_CELL = 4
 """One brightness sample, the one with the strongest gradient, is taken of each such cell, shrunk pixels a side."""
 FAINT = 1.5
 """Grey levels a pixel; a weaker gradient is noise of the image."""
-MOST_POINTS, MOST_EDGES = 2400, 3600
+MAX_POINTS, MAX_EDGES = 2400, 3600
 """Surface and edge points of the source that take part; more cost time and change nothing: they share their errors."""
 PIXELS_AT_ONCE, CELLS_AT_ONCE = 16384, 4096
 """Tables have a multiple of so many rows: the alignment is compiled for few sizes of images."""
@@ -79,7 +79,7 @@ class RgbdView:
         coarse = pinhole.coarser(intrinsics, factor * BLOCK)
         cameras = [*(pinhole.coarser(intrinsics, factor * 2**level) for level in range(LEVELS)), coarse]
         shape, cells = (0, 0), np.zeros((0, 7), np.float32)
-        surface, edges = Points.none(4, MOST_POINTS), Points.none(LEVELS, MOST_EDGES)
+        surface, edges = Points.none(4, MAX_POINTS), Points.none(LEVELS, MAX_EDGES)
         if depth is not None and np.isfinite(depth[0]).any():
             z, sigma = _cell_means(*depth, factor * BLOCK)
             points = _unproject_grid(z, coarse)
@@ -171,16 +171,16 @@ def _cells(points: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> np.nda
 
 
 def _spread(cells: np.ndarray) -> Points:
-    """At most `MOST_POINTS` cells with a surface, evenly spread."""
+    """At most `MAX_POINTS` cells with a surface, evenly spread."""
     known = np.flatnonzero(cells[:, 3:6].any(axis=1))
     # A fixed shuffle: a regular stride would take whole columns of the grid.
-    order = np.random.default_rng(0).permutation(len(known))[:MOST_POINTS]
+    order = np.random.default_rng(0).permutation(len(known))[:MAX_POINTS]
     chosen = cells[np.sort(known[order])].T
-    return Points.of(chosen[:3], chosen[3:], MOST_POINTS)
+    return Points.of(chosen[:3], chosen[3:], MAX_POINTS)
 
 
 def _edge_samples(levels: tuple[np.ndarray, ...], cells: np.ndarray, intrinsics: np.ndarray) -> Points:
-    """The strongest gradient of each cell whose depth is known, at most `MOST_EDGES` of them, and the brightness there.
+    """The strongest gradient of each cell whose depth is known, at most `MAX_EDGES` of them, and the brightness there.
 
     cells: depth, [h, w]. intrinsics: of the finest level.
     """
@@ -197,9 +197,9 @@ def _edge_samples(levels: tuple[np.ndarray, ...], cells: np.ndarray, intrinsics:
     z = cells[np.minimum(row // BLOCK, cells.shape[0] - 1), np.minimum(column // BLOCK, cells.shape[1] - 1)]
     inner = (row > 2) & (column > 2) & (row < strength.shape[0] - 3) & (column < strength.shape[1] - 3)
     good = np.flatnonzero(np.isfinite(z) & (strength[row, column] > FAINT) & inner)
-    if len(good) > MOST_EDGES:
+    if len(good) > MAX_EDGES:
         weakest_last = np.argsort(-strength[row[good], column[good]], kind="stable")
-        good = np.sort(good[weakest_last[:MOST_EDGES]])
+        good = np.sort(good[weakest_last[:MAX_EDGES]])
     row, column, z = row[good], column[good], z[good]
     pixels = np.column_stack([column, row]).astype(np.float64)
     points = pinhole.rays(pixels, intrinsics) * z[:, None]
@@ -210,4 +210,4 @@ def _edge_samples(levels: tuple[np.ndarray, ...], cells: np.ndarray, intrinsics:
         value = np.ascontiguousarray(level[..., 0])
         if len(x):
             values[number] = cv2.remap(value, x[None], y[None], cv2.INTER_LINEAR)[0]
-    return Points.of(points.T, values, MOST_EDGES)
+    return Points.of(points.T, values, MAX_EDGES)

@@ -16,7 +16,7 @@ from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages, array_of
 
 LINE_SPACING = 10.0
 """Pixels between the samples of a segment: closer ones would measure the same piece of an edge again."""
-LARGEST_ERROR = 0.2
+MAX_DEPTH_ERROR = 0.2
 """Relative standard deviation of a depth that is still of use as a depth."""
 
 
@@ -41,8 +41,8 @@ class Slots:
 
     @property
     def determined(self) -> np.ndarray:
-        """Whether the depth itself is known, bool [m]: no more than `LARGEST_ERROR` of it is its standard deviation."""
-        return np.isfinite(self.inverse_depth) & ~(self.deviation > LARGEST_ERROR * self.inverse_depth)
+        """Whether the depth itself is known, bool [m]: its relative standard deviation is at most `MAX_DEPTH_ERROR`."""
+        return np.isfinite(self.inverse_depth) & ~(self.deviation > MAX_DEPTH_ERROR * self.inverse_depth)
 
     def known_for(self, length: float, focal: float, pixels: float) -> np.ndarray:
         """Whether the depth tells the projection after a motion of `length` to within `pixels`, or is determined, bool

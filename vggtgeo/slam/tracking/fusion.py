@@ -1,5 +1,6 @@
-"""One motion from a keyframe to a frame out of what points, picture, lines and the motion so far know: means by
-information, in the tangent space of the motion.
+"""Fusion of points, image, lines and motion prior into one motion from keyframe to frame.
+
+Estimates are averaged by information in the tangent space of the motion.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ motion. Set so that the squared Mahalanobis distance of dense alignments from th
 chi-square with 6 degrees of freedom, 5.3 (`benchmarks/alignment.py`)."""
 AGREEMENT_GATE = float(chi_square.ppf(0.9999, 6))
 """Squared Mahalanobis distance between the poses by points and by dense alignment below which they are fused."""
-LARGEST_DISAGREEMENT = 0.15
-"""Distance between them, metres, above which many points are preferred to dense alignment."""
+MAX_DISAGREEMENT = 0.15
+"""Distance between them, metres, above which many inliers are preferred to dense alignment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class Motion:
 
 
 def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) -> Motion | None:
-    """The mean of both where they agree to within their noise, else the one with the better evidence."""
+    """Return the mean of both motions if they agree within their noise, else the one with the better evidence."""
     if dense is None:
         return by_points
     by_picture = Motion(dense.motion, dense.information)
@@ -51,14 +52,14 @@ def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) 
         mean = np.linalg.solve(both + 1e-9 * np.eye(6), by_points.information @ off)
         return Motion(exponential(mean) @ dense.motion, both)
     # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
-    near = np.linalg.norm(off[:3]) < LARGEST_DISAGREEMENT or not evidence.points_strong
+    near = np.linalg.norm(off[:3]) < MAX_DISAGREEMENT or not evidence.points_strong
     return by_picture if evidence.dense_fair and near else by_points
 
 
-def drawn_to(found: Motion, prior: Motion) -> Motion:
-    """The mean of a measured motion and the expected one.
+def fused_with_prior(found: Motion, prior: Motion) -> Motion:
+    """Return the mean of a measured motion and the motion prior.
 
-    A direction that is seen badly goes on as the motion did; the information is that of what was measured alone.
+    The prior continues the motion in weakly constrained directions. The information is that of the measurement alone.
     """
     off = tangent(prior.motion @ rigid.invert(found.motion))
     step = np.linalg.solve(found.information + prior.information, prior.information @ off)
@@ -66,21 +67,22 @@ def drawn_to(found: Motion, prior: Motion) -> Motion:
     return Motion(exponential(step) @ found.motion, found.information)
 
 
-def wanting(found: Motion) -> bool:
-    """Whether, in some direction, a motion is known worse than to within what no number of samples removes.
+def weakly_constrained(found: Motion) -> bool:
+    """Return whether the standard deviation in some direction exceeds the systematic error of the motion.
 
-    Elsewhere neither lines nor the points of other keyframes change anything for the better
-    (docs/results/clips.md), and finding lines costs as much as the alignment.
+    Elsewhere neither lines nor points of other keyframes improve the pose (docs/results/clips.md), and line detection
+    costs as much as the alignment.
     """
-    floor = _floor(found.motion)
+    floor = _systematic_sigma(found.motion)
     return bool(np.linalg.eigvalsh(found.information * np.outer(floor, floor))[0] < 1.0)
 
 
 def metre_of(points: np.ndarray, pose: np.ndarray) -> float:
-    """What stands for a metre in a map of free scale, in its unit, where points [m, 3] are seen from a pose [4, 4].
+    """Return the length that stands for a metre in a map of free scale, in its unit, at points [m, 3] seen from a pose
+    [4, 4].
 
-    The mean inverse depth tells how far the image moves for a motion of one unit. In the first views of a map it is
-    about `1 / NOMINAL_DEPTH`, and thresholds are in metres there; where all is far away, places are known worse.
+    The mean inverse depth determines the image motion for a motion of one unit. In the first views of a map it is about
+    `1 / NOMINAL_DEPTH`, and thresholds are in metres there; positions are less accurate where everything is far away.
     """
     if not len(points):
         return 1.0
@@ -98,7 +100,7 @@ def with_lines(
     intrinsics: np.ndarray,
     matcher: LineMatcher,
 ) -> tuple[Motion | None, Evidence]:
-    """What was found (drawn to the prior) with what segments know of it; where nothing was, from the prior by lines."""
+    """Return the motion refined by line segments, with the evidence; without a measured motion, from the prior."""
     measured = np.zeros((6, 6)) if found is None else found.information
     start = prior if found is None else found
     assert start is not None
@@ -111,12 +113,12 @@ def with_lines(
 
 
 def with_systematic(information: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """What is left of an information where the errors that no sample removes are counted in."""
-    return np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + np.diag(_floor(motion) ** 2))
+    """Return the information of a motion after adding its systematic error."""
+    return np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + np.diag(_systematic_sigma(motion) ** 2))
 
 
-def _floor(motion: np.ndarray) -> np.ndarray:
-    """Standard deviations float64 [6] of a motion that no number of samples removes."""
+def _systematic_sigma(motion: np.ndarray) -> np.ndarray:
+    """Return the standard deviations float64 [6] of a motion's systematic error, which samples share."""
     length, angle = (np.linalg.norm(part) for part in np.split(tangent(motion), 2))
     metres, radians, share = SYSTEMATIC
     # Calibration errors grow with the motion; rolling shutter and clock errors do not vanish without it.

@@ -18,7 +18,7 @@ from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
-from vggtgeo.slam.sparse_map.keyframe import LARGEST_ERROR, LINE_SPACING, Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe import LINE_SPACING, MAX_DEPTH_ERROR, Keyframe, Slots
 from vggtgeo.slam.window.line_support import sample_shares, supported
 from vggtgeo.slam.window.selection import Selection
 
@@ -287,7 +287,7 @@ def _initial_depths(
     triangulated, information, longest = _triangulated(keyframes, edges, local, points, intrinsics)
     seen = information > 0
     deviation = np.where(seen, 1.0 / np.sqrt(np.maximum(information, 1e-12)), np.nan)
-    determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (deviation < LARGEST_ERROR * triangulated)
+    determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (deviation < MAX_DEPTH_ERROR * triangulated)
     # Where a depth camera measures nothing there may be glass or a mirror: do not triangulate there.
     free = seen & ~np.array([np.isfinite(own.prior).any() for own in slots])[points.host]
     # Far points whose depth is not determined still fix rotations, as long as their projection does not depend on

@@ -25,7 +25,7 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 PIXELS = 1.0
 """Standard deviation of the distance of an endpoint from its line in another view, pixels."""
-LARGEST_SIGMA = 0.05
+MAX_SIGMA = 0.05
 """Largest relative standard deviation of a depth that counts as known."""
 MIN_VIEWS = 2
 CHANCE = 0.99
@@ -67,7 +67,7 @@ def _triangulated(
     # Weighted sum of squared residuals about the mean: chi-square with `views - 1` degrees of freedom.
     spread = second - total * mean**2
     agree = spread < chi_square.ppf(CHANCE, np.maximum(views - 1, 1))
-    known = (views >= MIN_VIEWS) & agree & (mean > 1e-3) & (sigma < LARGEST_SIGMA * mean)
+    known = (views >= MIN_VIEWS) & agree & (mean > 1e-3) & (sigma < MAX_SIGMA * mean)
     # One end alone does not give a line in space.
     both = known.all(1, keepdims=True)
     return np.where(both, mean, np.nan), np.where(both, sigma, np.nan)
