@@ -1,4 +1,4 @@
-"""Compiling the last adjustment while the run goes on, so that nobody waits for it at the end."""
+"""Compilation of the global adjustment during the run, so that it does not delay the end."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit
 
 CHECKED = (0.3, 0.6, 0.85)
-"""Shares of the frames at which the number of keyframes is foreseen: early, to have time, and again, to be right."""
+"""Shares of the frames at which the number of keyframes is predicted: early for time, and again for accuracy."""
 MIN_KEYFRAMES = 8
-"""Where nobody knows how many frames will come: before the map has so many, it may stay small."""
+"""For an unknown number of frames: smaller maps may stay small."""
 
 
 class CompileAhead(Callback):
-    """Compiles for as many keyframes as the map will have if it goes on as it began. The result of the run is the same
-    whatever it compiles, and what it did not foresee is compiled at the end.
+    """Compile for the predicted number of keyframes.
+
+    The result of the run does not depend on it: other shapes are compiled at the end.
     """
 
     def __init__(self, settings: SlamSettings) -> None:
@@ -48,15 +49,16 @@ class CompileAhead(Callback):
             self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, camera_of(slam))
 
     def on_adjust(self, slam: Slam) -> None:
-        """Waits for what is needed now."""
+        """Wait for the program that is needed now."""
         future = self._asked.get(padded_count(len(slam.keyframes)))
         if future is not None:
             wait([future])
 
 
 def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | None:
-    """How many keyframes a map will have that has `keyframes` after so many of `total` frames; None at most frames: it
-    is foreseen a few times only.
+    """Return the predicted number of keyframes, given `keyframes` after `frames` of `total` frames.
+
+    None at most frames: it is predicted a few times only.
     """
     if total is None:
         return keyframes if keyframes >= MIN_KEYFRAMES else None
@@ -67,8 +69,9 @@ def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | 
 
 @in_double_precision
 def compile_global(shape: GlobalShape, settings: SlamSettings, camera: type[Pinhole | SquarePinhole] = Pinhole) -> None:
-    """Compile the adjustment of maps of a shape and their uncertainties, on a problem that holds one observation: both
-    programs at once, on two cores.
+    """Compile the adjustment of maps of a shape and their uncertainties on a problem with one observation.
+
+    Both programs are compiled at once, on two cores.
     """
     nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
     surfaces = surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing)

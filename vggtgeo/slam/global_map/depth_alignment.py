@@ -1,8 +1,9 @@
-"""Dense depth between keyframes: projective point-to-plane alignment as a quadratic on relative poses, so that surfaces
-without texture speak in the adjustment too (Chen & Medioni 1991; Newcombe et al., KinectFusion, 2011).
+"""Alignment of dense depth between keyframes: point-to-plane as a quadratic on relative poses.
+
+So surfaces without texture constrain the adjustment (Chen & Medioni 1991; Newcombe et al., KinectFusion, 2011).
 
 At the current poses every pair (i, j) gives residuals `n . (T_ji p - q)` in standard deviations of both depths, where
-`q, n` is the surface of j at the pixel that `p` of i falls on. Their normal equations `H, g` over the left tangent
+`q, n` is the surface of j at the pixel to which `p` of i projects. Their normal equations `H, g` over the left tangent
 `eta` of `T_ji` enter the adjustment as a term on the pair. Relinearising after each adjustment makes it Gauss-Newton on
 the sum of both.
 """
@@ -23,15 +24,15 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 CELL = 4
 """Pixels a side of the blocks whose median depth makes one surface point."""
 MAX_DISTANCE = 0.10
-"""Metres between surfaces that can be one."""
+"""Largest distance of points on one surface, metres."""
 MIN_COSINE = 0.8
 MIN_POINTS = 150
-"""Of the source's samples, that a surface of the target is near."""
+"""Minimum number of the source's samples near a surface of the target."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceRows:
-    """Cells in a row: points and unit normals float32 [3, m], camera frame, standard deviations of the depth [m]."""
+    """Cells as rows: points and unit normals float32 [3, m], camera frame, standard deviations of the depth [m]."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -40,7 +41,7 @@ class SurfaceRows:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A keyframe's depth as points float32 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = none.
+    """A keyframe's depth as points float32 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = unknown.
 
     sigma: standard deviation of the depth, metres, [h, w].
     """
@@ -52,7 +53,7 @@ class Surface:
 
     @classmethod
     def of(cls, keyframe: Keyframe, intrinsics: np.ndarray) -> Surface:
-        """Block medians of the depth, and normals from central differences that do not cross a depth jump."""
+        """Compute block medians of the depth, and normals by central differences that do not cross a depth edge."""
         middle = _block_medians(keyframe.depth)
         coarse = pinhole.coarser(intrinsics, CELL)
         points = pinhole.grid_rays(middle.shape, coarse) * middle[..., None]
@@ -68,7 +69,7 @@ class Surface:
 
     @cached_property
     def samples(self) -> SurfaceRows:
-        """Every other cell, as on a chessboard, of those that have a normal: neighbours share their errors."""
+        """Every other cell with a normal, as on a chessboard: neighbours share their errors."""
         rows, columns = np.indices(self.sigma.shape)
         good = np.flatnonzero(np.isfinite(self.rows.normals[0]) & ((rows + columns) % 2 == 0).ravel())
         return SurfaceRows(self.rows.points[:, good], self.rows.normals[:, good], self.rows.sigma[good])
@@ -88,9 +89,9 @@ class Alignment:
 def align(
     first: int, second: int, surfaces: Sequence[Surface], relative: np.ndarray, effective: float
 ) -> Alignment | None:
-    """Linearise surface i = `first` against j = `second`; None where too little overlaps.
+    """Linearise surface i = `first` against j = `second`; None if the overlap is too small.
 
-    Neighbouring depths share their errors: however many points there are, they count as `effective` ones.
+    effective: largest number of independent points, since neighbouring depths share their errors.
     """
     source, target = surfaces[first].samples, surfaces[second]
     turn = relative[:3, :3]
@@ -126,7 +127,7 @@ def align_pairs(
     effective: float,
     room: int | None = None,
 ) -> SurfaceAlignment:
-    """All pairs' alignments at the current poses, as one term; pairs that do not overlap have no weight.
+    """Return the alignments of all pairs at the current poses as one term; pairs without overlap have weight 0.
 
     room: observations of the term, by default one a pair.
     """
@@ -144,7 +145,7 @@ def align_pairs(
 
 
 def _block_medians(values: np.ndarray) -> np.ndarray:
-    """Medians of blocks of `CELL` x `CELL`, float32 [h, w]; NaN where fewer than half of a block is known."""
+    """Return medians of blocks of `CELL` x `CELL`, float32 [h, w]; NaN if fewer than half of a block is known."""
     height, width = values.shape[0] // CELL, values.shape[1] // CELL
     blocks = values[: height * CELL, : width * CELL].astype(np.float32).reshape(height, CELL, width, CELL)
     ordered = np.sort(blocks.transpose(0, 2, 1, 3).reshape(height, width, -1), axis=2)
@@ -154,7 +155,7 @@ def _block_medians(values: np.ndarray) -> np.ndarray:
 
 
 def _normals(points: np.ndarray) -> np.ndarray:
-    """Unit normals towards the camera, NaN at borders, holes and depth jumps."""
+    """Return unit normals towards the camera, NaN at borders, holes and depth edges."""
     normals = np.full_like(points, np.nan)
     right = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]

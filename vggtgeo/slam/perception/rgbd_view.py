@@ -1,4 +1,4 @@
-"""What the direct alignment of two RGB-D images needs of each: a pyramid of brightness, surface points, edge points."""
+"""Data of one image for the direct RGB-D alignment: a pyramid of brightness, surface points, edge points."""
 
 from __future__ import annotations
 
@@ -10,27 +10,29 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 
 WIDTH = 300
-"""Images are shrunk by a whole factor to about so many pixels for the brightness."""
+"""Images are reduced by a whole factor to about this width for the brightness, pixels."""
 LEVELS = 3
 BACKGROUND = 6.0
-"""Standard deviation of the local mean that is taken off, pixels of each level: exposure and shading change it."""
+"""Standard deviation of the blur whose result is subtracted as local mean, pixels of each level: it changes with
+exposure and shading."""
 BLOCK = 2
-"""Cells of the depth, in shrunk pixels a side: their mean is less noisy than one pixel."""
+"""Side of a depth cell, reduced pixels: the mean is less noisy than one pixel."""
 EDGE_CELL = 4
-"""One brightness sample, the one with the strongest gradient, is taken of each such cell, shrunk pixels a side."""
+"""Side of a cell for edge samples, reduced pixels: the pixel with the strongest gradient is used."""
 FAINT = 1.5
-"""Grey levels a pixel; a weaker gradient is noise of the image."""
+"""Minimum gradient, grey levels a pixel; weaker ones are image noise."""
 MAX_POINTS, MAX_EDGES = 2400, 3600
-"""Surface and edge points of the source that take part; more cost time and change nothing: they share their errors."""
+"""Surface and edge points of the source; more cost time and change nothing, since they share their errors."""
 PIXELS_AT_ONCE, CELLS_AT_ONCE = 16384, 4096
-"""Tables have a multiple of so many rows: the alignment is compiled for few sizes of images."""
+"""Tables are padded to a multiple of so many rows: the alignment is compiled for few image sizes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Samples of a view in columns, the first `count` of which are there. points: float32 [3, n] in the camera frame,
-    metres. values: [k, n], what else is known of each: of a surface the unit normal towards the camera and the standard
-    deviation of the depth, metres; of an edge the brightness in each level.
+    """Samples of a view in columns, of which the first `count` are valid.
+
+    points: float32 [3, n] in the camera frame, metres. values: [k, n], further data of each: of a surface the unit
+    normal towards the camera and the standard deviation of the depth, metres; of an edge the brightness in each level.
     """
 
     points: np.ndarray
@@ -39,7 +41,7 @@ class Points:
 
     @classmethod
     def of(cls, points: np.ndarray, values: np.ndarray, room: int) -> Points:
-        """From as many as there are, each in a column; at most `room`."""
+        """Pack samples, one a column, into `room` columns."""
         count = points.shape[1]
         padded = np.zeros((3 + len(values), room), np.float32)
         padded[:3, :count], padded[3:, :count] = points, values
@@ -47,20 +49,19 @@ class Points:
 
     @classmethod
     def none(cls, known: int, room: int) -> Points:
-        """None of which `known` numbers are known besides."""
+        """Return no samples, with `known` further values."""
         return cls.of(np.zeros((3, 0)), np.zeros((known, 0)), room)
 
 
 @dataclass(frozen=True, eq=False)
 class RgbdView:
-    """What an alignment needs of one image.
+    """Data of one image for an alignment.
 
     picture: float32 [p, 3], brightness without its local mean and its derivatives by x and y, all levels one after the
-    other, the finest first, row by row. cells: [c, 7] of the image with depth, row by row: the point in the camera
-    frame, metres, the unit normal towards the camera, and the standard deviation of the depth, metres; normal zero =
-    none. sizes: int32 [levels + 1, 3], width and height of each level and where it begins; the last is that of the
-    cells. intrinsics: [levels + 1, 4] of the same. surface: cells spread over the image. edges: points with a strong
-    gradient.
+    other, the finest first, row by row. cells: [c, 7] of the depth image, row by row: the point in the camera frame,
+    metres, the unit normal towards the camera, and the standard deviation of the depth, metres; normal zero = unknown.
+    sizes: int32 [levels + 1, 3], width and height of each level and its first row; the last is that of the cells.
+    intrinsics: [levels + 1, 4] of the same. surface: cells spread over the image. edges: points with a strong gradient.
     """
 
     picture: np.ndarray
@@ -72,7 +73,9 @@ class RgbdView:
 
     @classmethod
     def of(cls, image: np.ndarray, depth: tuple[np.ndarray, np.ndarray] | None, intrinsics: np.ndarray) -> RgbdView:
-        """From an image uint8 [H, W, 3], its depth float [H, W], metres, NaN = none, and that one's relative sigma."""
+        """Compute the view of an image uint8 [H, W, 3] with depth float [H, W], metres, NaN = unknown, and its relative
+        sigma.
+        """
         factor = max(round(image.shape[1] / WIDTH), 1)
         gray = _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), factor)
         levels = _pyramid(gray)
@@ -95,7 +98,7 @@ class RgbdView:
 
 
 def _padded(rows: np.ndarray, step: int) -> np.ndarray:
-    """The table with zeros behind it, at least one row of them: what is nowhere in view reads the first rows."""
+    """Return the table padded with zeros, at least one row: samples out of view read valid rows."""
     count = (len(rows) // step + 1) * step
     return np.concatenate([rows, np.zeros((count - len(rows), rows.shape[1]), np.float32)])
 
@@ -107,7 +110,7 @@ def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _pyramid(gray: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Brightness without its local mean, and its derivatives by x and y, float32 [h, w, 3] of each level."""
+    """Return brightness without its local mean, and its derivatives by x and y, float32 [h, w, 3] of each level."""
     levels = []
     for level in range(LEVELS):
         image = _shrink(gray, 2**level)
@@ -120,8 +123,10 @@ def _pyramid(gray: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean inverse depth's depth of blocks and its sigma, metres, float32 [h, w]; NaN where half a block is unknown, or
-    across a jump. Neighbouring pixels share their errors (smoothing, interpolation), so a block knows no more than one.
+    """Return the depth at the mean inverse depth of blocks and its sigma, metres, float32 [h, w].
+
+    NaN if half of a block is unknown, or across a depth edge. Neighbouring pixels share their errors (smoothing,
+    interpolation), so the sigma of a block is that of one pixel.
     """
     height, width = depth.shape[0] // factor * factor, depth.shape[1] // factor * factor
     depth = np.ascontiguousarray(depth[:height, :width], np.float32)
@@ -150,7 +155,7 @@ def _unproject_grid(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 
 def _normals(points: np.ndarray) -> np.ndarray:
-    """Unit normals towards the camera from central differences, NaN at borders, holes and jumps of the depth."""
+    """Return unit normals towards the camera by central differences, NaN at borders, holes and depth edges."""
     normals = np.full_like(points, np.nan)
     if min(points.shape[:2]) < 3:
         return normals
@@ -171,7 +176,7 @@ def _cells(points: np.ndarray, normals: np.ndarray, sigma: np.ndarray) -> np.nda
 
 
 def _spread(cells: np.ndarray) -> Points:
-    """At most `MAX_POINTS` cells with a surface, evenly spread."""
+    """Return at most `MAX_POINTS` cells with a surface, evenly spread."""
     known = np.flatnonzero(cells[:, 3:6].any(axis=1))
     # A fixed shuffle: a regular stride would take whole columns of the grid.
     order = np.random.default_rng(0).permutation(len(known))[:MAX_POINTS]
@@ -180,7 +185,7 @@ def _spread(cells: np.ndarray) -> Points:
 
 
 def _edge_samples(levels: tuple[np.ndarray, ...], cells: np.ndarray, intrinsics: np.ndarray) -> Points:
-    """The strongest gradient of each cell whose depth is known, at most `MAX_EDGES` of them, and the brightness there.
+    """Return the strongest gradient of each cell of known depth, at most `MAX_EDGES` of them, and the brightness there.
 
     cells: depth, [h, w]. intrinsics: of the finest level.
     """

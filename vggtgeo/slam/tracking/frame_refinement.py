@@ -38,9 +38,7 @@ REGULARISER = 1e-9
 
 
 def with_view(known: Map, tracker: Tracker, view: RgbdView | None, intrinsics: np.ndarray, roles: Roles) -> Tracker:
-    """Return the tracker with the view of its last frame, which is kept until the next keyframe, for at most
-    `MAX_WAITING` frames.
-    """
+    """Return the tracker with the view of its last frame, kept for the next keyframe, at most `MAX_WAITING` frames."""
     measured = isinstance(roles.depth, SensorDepth) and roles.alignment is not None
     if view is None or not (measured and known.metric):
         return tracker
@@ -112,8 +110,9 @@ def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.nd
 
 
 def squared_distance(off: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return squared Mahalanobis distances [n] of poses `off` [n, 6] apart, in the noise of both; first, second: their
-    information [n, 6, 6].
+    """Return squared Mahalanobis distances [n] of poses `off` [n, 6] apart, in the noise of both.
+
+    first, second: information of each, [n, 6, 6].
     """
     none = REGULARISER * np.eye(6)
     noise = np.linalg.inv(first + none) + np.linalg.inv(second + none)

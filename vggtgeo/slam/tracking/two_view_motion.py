@@ -1,8 +1,8 @@
-"""Motion of a frame from a keyframe whose key points have no depth yet: for turns so fast that points are seen in two
-frames only.
+"""Motion of a frame from a keyframe whose key points have no depth yet.
 
-The essential matrix of the matches gives the rotation and the direction of the translation. Its length is taken from
-the motion so far, since too few depths are known to measure it.
+This happens in turns so fast that points are seen in two frames only. The essential matrix of the matches gives the
+rotation and the direction of the translation. Its length is taken from the motion so far, since too few depths are
+known to measure it.
 
 The information of the motion is that of the matches with depths eliminated: with the rows `J` of a projection over the
 left tangent and its column `c` over the inverse depth of the point, `sum J^T (I - c c^T / c^T c) J / sigma^2`. It has
