@@ -46,12 +46,12 @@ _MAX_KEYFRAMES = 1000
 _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
-def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: int = 4) -> MarginalPrior:
+def empty_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: int = 4) -> MarginalPrior:
     """Return an empty prior (zero information) for `keyframes` keyframes and `parameters` camera parameters.
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.no_prior(4).root.shape
+        >>> vg.empty_prior(4).root.shape
         (28, 28)
 
     """
@@ -71,15 +71,15 @@ def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: in
 def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -> MarginalPrior:
     """Marginalise keyframe `leaving`: return the prior over the other poses and the camera.
 
-    The problem must have a `marginal` term (at first `problem.with_term(no_prior(n))`). The result has the same shape,
-    with zero information about keyframe `leaving`. Pure; `leaving` may be traced.
+    The problem must have a `marginal` term (at first `problem.with_term(empty_prior(n))`). The result has the same
+    shape, with zero information about keyframe `leaving`. Pure; `leaving` may be traced.
 
     Raises:
         InputError: `leaving` is out of range, or `state` does not match `problem` or is not finite.
         ValueError: `problem` has no `marginal` term.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
-        >>> window = problem.with_term(vg.no_prior(4))
+        >>> window = problem.with_term(vg.empty_prior(4))
         >>> prior = jax.eval_shape(vg.marginalise, window, solution.state, jax.numpy.asarray(1))
         >>> prior.root.shape
         (28, 28)
@@ -106,8 +106,8 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     )
 
 
-def reorder(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPrior:
-    """Permute a prior: keyframe `order[i]` comes to position i; -1 inserts a keyframe without information.
+def permute_prior(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPrior:
+    """Permute the keyframes of a prior: keyframe `order[i]` comes to position i; -1 inserts an unknown keyframe.
 
     order: int [n]. Pure; `prior` and `order` may be traced. The values of a traced order are not checked.
 
@@ -116,7 +116,7 @@ def reorder(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPrior:
 
     Example: the first of three keyframes has left, and a new one takes the last position.
         >>> import numpy as np, vggtgeo as vg
-        >>> vg.reorder(vg.no_prior(3), np.array([1, 2, -1])).root.shape
+        >>> vg.permute_prior(vg.empty_prior(3), np.array([1, 2, -1])).root.shape
         (22, 22)
 
     """
@@ -256,7 +256,7 @@ def _marginal_term(problem: Problem) -> MarginalPrior:
         if isinstance(term, MarginalPrior):
             return term
     raise ValueError(
-        "`problem` has no `marginal` term; add `problem.with_term(no_prior(n))` before the first marginalisation"
+        "`problem` has no `marginal` term; add `problem.with_term(empty_prior(n))` before the first marginalisation"
     )
 
 

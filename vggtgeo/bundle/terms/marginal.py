@@ -30,7 +30,7 @@ class MarginalPrior(DenseTerm):
         kernel: robust kernel of each observation.
 
     Example:
-        >>> vg.no_prior(3).root.shape
+        >>> vg.empty_prior(3).root.shape
         (22, 22)
 
     """

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
-from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior
+from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
@@ -79,7 +79,7 @@ def _compile_marginalisation(problem: Problem, initial: State) -> None:
 
 @in_double_precision
 def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, State]:
-    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric), metric=metric))
+    terms = (empty_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric), metric=metric))
     return smallest_problem(window_size(settings), settings, terms)
 
 
@@ -208,7 +208,7 @@ def window_problem(
     """Return the problem of the current window with fixed gauge."""
     numbers, size = window.members, settings.window.size
     places = {number: row for row, number in enumerate(numbers)}
-    prior = no_prior(size) if window.prior is None else window.prior.aligned(numbers, size)
+    prior = empty_prior(size) if window.prior is None else window.prior.aligned(numbers, size)
     adjustment = build(
         [known.keyframes[number] for number in numbers],
         window_edges(known, numbers),

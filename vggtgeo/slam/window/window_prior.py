@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.bundle.marginalisation import reorder
+from vggtgeo.bundle.marginalisation import permute_prior
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 
 
@@ -26,4 +26,4 @@ class WindowPrior:
         places = {number: row for row, number in enumerate(self.keyframes)}
         order = np.full(size, -1)
         order[: len(numbers)] = [places.get(number, -1) for number in numbers]
-        return reorder(self.prior, order)
+        return permute_prior(self.prior, order)
