@@ -201,12 +201,18 @@ def _check_shapes(observations: Observations, poses: np.ndarray) -> None:
             raise InputError(f"`{name}` must have shape {shape}, got {np.shape(given[name])}")
 
 
-def check_intrinsics(camera: Any, intrinsics: np.ndarray, camera_of: np.ndarray | None, keyframes: int) -> None:
-    """Check the number of parameters, positive focal lengths, and the camera of each keyframe."""
+def check_camera(camera: Any) -> None:
+    """Check that `camera` is a camera class."""
     if not (isinstance(camera, type) and issubclass(camera, AbstractCamera)):
         raise InputError(
             f"`camera` must be a camera class, such as `vggtgeo.cameras.RadialTangential`, got {camera!r:.60}"
         )
+
+
+def check_intrinsics(
+    camera: type[AbstractCamera], intrinsics: np.ndarray, camera_of: np.ndarray | None, keyframes: int
+) -> None:
+    """Check the number of parameters, positive focal lengths, and the camera of each keyframe."""
     names, cameras = ", ".join(camera.names), "" if camera_of is None else "g, "
     if intrinsics.ndim != 1 + (camera_of is not None) or intrinsics.shape[-1] != len(camera.names):
         raise InputError(

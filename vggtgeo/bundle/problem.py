@@ -27,7 +27,7 @@ from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole
+from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, SharedFocal
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
@@ -277,6 +277,11 @@ class Problem(eqx.Module):
     def host_of_row(self) -> Int[Array, " h"]:
         """Keyframe that hosts each row of landmarks."""
         return jnp.arange(self.num_keyframes) if self.host is None else self.host
+
+    @property
+    def shared_focal(self) -> bool:
+        """Whether the cameras have one focal length, `fx = fy = f`."""
+        return issubclass(self.camera, SharedFocal)
 
     @property
     def num_parameters(self) -> int:

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from vggtgeo.io.errors import InputError
 
 MIN_RELATIVE_DEPTH = 1e-2
 """Lower bound of `z` in `project`, in units of the point's depth in its own camera: a point nearer than this to the
@@ -160,17 +162,11 @@ def _drawn_radius(camera: KannalaBrandt, angle: Float[Array, ""]) -> Float[Array
     return angle * camera._stretch(angle)
 
 
-class SquarePixels(AbstractCamera):
-    """A model whose pixels are square: one focal length, exactly `fx = fy = f`, and the rest of `model`'s parameters.
+class SharedFocal(AbstractCamera):
+    """A model with one focal length, exactly `fx = fy = f`, and the rest of `model`'s parameters.
 
     Fields:
         parameters: [q], as `names` lists them.
-
-    Example: of a model of one's own, as of this package's fisheye.
-        >>> class SquareFisheye(vg.cameras.SquarePixels):
-        ...     model = vg.cameras.KannalaBrandt
-        >>> SquareFisheye.names
-        ('f', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
 
     """
 
@@ -190,50 +186,33 @@ class SquarePixels(AbstractCamera):
         return self.model(jnp.concatenate([self.parameters[:1], self.parameters]))
 
 
-class SquarePinhole(SquarePixels):
-    """The pinhole with square pixels.
-
-    Fields:
-        parameters: [q], as `names` lists them.
-
-    Example:
-        >>> import jax.numpy as jnp, vggtgeo as vg
-        >>> vg.cameras.SquarePinhole(jnp.array([500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.2, 1.0])).tolist()
-        [370.0, 340.0]
-
-    """
-
-    model = Pinhole
+def has_two_focal_lengths(model: type[AbstractCamera]) -> bool:
+    """Return whether the first parameters of a model are `fx` and `fy`."""
+    return model.names[:2] == ("fx", "fy")
 
 
-class SquareRadialTangential(SquarePixels):
-    """`RadialTangential` with square pixels.
+# Cached: JAX compiles anew for another class, even if it is equal.
+@cache
+def with_shared_focal(model: type[AbstractCamera]) -> type[SharedFocal]:
+    """Return a model with one focal length in place of `fx` and `fy`.
 
-    Fields:
-        parameters: [q], as `names` lists them.
+    Raises:
+        InputError: the first parameters of `model` are not `fx` and `fy`.
 
     Example:
-        >>> vg.cameras.SquareRadialTangential.names
-        ('f', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2')
-
-    """
-
-    model = RadialTangential
-
-
-class SquareKannalaBrandt(SquarePixels):
-    """`KannalaBrandt` with square pixels.
-
-    Fields:
-        parameters: [q], as `names` lists them.
-
-    Example:
-        >>> vg.cameras.SquareKannalaBrandt.names
+        >>> from vggtgeo.geometry.camera_models import with_shared_focal
+        >>> with_shared_focal(vg.cameras.KannalaBrandt).names
         ('f', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
 
     """
-
-    model = KannalaBrandt
+    if not has_two_focal_lengths(model):
+        raise InputError(
+            f"`shared_focal` needs a `camera` whose first parameters are fx and fy, got `{model.__name__}` with "
+            f"{', '.join(model.names)}"
+        )
+    # The module of `model`: a program is kept on disk by the names of its classes, if those are the package's.
+    body = {"model": model, "__module__": model.__module__, "__doc__": f"`{model.__name__}` with one focal length."}
+    return type(SharedFocal)(f"SharedFocal{model.__name__}", (SharedFocal,), body)
 
 
 class Cameras(eqx.Module):
@@ -241,9 +220,9 @@ class Cameras(eqx.Module):
 
     Example: keyframes 0 and 2 were taken by the first of two cameras.
         >>> import jax.numpy as jnp
-        >>> from vggtgeo.geometry.camera_models import Cameras, SquarePinhole
-        >>> both = jnp.array([[500.0, 320.0, 240.0], [300.0, 160.0, 120.0]])
-        >>> float(Cameras(both, SquarePinhole, jnp.array([0, 1, 0])).of(1).parameters[0])
+        >>> from vggtgeo.geometry.camera_models import Cameras, Pinhole
+        >>> both = jnp.array([[500.0, 500.0, 320.0, 240.0], [300.0, 300.0, 160.0, 120.0]])
+        >>> float(Cameras(both, Pinhole, jnp.array([0, 1, 0])).of(1).parameters[0])
         300.0
 
     """

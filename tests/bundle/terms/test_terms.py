@@ -81,19 +81,19 @@ def used(model: Any) -> tuple[jax.Array, jax.Array]:
 
 @pytest.mark.long
 @pytest.mark.parametrize(  # one kind of kernel, so that it is compiled once
-    ("shape", "camera"),
+    ("shape", "shared_focal"),
     [
-        (1.0, vg.cameras.Pinhole),
-        (-2.0, vg.cameras.Pinhole),
-        pytest.param(1.0, vg.cameras.SquarePinhole, marks=pytest.mark.slow),
+        (1.0, False),
+        (-2.0, False),
+        pytest.param(1.0, True, marks=pytest.mark.slow),
     ],
 )
-def test_what_is_written_by_hand_is_what_is_derived(shape: float, camera: type[vg.cameras.AbstractCamera]) -> None:
+def test_what_is_written_by_hand_is_what_is_derived(shape: float, shared_focal: bool) -> None:
     # Proves energy, columns (with and without a correction), gradient and exact model of points and lines, outliers,
     # absent matches and a landmark behind its target included, with two focal lengths and with one. Oracle: automatic
     # differentiation of the residual.
-    scene = replace(SCENE, start_intrinsics=SCENE.start_intrinsics[-len(camera.names) :])
-    problem, state, _ = scene.pack(kernel=Barron(1.5, shape), size=vg.PaddedSize(3, 8, 5, 3), camera=camera)
+    scene = replace(SCENE, start_intrinsics=SCENE.start_intrinsics[int(shared_focal) :])
+    problem, state, _ = scene.pack(kernel=Barron(1.5, shape), size=vg.PaddedSize(3, 8, 5, 3), shared_focal=shared_focal)
     state = eqx.tree_at(lambda s: s.inverse_depth, state, state.inverse_depth.at[0, 0].set(60.0))
     four = eqx.tree_at(lambda s: s.intrinsics, state, jnp.asarray(SCENE.start_intrinsics))
     behind = oracle.seen_from(problem, four)[:, 0, 2] < oracle.LEAST_DEPTH

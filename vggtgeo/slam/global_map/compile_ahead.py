@@ -7,9 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.global_map.global_adjustment import camera_of
+from vggtgeo.slam.global_map.global_adjustment import shares_focal
 from vggtgeo.slam.global_map.global_shape import MAX_DENSE, GlobalShape, global_solver, padded_count, shape_for
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.precision import in_double_precision
@@ -46,7 +45,7 @@ class CompileAhead(Callback):
         padded = padded_count(count)
         if padded <= MAX_DENSE and padded not in self._asked:
             shape = shape_for(padded, self._settings)
-            self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, camera_of(slam))
+            self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, shares_focal(slam))
 
     def on_adjust(self, slam: Slam) -> None:
         """Wait for the program that is needed now."""
@@ -68,7 +67,7 @@ def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | 
 
 
 @in_double_precision
-def compile_global(shape: GlobalShape, settings: SlamSettings, camera: type[Pinhole | SquarePinhole] = Pinhole) -> None:
+def compile_global(shape: GlobalShape, settings: SlamSettings, shared_focal: bool = False) -> None:
     """Compile the adjustment of maps of a shape and their uncertainties on a problem with one observation.
 
     Both programs are compiled at once, on two cores.
@@ -79,7 +78,7 @@ def compile_global(shape: GlobalShape, settings: SlamSettings, camera: type[Pinh
         *factor_terms((), {}, shape.room, metric=True),
         *([surfaces] if settings.depth_terms.surface_points > 0 else []),
     )
-    problem, initial = smallest_problem(shape.size, settings, terms, camera)
+    problem, initial = smallest_problem(shape.size, settings, terms, shared_focal)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)
         solve_jit(problem, initial, global_solver(problem, settings)).energy.block_until_ready()

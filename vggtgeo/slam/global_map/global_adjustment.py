@@ -10,7 +10,6 @@ import numpy as np
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
@@ -75,7 +74,7 @@ class _Whole:
         edges = _edges(slam)
         degrees = np.bincount([edge.host for edge in edges])
         shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.map.factors, len(slam.map.pairs), settings)
-        camera = CameraPrior(slam.camera.given, slam.camera.sigma, camera_of(slam))
+        camera = CameraPrior(slam.camera.given, slam.camera.sigma, shares_focal(slam))
         return cls(edges, _surfaces(slam), camera, shape)
 
     def adjustment(self, slam: Slam, settings: SlamSettings, finds_camera: bool) -> tuple[Adjustment, tuple[str, ...]]:
@@ -117,7 +116,7 @@ class _Whole:
             # Once estimated with all its matches, the camera must not be pulled back by motions tracked with the old
             # one.
             held = KNOWN_SIGMA * slam.intrinsics[0]
-            camera = replace(camera, sigma=np.full(4, held), kind=_of_pixels(slam.intrinsics))
+            camera = replace(camera, sigma=np.full(4, held), shared_focal=are_square(slam.intrinsics))
         return slam, replace(self, edges=_edges(slam), surfaces=_surfaces(slam), camera=camera)
 
 
@@ -174,7 +173,7 @@ def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
 
 def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
     """Return the state after trying non-square pixels for a guessed camera, the last adjustment and its solution."""
-    if adjustment.problem.camera is not SquarePinhole:
+    if not adjustment.problem.shared_focal:
         return slam, adjustment, state
     found = find_aspect(adjustment.problem, state, solve)
     if found is None or not found.pays:
@@ -186,16 +185,12 @@ def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: So
     return replace(slam, notes=(*slam.notes, note)), adjustment, found.state
 
 
-def camera_of(slam: Slam) -> type[Pinhole | SquarePinhole]:
-    """Return the camera model of the global adjustment.
+def shares_focal(slam: Slam) -> bool:
+    """Return whether the global adjustment has one focal length, `fx = fy`.
 
-    A guessed camera has square pixels, unless self-calibration found others.
+    For a guessed camera, unless self-calibration found pixels that are not square.
     """
-    return Pinhole if slam.camera.calibrated else _of_pixels(slam.camera.given)
-
-
-def _of_pixels(intrinsics: np.ndarray) -> type[Pinhole | SquarePinhole]:
-    return SquarePinhole if are_square(intrinsics) else Pinhole
+    return not slam.camera.calibrated and are_square(slam.camera.given)
 
 
 def _edges(slam: Slam) -> list[Directed]:

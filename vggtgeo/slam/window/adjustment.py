@@ -13,7 +13,6 @@ from vggtgeo.bundle.padding import PaddedSize, SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -34,17 +33,18 @@ in tracking: that of a match (`PIXEL_SIGMA` in `tracking/track.py`). It excludes
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """Prior of the intrinsics. mean, sigma: float64 [4] of fx, fy, cx, cy, pixels. kind: camera model; a guessed camera
-    has square pixels.
+    """Prior of the intrinsics. mean, sigma: float64 [4] of fx, fy, cx, cy, pixels.
+
+    shared_focal: whether `fx = fy`; a guessed camera has square pixels.
     """
 
     mean: np.ndarray
     sigma: np.ndarray
-    kind: type[Pinhole | SquarePinhole] = Pinhole
+    shared_focal: bool = False
 
     def parameters(self, intrinsics: np.ndarray) -> np.ndarray:
         """Return the parameters of the model from fx, fy, cx, cy (or from their standard deviations)."""
-        return np.array([np.mean(intrinsics[:2]), *intrinsics[2:]]) if self.kind is SquarePinhole else intrinsics
+        return np.array([np.mean(intrinsics[:2]), *intrinsics[2:]]) if self.shared_focal else intrinsics
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def build(
         size=size,
         intrinsics_mean=camera.parameters(camera.mean),
         intrinsics_sigma=camera.parameters(camera.sigma),
-        camera=camera.kind,
+        shared_focal=camera.shared_focal,
         fixed_pose=fixed_pose,
         kernel=settings.window.kernel,
         terms=terms,
@@ -166,8 +166,8 @@ def write_back(
         samples = _updated(keyframe.samples, adjustment, depths, here & adjustment.is_line)
         updated.append(replace(keyframe, pose=poses[i], points=points, samples=samples))
     parameters = np.asarray(state.intrinsics, np.float64)
-    square = adjustment.problem.camera is SquarePinhole
-    return tuple(updated), np.array([parameters[0], *parameters]) if square else parameters
+    shared = adjustment.problem.shared_focal
+    return tuple(updated), np.array([parameters[0], *parameters]) if shared else parameters
 
 
 def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.ndarray) -> Slots:

@@ -18,7 +18,6 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.models.classical import can_search
 from vggtgeo.slam.precision import in_double_precision
@@ -84,7 +83,7 @@ def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, Sta
 
 
 def smallest_problem(
-    size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm], camera: type[AbstractCamera] = Pinhole
+    size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm], shared_focal: bool = False
 ) -> tuple[Problem, State]:
     """Return a problem of the given shape with one observation, and its initial state, for compilation."""
     one = Observations(
@@ -98,9 +97,9 @@ def smallest_problem(
         segment=np.full(1, -1) if settings.line.two_ends_lines else None,
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
-    intrinsics = np.array([100.0, 100.0, 50.0, 50.0])[-len(camera.names) :]
-    kernel = settings.window.kernel
-    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=size, camera=camera, kernel=kernel, terms=terms)
+    intrinsics = np.array([100.0, 50.0, 50.0] if shared_focal else [100.0, 100.0, 50.0, 50.0])
+    options = {"size": size, "kernel": settings.window.kernel, "terms": terms, "shared_focal": shared_focal}
+    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), **options)
     return problem, initial
 
 
