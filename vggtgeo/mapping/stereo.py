@@ -37,7 +37,7 @@ class StereoSettings:
 
     Fields: views, maximum number of neighbours. planes, number of depths. size, longer side of the images in the
     search, pixels. window, width of the correlation window there, odd. smooth and jump, penalties of the semi-global
-    matching, in units of 1 - correlation. margin, minimum margin of a pixel's plane, same unit. least_views, number of
+    matching, in units of 1 - correlation. margin, minimum margin of a pixel's plane, same unit. min_views, number of
     neighbours that must confirm a depth.
     """
 
@@ -48,10 +48,10 @@ class StereoSettings:
     smooth: float = 0.04
     jump: float = 0.5
     margin: float = 0.02
-    least_views: int = 2
+    min_views: int = 2
 
     def __post_init__(self) -> None:
-        minima = {"views": 1, "planes": 8, "size": 32, "window": 3, "least_views": 1}
+        minima = {"views": 1, "planes": 8, "size": 32, "window": 3, "min_views": 1}
         for name, minimum in minima.items():
             if getattr(self, name) < minimum:
                 raise InputError(f"`{name}` must be at least {minimum}, got {getattr(self, name)}")
@@ -88,7 +88,7 @@ def stereo_depths(
     result: list[DepthMap | None] = []
     for i, own in enumerate(found):
         others = [other for j in views[i] if (other := found[j]) is not None]
-        confirmed = None if own is None else confirm(own, others, settings.least_views)
+        confirmed = None if own is None else confirm(own, others, settings.min_views)
         if confirmed is None or confirmed.empty:
             result.append(None)
         else:
