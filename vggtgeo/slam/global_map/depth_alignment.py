@@ -18,6 +18,7 @@ import numpy as np
 
 from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.slam.perception.rgbd_view import surface_normals
 from vggtgeo.slam.sparse_map.factors import surface_term
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
@@ -59,7 +60,9 @@ class Surface:
         points = pinhole.grid_rays(middle.shape, coarse) * middle[..., None]
         sigma = _block_medians(keyframe.depth_sigma) * middle
         # Those of all keyframes are in memory together: half a megabyte each in single precision.
-        return cls(points.astype(np.float32), _normals(points).astype(np.float32), sigma.astype(np.float32), coarse)
+        return cls(
+            points.astype(np.float32), surface_normals(points).astype(np.float32), sigma.astype(np.float32), coarse
+        )
 
     @cached_property
     def rows(self) -> SurfaceRows:
@@ -152,18 +155,3 @@ def _block_medians(values: np.ndarray) -> np.ndarray:
     count = np.isfinite(ordered).sum(2)
     middle = np.take_along_axis(ordered, (count // 2)[..., None].clip(0, CELL**2 - 1), 2)[..., 0]
     return np.where(count >= CELL**2 // 2, middle, np.nan)
-
-
-def _normals(points: np.ndarray) -> np.ndarray:
-    """Return unit normals towards the camera, NaN at borders, holes and depth edges."""
-    normals = np.full_like(points, np.nan)
-    right = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    normal = rigid.cross(down, right)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        z = points[1:-1, 1:-1, 2]
-        # A difference across a depth jump is no tangent of either surface.
-        smooth = (np.abs(right[..., 2]) < 0.1 * z) & (np.abs(down[..., 2]) < 0.1 * z)
-        normal = normal / np.linalg.norm(normal, axis=2, keepdims=True)
-    normals[1:-1, 1:-1] = np.where(smooth[..., None], normal, np.nan)
-    return normals

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import inverse_information
 from vggtgeo.models.classical import can_search, pose_information
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
 from vggtgeo.slam.global_map.straightening import Loop, straightened
@@ -133,6 +134,6 @@ def verify(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarr
     information = pose_information(guess.pose, points[guess.inliers], intrinsics, PIXEL_SIGMA)
     # Covariances add: matching noise, and what all matches share.
     floor = np.diag(np.repeat(FLOOR, 3) ** 2)
-    information = np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + floor)
+    information = np.linalg.inv(inverse_information(information) + floor)
     ratio = ratio_of_units(first, second, agreed.select(agreed.index_j >= 0), relative, intrinsics)
     return Loop(pair, MeasuredRelativePose(*pair.key, relative, information), ratio)

@@ -27,6 +27,7 @@ from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.relative_pose import RelativePose
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import POSE_GATE
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.global_map.global_shape import padded_count
 from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, relative_pose_rows
@@ -35,7 +36,7 @@ from vggtgeo.solvers.kernels import Cauchy
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
 
-BELIEF = float(chi_square.ppf(0.9999, 6))
+BELIEF = POSE_GATE
 """Squared Mahalanobis distance above which a loop is false: one true loop in 10,000 is lost."""
 GRADUATION = Graduation(factors=(256.0, 64.0, 16.0, 4.0), iterations=6)
 """A loop of 2 cm against 10 m of drift has a residual of 500 standard deviations, half of the first width."""

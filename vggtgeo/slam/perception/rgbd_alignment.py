@@ -24,6 +24,7 @@ from jax import lax
 
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.perception.rgbd_view import LEVELS, Points, RgbdView
 from vggtgeo.slam.precision import in_double_precision
@@ -40,8 +41,6 @@ known to a millimetre at best; a tenth of this takes twice the iterations (`benc
 COARSE_SPREAD = 2.0
 """Factor on the spread of surface residuals on coarse levels, so that brightness leads where a surface slides along
 itself (`benchmarks/alignment.py`)."""
-TUKEY = 4.685
-"""Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
 BITS = 20
 """Binary digits of a median, including sign and exponent: precise to 0.05 %."""
 
@@ -306,8 +305,7 @@ def _weighted(term: _Term, of: _Agreement, least: jax.Array, spread: jax.Array) 
     """Return derivatives and residual [7, m] of a term, with weights and without; zero for samples out of view."""
     used = term.seen & of.enough
     rows = jnp.where(used, jnp.concatenate([term.jacobian, term.residual[None]]), 0)
-    # 1.4826: the standard deviation of a normal distribution over its median absolute deviation.
-    usual = 1.4826 * _median(jnp.abs(term.residual), used, of.number)
+    usual = MAD_SIGMA * _median(jnp.abs(term.residual), used, of.number)
     scale = jnp.where(of.enough, jnp.maximum(usual, least), 1)
     share = rows[6] / (TUKEY * scale)
     # `spread` neighbouring samples share one error, so each has that part of its information.

@@ -17,6 +17,8 @@ BACKGROUND = 6.0
 exposure and shading."""
 BLOCK = 2
 """Side of a depth cell, reduced pixels: the mean is less noisy than one pixel."""
+MAX_STEP = 0.1
+"""Relative difference of depth between the neighbours of a cell above which they are on different surfaces."""
 EDGE_CELL = 4
 """Side of a cell for edge samples, reduced pixels: the pixel with the strongest gradient is used."""
 FAINT = 1.5
@@ -86,7 +88,7 @@ class RgbdView:
         if depth is not None and np.isfinite(depth[0]).any():
             z, sigma = _cell_means(*depth, factor * BLOCK)
             points = _unproject_grid(z, coarse)
-            normals = _normals(points)
+            normals = surface_normals(points)
             shape, cells = z.shape, _cells(points, normals, sigma)
             surface, edges = _spread(cells), _edge_samples(levels, z, cameras[0])
         picture = np.concatenate([level.reshape(-1, 3) for level in levels])
@@ -154,7 +156,7 @@ def _unproject_grid(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     return pinhole.grid_rays(depth.shape, intrinsics, np.float32) * depth[..., None]
 
 
-def _normals(points: np.ndarray) -> np.ndarray:
+def surface_normals(points: np.ndarray) -> np.ndarray:
     """Return unit normals towards the camera by central differences, NaN at borders, holes and depth edges."""
     normals = np.full_like(points, np.nan)
     if min(points.shape[:2]) < 3:
@@ -164,7 +166,8 @@ def _normals(points: np.ndarray) -> np.ndarray:
     normal = rigid.cross(down, right)
     z = points[1:-1, 1:-1, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
-        smooth = (np.abs(right[..., 2]) < 0.1 * z) & (np.abs(down[..., 2]) < 0.1 * z)
+        # A difference across a depth edge is no tangent of either surface.
+        smooth = (np.abs(right[..., 2]) < MAX_STEP * z) & (np.abs(down[..., 2]) < MAX_STEP * z)
         normal = normal / np.linalg.norm(normal, axis=2, keepdims=True)
     normals[1:-1, 1:-1] = np.where(smooth[..., None], normal, np.nan)
     return normals

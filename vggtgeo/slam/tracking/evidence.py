@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import POSE_GATE, inverse_information
 
 NAN = float("nan")
 MIN_INLIERS = 12
@@ -37,7 +37,7 @@ BARE_SURFACE, BARE_OVERLAP, BARE_SIGMA = 0.95, 0.5, 0.03
 the worst direction, metres."""
 MAX_SIGMA = 0.10
 """Largest standard deviation of an accepted pose in its worst direction, metres."""
-STEP_GATE = float(chi_square.ppf(0.9999, 6))
+STEP_GATE = POSE_GATE
 """Gate of the squared Mahalanobis distance to the prediction, 6 degrees of freedom."""
 MIN_CORRELATION_RATIO = 0.8
 """Correlation that an old keyframe must have to become the reference again, relative to that of the current one. A
@@ -200,6 +200,5 @@ def worst_sigma(information: np.ndarray) -> tuple[float, float]:
     """Return the standard deviations of translation and of rotation in their worst directions. information: float64 [6,
     6].
     """
-    # The regulariser turns a direction without information into a very large, but finite, standard deviation.
-    covariance = np.linalg.inv(information + 1e-9 * np.eye(6))
+    covariance = inverse_information(information)
     return tuple(float(np.sqrt(np.linalg.eigvalsh(covariance[i : i + 3, i : i + 3])[-1])) for i in (0, 3))  # type: ignore[return-value]

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import inverse_information
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.slam.perception.rgbd_alignment import Aligned, RgbdAlignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
@@ -33,8 +34,6 @@ FINEST = (4, 0, 0)
 MAX_WAITING = 16
 """Frames whose images wait for the next keyframe, 2 MB each. If the reference stays longer, the nearest earlier
 keyframe is used."""
-REGULARISER = 1e-9
-"""Information, 1/m^2 and 1/rad^2, that makes a singular matrix invertible."""
 
 
 def with_view(known: Map, tracker: Tracker, view: RgbdView | None, intrinsics: np.ndarray, roles: Roles) -> Tracker:
@@ -114,8 +113,7 @@ def squared_distance(off: np.ndarray, first: np.ndarray, second: np.ndarray) -> 
 
     first, second: information of each, [n, 6, 6].
     """
-    none = REGULARISER * np.eye(6)
-    noise = np.linalg.inv(first + none) + np.linalg.inv(second + none)
+    noise = inverse_information(first) + inverse_information(second)
     return np.asarray(np.einsum("ni,ni->n", off, np.linalg.solve(noise, off[..., None])[..., 0]))
 
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import POSE_GATE, REGULARISER, inverse_information
 from vggtgeo.models.roles import LineFeatures, LineMatcher
 from vggtgeo.slam.perception.rgbd_alignment import Aligned
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -23,7 +23,7 @@ SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
 """Standard deviation of errors that samples share (calibration, rolling shutter, clocks): metres, radians, share of the
 motion. Set so that the squared Mahalanobis distance of dense alignments from the ground truth has the median of
 chi-square with 6 degrees of freedom, 5.3 (`benchmarks/alignment.py`)."""
-AGREEMENT_GATE = float(chi_square.ppf(0.9999, 6))
+AGREEMENT_GATE = POSE_GATE
 """Squared Mahalanobis distance between the poses by points and by dense alignment below which they are fused."""
 MAX_DISAGREEMENT = 0.15
 """Distance between them, metres, above which many inliers are preferred to dense alignment."""
@@ -49,7 +49,7 @@ def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) 
     noise = [np.linalg.inv(with_systematic(one.information, one.motion)) for one in (by_points, by_picture)]
     if off @ np.linalg.solve(noise[0] + noise[1], off) < AGREEMENT_GATE:
         both = by_points.information + dense.information
-        mean = np.linalg.solve(both + 1e-9 * np.eye(6), by_points.information @ off)
+        mean = np.linalg.solve(both + REGULARISER * np.eye(6), by_points.information @ off)
         return Motion(exponential(mean) @ dense.motion, both)
     # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
     near = np.linalg.norm(off[:3]) < MAX_DISAGREEMENT or not evidence.points_strong
@@ -114,7 +114,7 @@ def with_lines(
 
 def with_systematic(information: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """Return the information of a motion after adding its systematic error."""
-    return np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + np.diag(_systematic_sigma(motion) ** 2))
+    return np.linalg.inv(inverse_information(information) + np.diag(_systematic_sigma(motion) ** 2))
 
 
 def _systematic_sigma(motion: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -31,8 +32,6 @@ from vggtgeo.slam.tracking.evidence import tangent, worst_sigma
 
 END_SIGMA = 0.7
 """Standard deviation of a segment's end across it, pixels."""
-TUKEY = 4.685
-"""Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
 MIN_LINES = 3
 """Three lines in general position determine a pose."""
 MIN_DEPTH = 0.1
@@ -214,8 +213,7 @@ def _without_chance(hessian: np.ndarray, by_chance: np.ndarray) -> np.ndarray:
 def _weights(residual: np.ndarray) -> np.ndarray:
     """Return Tukey's weights; larger residuals than expected widen the kernel and lower all weights."""
     finite = np.isfinite(residual)
-    # 1.4826: the standard deviation of a normal distribution over its median absolute deviation.
-    scale = max(1.4826 * float(np.median(np.abs(residual[finite]))), 1.0) if finite.any() else 1.0
+    scale = max(MAD_SIGMA * float(np.median(np.abs(residual[finite]))), 1.0) if finite.any() else 1.0
     inside = np.where(finite, residual / (TUKEY * scale), 1.0)
     return np.maximum(1.0 - inside**2, 0.0) ** 2 / scale**2
 

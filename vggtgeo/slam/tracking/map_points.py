@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import POSE_GATE, TUKEY, inverse_information
 from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -28,9 +28,6 @@ MAX_POINTS = 300
 MAX_TURN = np.deg2rad(45.0)
 """Largest angle between a keyframe and a frame: descriptors of key points change too much beyond."""
 MIN_POINTS = 8
-GATE = float(chi_square.ppf(0.9999, 6))
-TUKEY = 4.685
-"""Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
 STEPS = 4
 
 
@@ -188,10 +185,9 @@ def _should_show(
 
 def _agrees(own: _Equations, known: np.ndarray, bound: Bound) -> bool:
     """Return whether these points agree with the known pose within the noise of both."""
-    tiny = 1e-9 * np.eye(6)
-    noise = np.linalg.inv(bound(own.hessian, own.motion) + tiny) + np.linalg.inv(known + tiny)
+    noise = inverse_information(bound(own.hessian, own.motion)) + inverse_information(known)
     step = own.step()
-    return float(step @ np.linalg.solve(noise, step)) < GATE
+    return float(step @ np.linalg.solve(noise, step)) < POSE_GATE
 
 
 def _solve(hessian: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -97,7 +97,7 @@ def smallest_problem(
         segment=np.full(1, -1) if settings.line.two_ends_lines else None,
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
-    intrinsics = np.array([100.0, 50.0, 50.0] if shared_focal else [100.0, 100.0, 50.0, 50.0])
+    intrinsics = np.array([100.0, 100.0, 50.0, 50.0])[int(shared_focal) :]
     options = {"size": size, "kernel": settings.window.kernel, "terms": terms, "shared_focal": shared_focal}
     problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), **options)
     return problem, initial
