@@ -34,7 +34,7 @@ from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import STATE, load_state, save_state
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import SeenPoints, Waiting
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import WindowPrior
 
 MIDDLE = 4
 """Frame of the recorded run whose state is saved."""

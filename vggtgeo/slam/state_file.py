@@ -45,8 +45,7 @@ from vggtgeo.slam.state_checks import check_state
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, Waiting
 from vggtgeo.slam.window.adjustment import Adjustment
-from vggtgeo.slam.window.window import Window
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import Window, WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 

@@ -25,8 +25,7 @@ from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.window.sliding_window import make_room
-from vggtgeo.slam.window.window import Window
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import Window, WindowPrior
 
 KEYFRAMES, POINTS = 7, 12
 SOLVE = eqx.filter_jit(solve)

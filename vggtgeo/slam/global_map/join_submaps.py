@@ -18,7 +18,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import relocalise
 from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput
 from vggtgeo.slam.tracking.tracker import scaled_record
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import WindowPrior
 
 TRIED = 2
 """Keyframes of other submaps that are verified for each new keyframe."""

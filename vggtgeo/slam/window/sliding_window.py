@@ -30,8 +30,7 @@ from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.window.gauge import Gauge, gauge_notes, with_one_gauge
 from vggtgeo.slam.window.line_triangulation import with_segment_depths
-from vggtgeo.slam.window.window import Window
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import Window, WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 
