@@ -1,8 +1,7 @@
-"""Camera models as differentiable functions of their parameters: from a point in front of the camera to its pixel, and
-back to its viewing ray.
+"""Camera models as differentiable functions of their parameters: projection of points, and viewing rays of pixels.
 
-Each model is a module that holds one vector of parameters, so that bundle adjustment can move, hold or differentiate
-it. A point is given up to a positive factor, `z > 0`; a ray has `z = 1`, so fields of view stay below 180 degrees.
+Each model is a module with one vector of parameters, so that bundle adjustment can estimate, fix or differentiate it. A
+point is given up to a positive factor, `z > 0`; a ray has `z = 1`, so fields of view stay below 180 degrees.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.io.errors import InputError
 
 MIN_RELATIVE_DEPTH = 1e-2
-"""Lower bound of `z` in `project`, in units of the point's depth in its own camera: a point nearer than this to the
-camera's plane, or behind it, projects as if it lay there, far outside the image, where a robust kernel sees it as an
-outlier; the projection never divides by zero."""
+"""Lower bound of `z` in `project`, relative to the depth in the host camera. A point nearer to the camera's plane, or
+behind it, is projected as if at this bound, far outside the image, where a robust kernel treats it as an outlier; the
+projection never divides by zero."""
 
 _NEWTON_STEPS = 8
-"""To undo a distortion: quadratic convergence reaches the last digits long before."""
+"""Newton steps to invert a distortion: convergence is quadratic, so that all digits are reached long before."""
 
 
 class AbstractCamera(eqx.Module):
-    """A camera model: focal lengths and principal point first, then what the model adds.
+    """A camera model: focal lengths and principal point first, then further parameters.
 
     Fields:
-        parameters: [q], as `names` lists them: pixels, then the distortion's without a unit.
+        parameters: [q], as listed in `names`: pixels, then distortion without a unit.
 
     Example:
         >>> vg.cameras.KannalaBrandt.names[:4]
@@ -47,11 +46,11 @@ class AbstractCamera(eqx.Module):
 
     @abc.abstractmethod
     def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Return pixel of a point in camera coordinates (any positive multiple of it), pixels."""
+        """Return the pixel of a point in camera coordinates (any positive multiple of it)."""
 
     @abc.abstractmethod
     def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Return viewing ray of a pixel, with `z = 1`."""
+        """Return the viewing ray of a pixel, with `z = 1`."""
 
 
 class Pinhole(AbstractCamera):
@@ -158,7 +157,7 @@ class KannalaBrandt(AbstractCamera):
 
 
 def _drawn_radius(camera: KannalaBrandt, angle: Float[Array, ""]) -> Float[Array, ""]:
-    """Return where a fisheye draws a ray at this angle from its axis, in focal lengths."""
+    """Return the radius at which a fisheye draws a ray at this angle from its axis, in focal lengths."""
     return angle * camera._stretch(angle)
 
 
@@ -235,13 +234,14 @@ class Cameras(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return number of parameters of one camera, `k`."""
+        """Number of parameters of one camera, `k`."""
         return self.parameters.shape[-1]
 
     @property
     def seen(self) -> int:
-        """Return number of parameters that an edge sees: those of the target's camera and of the host's, once if all
-        keyframes share one.
+        """Number of parameters that an edge depends on.
+
+        Those of the target's camera and of the host's; once if all keyframes share one camera.
         """
         return self.size if self.group is None else 2 * self.size
 
@@ -253,8 +253,9 @@ class Cameras(eqx.Module):
     def along(
         self, ends: tuple[Int[Array, ""], Int[Array, ""]], steps: list[Array]
     ) -> tuple[AbstractCamera, AbstractCamera]:
-        """Host's and target's camera of an edge `(i, j)`, after steps of the parameters that it sees: the target's,
-        then the host's, or those of the camera that all share.
+        """Return the cameras of host and target of an edge `(i, j)`, after steps of their parameters.
+
+        steps: of the target's camera, then of the host's; or of the camera that all share.
         """
         camera = self.of(ends[1], steps[0])
         return (camera if self.group is None else self.of(ends[0], steps[1])), camera
@@ -269,7 +270,7 @@ def _ray(flat: Float[Array, "2"]) -> Float[Array, "3"]:
 
 
 def _norm(flat: Float[Array, "2"]) -> Float[Array, ""]:
-    """Length of a vector; its derivatives at zero are zero, not NaN."""
+    """Return the length of a vector; its derivatives at zero are zero, not NaN."""
     squared = jnp.sum(flat * flat)
     # Two `where`: the derivative of the root at zero is infinite, also in the branch that is not taken.
     somewhere = squared > 1e-12
@@ -280,7 +281,7 @@ def _norm(flat: Float[Array, "2"]) -> Float[Array, ""]:
 def _inverted(
     function: Callable[[Any, Array], Array], camera: AbstractCamera, value: Float[Array, "*d"]
 ) -> Float[Array, "*d"]:
-    """`x` with `function(camera, x) = value`, a number or two, by Newton's method from `x = value`."""
+    """Return `x` with `function(camera, x) = value`, a number or two, by Newton's method from `x = value`."""
 
     def step(_: Int[Array, ""] | int, x: Array) -> Array:
         return x - _divided(function(camera, x) - value, jax.jacfwd(function, 1)(camera, x))
@@ -292,7 +293,7 @@ def _inverted(
 def _inverted_jvp(
     function: Callable[[Any, Array], Array], at: tuple[Any, Array], along: tuple[Any, Array]
 ) -> tuple[Array, Array]:
-    """Return the implicit function theorem, in which `x` is again an inverse: exact to any order."""
+    """Differentiate by the implicit function theorem, in which `x` is again an inverse: exact to any order."""
     camera, value = at
     x = _inverted(function, camera, value)
     _, moved = jax.jvp(lambda camera: function(camera, x), (camera,), along[:1])
@@ -300,7 +301,7 @@ def _inverted_jvp(
 
 
 def _divided(vector: Float[Array, "*d"], matrix: Float[Array, "*dd"]) -> Float[Array, "*d"]:
-    """`matrix^-1 vector`, written out: a factorisation for each of many thousand pixels takes many times as long."""
+    """Return `matrix^-1 vector`, written out: a factorisation for each of many thousand pixels is many times slower."""
     if vector.ndim == 0:
         return vector / matrix
     (a, b), (c, d) = matrix

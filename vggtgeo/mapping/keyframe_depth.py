@@ -155,7 +155,7 @@ def _neighbours(
 
 
 def _points(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Sampled points of a depth map in the camera frame, float32 [3, n], metres."""
+    """Return sampled points of a depth map in the camera frame, float32 [3, n], metres."""
     rows, columns = np.mgrid[STEP // 2 : depth.shape[0] : STEP, STEP // 2 : depth.shape[1] : STEP].reshape(2, -1)
     z = depth[rows, columns]
     known = np.isfinite(z)

@@ -113,7 +113,7 @@ class _Window:
         return inside, product
 
     def _mean_into(self, mean: np.ndarray, image: np.ndarray) -> None:
-        """As `box`, to 1e-7 of the largest value, in two thirds of its time."""
+        """Compute `box`, accurate to 1e-7 of the largest value, in two thirds of its time."""
         cv2.sepFilter2D(image, cv2.CV_32F, self._taps, self._taps, dst=mean, borderType=cv2.BORDER_REFLECT_101)
 
 

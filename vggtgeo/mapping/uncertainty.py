@@ -99,8 +99,10 @@ def _bend(inverse_depth: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _seen(reference: Photo, other: Photo, inverse_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Grey level of `other` at each pixel's point (below 0 outside), its derivative with respect to inverse depth, and
-    the pixels that the projection moves per inverse depth; float32 [H, W] each.
+    """Return the grey level of `other` at each pixel's point, its derivative, and the pixels moved; float32 [H, W]
+    each.
+
+    The grey level is below 0 outside. Derivative and motion are with respect to inverse depth.
     """
     height, width = inverse_depth.shape
     relative = (other.pose @ np.linalg.inv(reference.pose)).astype(np.float32)
