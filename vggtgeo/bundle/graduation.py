@@ -59,6 +59,7 @@ class Graduation(eqx.Module):
                 state,
                 args=BundleAdjustment(wide),
                 max_steps=self.iterations,
+                # A stage that ends early still leaves a better start.
                 throw=False,
             )
             return found.value, None

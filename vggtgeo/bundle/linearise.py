@@ -54,6 +54,7 @@ def linearise(
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
     degree, size = problem.edges.of_host.shape[1], lie.TANGENT + cameras.seen
     apart = cameras.seen - cameras.size  # parameters of the target's camera, if it can differ from the host's
+    # Rows of `cross`: `eta` of each edge, the target's camera of each edge (if several), the host's camera.
     wide = lie.TANGENT * degree
     common = wide + apart * degree
 
@@ -347,6 +348,7 @@ def _node_factors(
             whole = jnp.zeros((len(gradient), 2 * block + tail, 2 * block + tail), gradient.dtype)
             whole = whole.at[:, apart[:, None], apart].set(hessian)
             spread = jnp.zeros((len(gradient), 2 * block + tail), gradient.dtype).at[:, apart].set(gradient)
+            # The index after the last node means none (`NodeFactors`).
             no_node = jnp.full_like(touched[0], problem.num_keyframes)
             found.append(NodeFactors(touched[0], no_node, whole, spread))
     if not found:
@@ -379,6 +381,7 @@ def _dense_terms(
         hessian, gradient = hessian + own, gradient.at[-tail:].add(force)
     if not problem.dense_terms:
         return hessian, gradient
+    # Dense terms couple all poses, so the matrix grows to all dense coordinates.
     hessian = jnp.pad(hessian, (problem.num_camera - tail, 0))
     for dense in problem.dense_terms:
         own, force = dense.model(state.poses, state.parameters, correction, exact)

@@ -173,6 +173,8 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
     """Return the part of a term that is removed with a keyframe; terms on the camera alone stay in the problem."""
     goes: Array
     if isinstance(term, EdgeTerm):
+        # Observations of other hosts in this keyframe are dropped: as a prior they would couple their landmarks, and
+        # the structure would no longer be an arrow.
         goes = (problem.edges.source == leaving)[:, None]
     elif isinstance(term, SlotTerm | HostPixel):
         goes = (problem.host_of_row == leaving)[:, None]
@@ -181,6 +183,7 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
     elif isinstance(term, PairTerm):
         goes = (term.first == leaving) | (term.second == leaving)
     else:
+        # The earlier prior becomes part of the new one. Terms on the camera stay in the problem and would count twice.
         goes = jnp.asarray(isinstance(term, DenseTerm) and not isinstance(term, CameraTerm))
     return term.reweighted(jnp.where(goes, term.weight, jnp.zeros_like(term.weight)))
 

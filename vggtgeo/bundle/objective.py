@@ -177,6 +177,7 @@ def places(problem: Problem) -> Place:
 def view_of(cameras: Cameras, hosts: Hosts, place: Place, motion: Motions) -> EdgeView:
     """Return the slots of a row, seen along the edge at `place` with that relative pose."""
     own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, place.row, keepdims=False), hosts)
+    # Once for an edge: all its terms share the rays and the projection.
     fast, projection = None, None
     known = pinhole_parameters(cameras)
     if own.rays is not None and known is not None:

@@ -197,6 +197,7 @@ def _solve_jit(
         args=BundleAdjustment(problem, initial),
         max_steps=solver.max_iterations,
         adjoint=adjoint,
+        # Failure is a value, `termination`: an exception inside `jit` would lose the state.
         throw=False,
     )
     last = jax.lax.stop_gradient(eqx.filter(found.state, eqx.is_array))

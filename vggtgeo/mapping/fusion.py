@@ -171,6 +171,7 @@ class SurfaceFusion:
     def _fuse(self, changed: set[Block]) -> int:
         min_count = min(self._min_views, len(self._fused))
         if min_count != self._min_count:
+            # Another number of required views may change every block.
             changed, self._min_count = set(self._touched), min_count
         # Blocks share layers of voxels, which must be fused from the same views in each.
         near = sorted({other for block in changed for other in neighbourhood(block)} & self._touched.keys())

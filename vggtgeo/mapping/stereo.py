@@ -147,6 +147,7 @@ def _planes(points: np.ndarray, photo: Photo, count: int) -> np.ndarray | None:
 def upsample(depth_map: DepthMap, shape: Sequence[int]) -> DepthMap:
     """Return the depth map at (height, width): interpolated on one surface, nearest neighbour at depth edges."""
     size = (shape[1], shape[0])
+    # Inverse depth is affine in the pixel on a plane, where this interpolation is therefore exact.
     linear = cv2.resize(1.0 / depth_map.depth, size, interpolation=cv2.INTER_LINEAR)
     nearest, sigma, confidence = (
         cv2.resize(part, size, interpolation=cv2.INTER_NEAREST_EXACT)

@@ -128,6 +128,7 @@ def _packed(view: View) -> Array:
     return jnp.asarray(packed)
 
 
+# Donated, so that XLA updates the sums in place.
 @partial(jax.jit, donate_argnums=0)
 def _with_view(
     sums: Float[Array, "n i j k 6"],

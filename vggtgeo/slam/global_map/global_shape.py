@@ -76,6 +76,7 @@ def padded_count(count: int) -> int:
     power = SMALL[-1]
     while power < count:
         power *= 2
+    # Powers of two and their three quarters: at most a third of the rows is padding.
     return 3 * power // 4 if 3 * power // 4 >= count else power
 
 

@@ -104,5 +104,6 @@ def scaled_record(record: FramePose, ratio: float) -> FramePose:
 
 def scaled_second(second: SecondMotion, ratio: float) -> SecondMotion:
     """Return the motion from a second keyframe that was scaled."""
+    # Information of a translation is 1 / length^2, so it is scaled too.
     information = scaled_information(second.information, ratio)
     return replace(second, relative=longer(second.relative, ratio), information=information)

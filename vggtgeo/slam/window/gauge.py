@@ -170,7 +170,7 @@ def _rank(pair: PairTerm) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _PriorKnowledge:
-    """What a marginal prior constrains. tied: bool [n, n], relative poses. placed: bool [n], absolute poses."""
+    """Constraints of a marginal prior. tied: bool [n, n], relative poses. placed: bool [n], absolute poses."""
 
     tied: np.ndarray
     placed: np.ndarray
