@@ -239,7 +239,7 @@ def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
 
 def window_edges(known: Map, members: Iterable[int]) -> list[Directed]:
     """Return both directions of each pair inside the window."""
-    # Matches with keyframes outside have served: what they knew is in the prior.
+    # Matches with keyframes that have left are part of the prior, or were dropped with them.
     inside = set(members)
     pairs = [pair for pair in known.pairs if pair.first in inside and pair.second in inside]
     by_number = {number: known.keyframes[number] for number in inside}
