@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 from functools import cache, partial
+from types import new_class
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -211,7 +212,10 @@ def with_shared_focal(model: type[AbstractCamera]) -> type[SharedFocal]:
         )
     # The module of `model`: a program is kept on disk by the names of its classes, if those are the package's.
     body = {"model": model, "__module__": model.__module__, "__doc__": f"`{model.__name__}` with one focal length."}
-    return type(SharedFocal)(f"SharedFocal{model.__name__}", (SharedFocal,), body)
+    made: type[SharedFocal] = new_class(
+        f"SharedFocal{model.__name__}", (SharedFocal,), exec_body=lambda space: space.update(body)
+    )
+    return made
 
 
 class Cameras(eqx.Module):

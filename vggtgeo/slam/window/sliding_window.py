@@ -97,8 +97,10 @@ def smallest_problem(
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
     intrinsics = np.array([100.0, 100.0, 50.0, 50.0])[int(shared_focal) :]
-    options = {"size": size, "kernel": settings.window.kernel, "terms": terms, "shared_focal": shared_focal}
-    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), **options)
+    kernel, depth = settings.window.kernel, np.ones(1)
+    problem, initial, _ = pack(
+        one, poses, intrinsics, depth, size=size, shared_focal=shared_focal, kernel=kernel, terms=terms
+    )
     return problem, initial
 
 
