@@ -23,10 +23,10 @@ import numpy as np
 import vggtgeo as vg
 from vggtgeo.simulation.loop import simulate_loop
 
-MODELS = (vg.cameras.SquarePinhole, vg.cameras.SquareRadialTangential, vg.cameras.SquareKannalaBrandt)
+MODELS = (vg.cameras.Pinhole, vg.cameras.RadialTangential, vg.cameras.KannalaBrandt)
 SIGMA = 0.05
 """Of each coefficient of a lens."""
-FREE = np.isin(vg.cameras.SquareRadialTangential.names, ("f", "k1", "k2"))
+FREE = np.isin(("f", *vg.cameras.RadialTangential.names[2:]), ("f", "k1", "k2"))
 """Of the parameters of each of many cameras."""
 ITERATIONS = 10
 """Of a timed solve."""
@@ -75,7 +75,7 @@ def timed_solve(window: vg.data.SimulatedWindow, count: int) -> Callable[[], flo
         guess, options = guess[0], {name: value[0] for name, value in options.items()}
     seen = window.observations
     problem, initial, _ = vg.pack(
-        seen, window.start, guess, seen.depth_mean, camera=vg.cameras.SquareRadialTangential, **options
+        seen, window.start, guess, seen.depth_mean, camera=vg.cameras.RadialTangential, shared_focal=True, **options
     )
     solver = vg.SchurLevenbergMarquardt(rtol=0.0, max_iterations=ITERATIONS)
     solve = jax.jit(lambda problem, initial: vg.solve(problem, initial, solver=solver))
@@ -96,10 +96,11 @@ def each_model(keyframes: int, points: int) -> None:
     focal, _, x, y = np.asarray(window.intrinsics)
     print("| model | first call, s | second, s | iterations | energy |\n" + "|---" * 5 + "|")
     for model in MODELS:
-        coefficients = len(model.names) - 3
+        coefficients = len(model.names) - len(vg.cameras.Pinhole.names)
         sigma = np.array([10.0, 5.0, 5.0, *[SIGMA] * coefficients])
         guess = window.start, np.array([focal, x, y, *[0.0] * coefficients]), window.observations.depth_mean
-        problem, initial, _ = vg.pack(window.observations, *guess, camera=model, intrinsics_sigma=sigma)
+        options = {"camera": model, "shared_focal": True, "intrinsics_sigma": sigma}
+        problem, initial, _ = vg.pack(window.observations, *guess, **options)
         seconds = []
         for _ in range(2):
             began = time.perf_counter()

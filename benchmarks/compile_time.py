@@ -85,7 +85,7 @@ def _chain() -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
         inside = range(first, first + KEYFRAMES)
         seen = long.observations.within(inside)
         parts.append((seen, long.start[list(inside)], long.intrinsics, seen.depth_mean))
-    windows = vg.batches.pack_batch(parts, terms=[vg.no_prior(KEYFRAMES)], fixed_intrinsics=True)[:2]
+    windows = vg.batches.pack_batch(parts, terms=[vg.empty_prior(KEYFRAMES)], fixed_intrinsics=True)[:2]
     first, start = jax.tree.map(lambda leaf: leaf[0], windows)
     # The last window is slid into the first one again, so that the body is compiled once; nothing looks at that.
     following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, 0), windows)

@@ -91,9 +91,11 @@ class ArrowAdjoint(optx.AbstractAdjoint):
     def apply(self, primal_fn: Any, rewrite_fn: Any, inputs: Any, tags: Any) -> Any:
         del rewrite_fn, tags
         problem = _only(AbstractArrowProblem, inputs)
+        # The derivative belongs to the optimum, not to the iterations that found it.
         detached = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs)
 
         def loop(*arguments: Any, **options: Any) -> Any:
+            # Nothing is differentiated through the loop, so it needs no bound and no stored iterates.
             return eqxi.while_loop(*arguments, **{**options, "kind": "lax"})
 
         point, rest = primal_fn((*detached, loop))
@@ -141,6 +143,7 @@ def _attach_derivative(
 def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     problem, point, _, options, solver = primals
     moved = tangents[0]
+    # Leaves without a tangent are constants; derivatives by them are not compiled.
     absent = jax.tree.map(lambda leaf: leaf is None, moved, is_leaf=lambda leaf: leaf is None)
     fixed, moving = eqx.partition(problem, absent, is_leaf=lambda leaf: leaf is None)
     optimum, model, left = _polish(_detached(problem), _detached(point), options.polish, solver)
@@ -172,6 +175,8 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
         found: Array = ravel_pytree(step)[0]
         return eqx.error_if(found, ~ended, _NOT_SOLVED) if options.not_stationary == "error" else found
 
+    # `operator` defines the derivative of this solve (for second derivatives); the factor in `solve` computes its
+    # value.
     solved = unflatten(jax.lax.custom_linear_solve(operator, -flat, solve, symmetric=True))
 
     def found(moving: Any, step: ArrowVector) -> Any:
@@ -259,6 +264,8 @@ def _chord_steps(
         new_size = model.size(new)
         better = new_size < size
         kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), (moved, new, new_size), (point, gradient, size))
+        # Chord steps converge linearly and fast near the optimum; slower than tenfold in the squared norm is rounding
+        # error.
         return *kept, number + 1, new_size < 0.1 * size
 
     # The system of the Hessian also has the gradient.

@@ -185,10 +185,12 @@ class ArrowSystem(eqx.Module):
         block = self.source_adjoint.shape[-1]
         if self.graph.group is not None:
             return len(self.graph.group)
+        # Without groups `gram` has `b + q + 1` rows, so this is `(c - q) / b`.
         return (len(self.free) - self.gram.shape[-1] + block + 1) // block
 
     def neighbours(self) -> Int[Array, "h k"]:
         """Return the target node of each edge of each row; `n` for a missing edge."""
+        # A missing edge has the index `e`, which reads the appended entry.
         return jnp.append(self.graph.target, self.num_nodes)[self.graph.of_host]
 
     def around(self) -> Int[Array, "h m"]:
@@ -221,6 +223,7 @@ def moving_landmarks(system: ArrowSystem) -> Bool[Array, "h s"]:
 def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "h s"]:
     """Return `V^-1`, zero for landmarks that are undetermined or at an active bound."""
     determined = moving_landmarks(system)
+    # Two `where`: the gradient of a division by zero would be NaN even in the branch that is not taken.
     return jnp.where(determined, 1 / jnp.where(determined, system.landmark_hessian, 1.0), 0.0)
 
 
@@ -231,6 +234,7 @@ def reduce(system: ArrowSystem) -> Reduced:
     """
     schur, schur_gradient = _dense(assemble_hosts(system, host_products(system), DenseLayout()))
     hessian, gradient = _dense(assemble_edges(system, DenseLayout()))
+    # The prior is on the last dense coordinates.
     outside = len(gradient) - len(system.prior_hessian)
     return Reduced(
         hessian=hessian + jnp.pad(system.prior_hessian, (outside, 0)),
@@ -249,6 +253,7 @@ def host_products(system: ArrowSystem) -> Float[Array, "h t t"]:
         products = jax.lax.map(product, (system.cross, inverse))
     else:
         products = jax.lax.map(_product_of_parts, (_each_part(system.cross), inverse, system.triples))
+    # The last row of `cross`, the curvature of the landmarks, is not a coordinate.
     return products[:, :-1, :-1]
 
 
@@ -263,6 +268,7 @@ def _product_of_parts(host: tuple[tuple[Array, ...], Array, TripleLandmarks]) ->
     cross, inverse, triples = host
     count = triples.ratio_u.shape[-1]
     u, v, d, others = (split_triples(whole, count)[k] for k, whole in enumerate(cross))
+    # The barrier keeps XLA from forming the parts again in both factors of each product.
     parts = jax.lax.optimization_barrier(restricted_parts(triples, (u, v, d, others)))
     scaled = [part * factor for part, factor in zip(parts, split_triples(inverse, count), strict=True)]
     return sum(left @ right.T for left, right in zip(scaled, parts, strict=True))
@@ -274,6 +280,7 @@ def to_relative(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array, 
     count, block = system.num_nodes, system.source_adjoint.shape[-1]
     nodes, shared = dense[: count * block].reshape(count, block), dense[count * block :]
     eta = nodes[system.graph.target] - jnp.einsum("eab,eb->ea", system.source_adjoint, nodes[system.graph.source])
+    # A zero row that missing edges read.
     eta = jnp.concatenate([eta, jnp.zeros_like(eta[:1])])[system.graph.of_host]
     own = _seen_of(shared, rows, seen_by_hosts(system))
     return jnp.concatenate([eta.reshape(rows, degree * block), own], 1)
@@ -296,6 +303,8 @@ def add_shared(values: Float[Array, "t p"], seen: Int[Array, "t p"] | None, coun
 def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> Float[Array, "h s"]:
     """Return `W' dense + gradient * h`, in one pass over the cross terms."""
     relative = to_relative(system, dense)
+    # The weights of the two last rows of `cross`: the gradient is wanted, the curvature is not. A slice would copy
+    # `cross`.
     tail = jnp.broadcast_to(jnp.asarray([gradient, 0.0], dense.dtype), (len(relative), 2))
     coupled = jnp.einsum("nrs,nr->ns", system.cross, jnp.concatenate([relative, tail], 1))
     return restricted(system.triples, coupled)
@@ -323,6 +332,7 @@ def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array
     seen = system.graph.seen(system.graph.ends(), system.seen)
     local = jnp.concatenate([at_target - at_source, _seen_of(shared, len(at_target), seen)], 1)
     pulled = jnp.einsum("eab,eb->ea", system.gram[:, :-1, :-1], local)
+    # Exact Hessian only: the curvature of `eta` couples target and source, and neither with itself.
     bent = jnp.einsum("eba,eb->ea", system.lie_curvature, at_target)
     nodes = _gather_at_nodes(
         system,
@@ -338,6 +348,7 @@ def hessian_times(system: ArrowSystem, dense: Float[Array, " c"]) -> Float[Array
 def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array, " c"]) -> Float[Array, " c"]:
     hosts, block = system.num_nodes, system.source_adjoint.shape[-1]
     nodes, shared = dense[: hosts * block].reshape(hosts, block), dense[hosts * block :]
+    # A zero row that factors without a second node read.
     nodes = jnp.concatenate([nodes, jnp.zeros_like(nodes[:1])])
     spread = _seen_of(shared, len(factors.first), _seen_by_factors(system, factors))
     local = jnp.concatenate([nodes[factors.first], nodes[factors.second], spread], 1)
@@ -369,6 +380,7 @@ def from_relative(system: ArrowSystem, relative: Float[Array, "h relative"]) -> 
     rows, degree = system.graph.of_host.shape
     block = system.source_adjoint.shape[-1]
     eta = relative[:, : degree * block].reshape(rows, degree, block)
+    # Forces on missing edges must not reach any node.
     eta = jnp.where(system.graph.of_host[..., None] < len(system.graph.source), eta, 0.0)
     to_host = -jnp.einsum("nkab,nka->nb", padded_transports(system), eta)
     nodes = jnp.zeros((system.num_nodes + 1, block), eta.dtype).at[system.neighbours()].add(eta)[:-1]
@@ -456,6 +468,7 @@ def assemble_hosts(system: ArrowSystem, products: Float[Array, "h t t"], layout:
     nodes, block = system.num_nodes, system.source_adjoint.shape[-1]
     wide = degree * block
     transports = padded_transports(system).reshape(hosts, wide, block)
+    # By the chain rule with `d eta / d x_i = -A` of each edge.
     own = -jnp.einsum("nrw,nwb->nrb", products[:, :, :wide], transports)
     corner = -jnp.einsum("nwa,nwb->nab", transports, own[:, :wide])
     # Local order: neighbours (k blocks), the host itself, then shared coordinates and the gradient.
@@ -504,8 +517,10 @@ def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     source, target = system.graph.source, system.graph.target
     eta, border = system.gram[:, :block, :block], system.gram[:, :block, block:]
     own = jnp.einsum("eba,ebc,ecd->ead", system.source_adjoint, eta, system.source_adjoint)
+    # The curvature of `eta` is a product of `x_j` and `x_i`, so the blocks on the diagonal do not have it.
     mixed = -jnp.einsum("eab,ebc->eac", eta + system.lie_curvature, system.source_adjoint)
     blocks = layout.empty(hosts, block, eta.dtype)
+    # Both triangles; a layout that stores one of them drops the other.
     blocks = layout.add(layout.add(blocks, target, target, eta), source, source, own)
     blocks = layout.add(blocks, target, source, mixed)
     blocks = layout.add(blocks, source, target, jnp.swapaxes(mixed, 1, 2))
@@ -547,6 +562,7 @@ def add_prior_blocks(blocks: Blocks, system: ArrowSystem, layout: AbstractLayout
     corner = blocks.corner.at[:shared, :shared].add(prior[-shared:, -shared:])
     nodes = blocks.nodes
     if len(prior) > shared:
+        # Its diagonal blocks only: the whole prior would fill any sparse layout, and a preconditioner may approximate.
         square = prior[: hosts * block, : hosts * block].reshape(hosts, block, hosts, block)
         every = jnp.arange(hosts)
         nodes = layout.add(nodes, every, every, square[every, :, every])

@@ -41,6 +41,8 @@ def damped_band(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) ->
     """Return the damped Schur complement, flat directions pinned."""
     shrink, shared = 1 / (1 + damping), len(bands.hessian.corner)
     matrix: BandMatrix = jax.tree.map(lambda whole, taken: whole - shrink * taken, bands.hessian, bands.schur)
+    # The stiffness along a gauge direction is dense. A pin on one coordinate keeps the band, and `solve_pinned`
+    # corrects it.
     added = damping * bands.diagonal + pins(system, bands.stiffness, bands.diagonal).sum(1)
     return add_to_diagonal(matrix, bands.layout.columns(added[:, None], shared))
 

@@ -54,6 +54,8 @@ class BandLayout(AbstractLayout):
         kept = (row < self.nodes) & (column < self.nodes) & ((below == 0) | (below == 1))
         at = jnp.where(kept, column // self.group, len(stored))
         below = jnp.clip(below, 0, 1)
+        # An index beyond the end is dropped: that of missing nodes, and of blocks above the diagonal or outside the
+        # band.
         return stored.at[at, below, row % self.group, :, column % self.group, :].add(value, mode="drop")
 
     def columns(self, columns: Shaped[Array, "c o"], shared: int) -> BandVector:
@@ -149,6 +151,7 @@ def assemble_bands(system: ArrowSystem, layout: BandLayout) -> tuple[BandMatrix,
     """
     near = layout.near(system, layout.group // 2)
     block = system.source_adjoint.shape[-1]
+    # The border of a far edge couples its nodes through the shared coordinates, so it is dropped with the coupling.
     border = jnp.where(near[:, None, None], system.gram[:, :block, block:], 0.0)
     near_system = eqx.tree_at(lambda s: s.gram, system, system.gram.at[:, :block, block:].set(border))
     hessian = add_prior_blocks(assemble_edges(near_system, layout), system, layout)
@@ -168,6 +171,8 @@ def factorise(matrix: BandMatrix, moves: BandVector) -> BandFactor:
     """Return the Cholesky factor over the free coordinates (others get a unit diagonal); NaN if not definite."""
     matrix = held(matrix, moves)
     nodes, shared = matrix.diagonal()
+    # Scaled to a unit diagonal: metres, radians and pixels differ by orders of magnitude, which would cost as many
+    # digits.
     scale = BandVector(_positive_root(nodes)[..., None], _positive_root(shared)[..., None])
     matrix = balanced(matrix, scale)
     groups, border, corner = matrix.groups, matrix.border, matrix.corner
@@ -176,6 +181,7 @@ def factorise(matrix: BandMatrix, moves: BandVector) -> BandFactor:
     def body(carry: Any, group: Any) -> tuple[Any, Any]:
         taken, taken_border = carry
         (diagonal, below), columns = group
+        # Assembled symmetric; making it so again would copy each group.
         lower = jnp.linalg.cholesky(diagonal - taken, symmetrize_input=False)
         both = jnp.concatenate([below.T, columns - taken_border], 1)
         both = jsp.linalg.solve_triangular(lower, both, lower=True)
@@ -204,6 +210,7 @@ def solve_band(factor: BandFactor, columns: BandVector) -> BandVector:
 
     start = jnp.zeros_like(nodes[0])
     _, nodes = jax.lax.scan(forward, start, (factor.lower, factor.left, nodes))
+    # The shared coordinates are eliminated last, so they are solved before the backward pass.
     shared = shared - jnp.einsum("kwq,kwo->qo", factor.border, nodes)
     shared = jsp.linalg.cho_solve((factor.corner, True), shared)
     nodes = nodes - factor.border @ shared

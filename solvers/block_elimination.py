@@ -100,6 +100,7 @@ def solve_eliminated(found: Elimination, columns: BandVector) -> BandVector:
         missed = jax.tree.map(jnp.subtract, rhs, _times(found.matrix, solved))
         return jax.tree.map(jnp.add, solved, _by_pivots(found, missed))
 
+    # From zero the first step is the solve itself, the others refine it.
     solved: BandVector = jax.lax.fori_loop(0, 1 + REFINEMENTS, refined, jax.tree.map(jnp.zeros_like, rhs))
     return BandVector(solved.nodes / found.scale.nodes, solved.shared / found.scale.shared)
 
@@ -159,7 +160,9 @@ def _pseudo_inverse(
     matrix: Float[Array, "w w"], tolerance: float
 ) -> tuple[Float[Array, "w w"], Float[Array, "w w"], Int[Array, ""]]:
     """Return the pseudo-inverse, the projector on its null space, and the rank."""
+    # Rounding makes pivots unsymmetric, and `eigh` reads one triangle only.
     values, vectors = jnp.linalg.eigh((matrix + matrix.T) / 2)
+    # At a saddle, determined directions may have negative pivots.
     kept = jnp.abs(values) > tolerance
     inverse = (vectors * jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)) @ vectors.T
     outside = vectors * jnp.where(kept, 0.0, 1.0)

@@ -65,6 +65,7 @@ def invert_blocks(system: ArrowSystem, blocks: JacobiBlocks, damping: Float[Arra
     def invert(hessian: Array, schur: Array, added: Array, free: Bool[Array, " m"]) -> Array:
         eye = jnp.eye(len(free), dtype=hessian.dtype)
         matrix = jnp.where(free[:, None] & free, hessian - schur / (1 + damping) + jnp.diag(added), eye)
+        # By Cholesky, not `inv`: NaN tells the caller that a block is not definite.
         return jsp.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), eye)
 
     return DiagonalBlocks(

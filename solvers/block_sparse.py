@@ -44,6 +44,7 @@ class SparseLayout(AbstractLayout):
     def add(
         self, stored: Array, row: Int[Array, "*t"], column: Int[Array, "*t"], value: Float[Array, "*t b b"]
     ) -> Array:
+        # Blocks are stored in ascending order of this number, and every block of the graph is among them.
         at = jnp.searchsorted(self.place, row * self.nodes + column)
         kept = (row < self.nodes) & (column < self.nodes)
         return stored.at[jnp.where(kept, at, len(stored))].add(value, mode="drop")

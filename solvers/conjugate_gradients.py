@@ -128,6 +128,7 @@ class IterativeFactor(AbstractFactor):
 
         inverse = self.solver.preconditioner.inverse(system, self.preconditioner, zero + _LIFT)
         rhs = jnp.where(system.free, rhs, 0.0)
+        # No iteration reaches a residual below the rounding error.
         rtol = max(self.solver.exact_rtol, 10 * float(jnp.finfo(rhs.dtype).eps))
         return minres(apply, inverse, rhs, rtol, self.solver.exact_iterations)
 
@@ -173,6 +174,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         self, system: ArrowSystem, prepared: _Prepared, damping: Float[Array, ""]
     ) -> tuple[ArrowVector, Float[Array, ""]]:
         solved = self.solve(system, prepared, damping)
+        # Damping multiplies the landmarks' curvature, `V (1 + l)`.
         landmarks = back_substitute(system, solved.solution) / (1 + damping)
         step = ArrowVector(solved.solution, landmarks)
         predicted = predicted_decrease(system, prepared.gradient, prepared.diagonal, step, damping)
@@ -197,6 +199,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         index = local_coordinates(system, rows)
         covariance, undetermined = jax.lax.map(around, index)
         flat = factor.stiffness > 0
+        # Conditional on flat directions: `C - C a (a' C a)^-1 a' C`.
         size = jnp.where(flat, jnp.sum(gauge * along, 0), 1.0)
         own = jnp.where(flat, along / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)[index]
         return LocalInverse(
@@ -244,6 +247,7 @@ def conjugate_gradients(
     The forcing term is `min(rtol, sqrt(r0' P r0))`: residuals are in standard deviations, so near the optimum, where
     the remaining decrease is a fraction of one, steps become more accurate.
     """
+    # The start is zero, so the first residual is `rhs`.
     first = inverse(rhs)
     start = rhs @ first
     forcing = jnp.minimum(rtol, jnp.sqrt(jnp.abs(start)))

@@ -59,6 +59,7 @@ def covariance(
     return ArrowCovariance(
         nodes=local[:, own, own],
         neighbours=jnp.where(present[:, :, None, None] & jnp.isfinite(beside), beside, 0.0),
+        # The shared coordinates are local to every row, so any row has their block.
         shared=local[0, end:, end:],
         landmarks=_landmarks(system, found, rows),
         rank=found.rank + jnp.sum(moving_landmarks(system)),

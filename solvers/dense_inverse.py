@@ -27,6 +27,7 @@ def dense_inverse(system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
     scale = balance(system, jnp.diagonal(reduced.hessian))
     stiffness, directions = gauge_stiffness(system, reduced), free_gauge(system)
     matrix = reduced.hessian - reduced.schur + (directions * stiffness) @ directions.T
+    # Unit rows for fixed coordinates keep the shape static and the matrix regular.
     matrix = jnp.where(free[:, None] & free[None, :], (matrix + matrix.T) / 2, jnp.eye(len(free), dtype=matrix.dtype))
     inverse, outside = _pseudo_inverse(matrix / scale[:, None] / scale[None, :])
     inverse = jnp.where(free[:, None] & free[None, :], inverse, 0.0) / scale[:, None] / scale[None, :]
@@ -75,6 +76,7 @@ def _by_eigenvectors(
     balanced: Float[Array, "c c"], tolerance: float
 ) -> tuple[Float[Array, "c c"], Float[Array, "c c"]]:
     values, vectors = jnp.linalg.eigh(balanced)
+    # Not the absolute value: the matrix is positive semidefinite, so a negative eigenvalue is rounding error.
     kept = values > tolerance
     inverse = (vectors * jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)) @ vectors.T
     return inverse, (vectors * jnp.where(kept, 0.0, 1.0)) @ vectors.T

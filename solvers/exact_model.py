@@ -38,11 +38,13 @@ class ExactModel(eqx.Module):
         inverse = inverse_landmark_hessian(self.system)
         rest = vector.dense - carry_to_nodes(self.system, inverse * vector.landmarks)
         dense, found = self.factor.checked(self.system, rest)
+        # A singular matrix gives no step, so the chord iteration ends and the derivative is zero, not NaN.
         dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
         return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0))), found
 
     def largest(self, gradient: ArrowVector) -> Float[Array, ""]:
         """Return the largest entry of a gradient, each scaled by the root of its curvature."""
+        # An exact Hessian may have negative curvature, so its size is the scale.
         landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
         dense = jnp.max(gradient.dense**2 / self.diagonal, initial=0.0)
         return jnp.sqrt(jnp.maximum(dense, jnp.max(landmarks, initial=0.0)))

@@ -222,11 +222,13 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # For another function this solver would silently minimise something else.
         same = jnp.isclose(_value(fn(y, args)), energy, rtol=1e-3, atol=0.0) | ~finite
         begun = _CODES.running if self.max_iterations else _CODES.max_iterations
+        # `jit` needs the length before the number of iterations is known.
         history = jnp.full(self.max_iterations + 1, jnp.nan, energy.dtype).at[0].set(energy)
         return LevenbergMarquardtState(
             energy=energy,
             damping=jnp.asarray(self.initial_damping, energy.dtype),
             growth=jnp.asarray(2.0, energy.dtype),
+            # Far from the optimum the correction predicts too large a decrease, so the iteration starts without it.
             correction=jnp.asarray(self.max_correction if self.fixed_correction else 0.0, energy.dtype),
             iterations=jnp.asarray(0),
             linearisations=jnp.asarray(0),
@@ -242,6 +244,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, state: LevenbergMarquardtState, tags: Any
     ) -> tuple[Any, LevenbergMarquardtState, None]:
         system = args.linearise(y, state.correction if self.max_correction > 0 else None)
+        # All that does not depend on the damping, so that a rejected step repeats none of it.
         prepared = self.reduced_solver.prepare(system)
         gradient_norm = _gradient_norm(system)
 
@@ -279,6 +282,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             history=last.history,
             termination=self._terminate(state.energy, last, gradient_norm, _largest_curvature(system)),
             polished=state.polished,
+            # That before the step: another linearisation would be needed for the gradient at the new point.
             gradient_residual=gradient_norm,
             record=last.record,
         )
@@ -312,6 +316,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         if not self.differentiable_loop:
             return jax.lax.while_loop(go_on, attempt, first)
+        # Reverse mode needs a bound. Eight rejections in a row raise the damping by 2^(1 + 2 + ... + 8) = 2^36.
         bounded: _Try = eqxi.while_loop(go_on, attempt, first, max_steps=8, kind="bounded")
         return bounded
 
@@ -329,9 +334,15 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         energy = state.energy
         candidate = problem.retract(point, ArrowVector(step.dense, expand(system.basis, step.landmarks)))
         new_energy = problem.energy(candidate)
+        # A step without a predicted decrease is rejected below, so its gain does not matter but must be finite.
         gain = (energy - new_energy) / jnp.where(predicted > 0, predicted, 1.0)
+        # 1e-3 is Ceres' `min_relative_decrease`.
         accepted = jnp.isfinite(new_energy) & (predicted > 0) & (gain > 1e-3)
+        # The correction may be the reason for the rejection: linearise again with less of it before raising the
+        # damping.
         overcorrected = ~accepted & (state.correction > 0) if not self.fixed_correction else jnp.asarray(False)
+        # Nielsen 1999: an accepted step lowers the damping smoothly with the gain, at most to a third; rejections in a
+        # row raise it by 2, 4, 8, ..., so that a poor start needs few of them.
         shrink = jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
         damping = jnp.where(accepted, trial.damping * shrink, trial.damping * trial.growth)
         damping, growth = (
@@ -358,6 +369,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def _next_correction(self, state: LevenbergMarquardtState, last: _Try) -> Float[Array, ""]:
         if self.fixed_correction:
             return state.correction
+        # A rejection means that the model was wrong at this scale, so the correction grows only if the first try
+        # succeeded.
         at_once = last.accepted & (last.iterations == state.iterations + 1)
         more = jnp.minimum(1 - 0.7 * (1 - state.correction), self.max_correction)
         less = jnp.where(state.correction > 0.1, state.correction / 2, 0.0)
@@ -374,7 +387,9 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # The gradient norm and this unit both scale with the root of a factor on all weights. A problem in pixels or in
         # standard deviations has curvatures far above 1, so the unit is 1.
         unit = jnp.sqrt(jnp.minimum(curvature, 1.0))
+        # A rejected step leaves the energy as it is, which is not convergence.
         small = last.accepted & (energy - last.energy <= self.rtol * energy)
+        # Later entries take precedence: a vanished gradient is convergence however the step ended.
         options = [
             (last.iterations >= self.max_iterations, _CODES.max_iterations),
             (small, _CODES.energy_converged),

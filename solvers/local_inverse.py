@@ -51,6 +51,7 @@ def to_relative(system: ArrowSystem, rows: Int[Array, " h"], local: Float[Array,
     selected = selected if seen is None else selected[seen[rows]]
     present = system.graph.of_host[rows] < len(system.graph.source)
     carry = jnp.zeros((len(rows), system.cross.shape[1] - 2, wide + block + shared), local.dtype)
+    # Jacobian of `(eta, shared)` by the local coordinates: identity at the neighbours, `-A` at the host.
     carry = carry.at[:, jnp.arange(wide), jnp.arange(wide)].set(jnp.repeat(present, block, 1).astype(local.dtype))
     transports = padded_transports(system)[rows].reshape(len(rows), wide, block)
     carry = carry.at[:, :wide, wide : wide + block].set(-transports)

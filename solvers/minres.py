@@ -66,11 +66,13 @@ def _advanced(loop: _Loop, apply: Apply, inverse: Apply) -> _Loop:
     alpha = vector @ image
     image = image - alpha / loop.beta * loop.newer
     preconditioned = inverse(image)
+    # Rounding may make the squared norm negative near convergence.
     beta = jnp.sqrt(jnp.maximum(image @ preconditioned, 0.0))
     cosine, sine = loop.rotation
     delta = cosine * loop.diagonal + sine * alpha
     rotated = sine * loop.diagonal - cosine * alpha
     size = jnp.sqrt(rotated**2 + beta**2)
+    # An exact solution leaves a zero rotation, which must not make the update NaN.
     size = jnp.where(size > 0, size, jnp.finfo(size.dtype).tiny)
     new_cosine, new_sine = rotated / size, beta / size
     search = (vector - loop.beyond * loop.last_search - delta * loop.search) / size

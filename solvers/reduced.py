@@ -89,6 +89,7 @@ class DenseCholesky(AbstractReducedSolver[_Prepared]):
         self, system: ArrowSystem, prepared: _Prepared, damping: Float[Array, ""]
     ) -> tuple[ArrowVector, Float[Array, ""]]:
         reduced, shrink = prepared.reduced, 1 / (1 + damping)
+        # Damping the landmarks divides their Schur complement by `1 + l`, so it is not assembled again.
         matrix = reduced.hessian - shrink * reduced.schur + jnp.diag(damping * prepared.diagonal)
         matrix = matrix + (system.gauge * prepared.gauge_stiffness) @ system.gauge.T
         rhs = shrink * reduced.schur_gradient - reduced.gradient
@@ -122,6 +123,7 @@ def solve_free(matrix: Float[Array, "c c"], rhs: Float[Array, " c"], free: Bool[
     """Solve the positive definite system of the free coordinates; zero for others, NaN if not definite."""
     both = free[:, None] & free[None, :]
     matrix = jnp.where(both, matrix, 0.0) + jnp.diag(jnp.where(free, 0.0, 1.0).astype(matrix.dtype))
+    # Metres, radians and pixels differ by orders of magnitude: a unit diagonal keeps the digits of the factor.
     scale = jnp.sqrt(jnp.diagonal(matrix))
     scale = jnp.where(scale > 0, scale, 1.0)
     factor = jsp.linalg.cho_factor(matrix / scale[:, None] / scale[None, :], lower=True)

@@ -27,6 +27,7 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
     first, second = 1 - fraction, fraction
     total = lambda left, right: jnp.sum(curvature * left * right, -1)
     own, mixed, other = total(first, first), total(first, second), total(second, second)
+    # A segment without matches has no curvature; its ratio does not matter but must be finite.
     ratio = jnp.where(own != 0, mixed / jnp.where(own != 0, own, 1.0), 0.0)
     second = second - ratio[..., None] * first
     rest = total(second, second)

@@ -31,5 +31,6 @@ def _symmetric_eigen_derivative(primals: tuple[Array], tangents: tuple[Array]) -
     apart = values[None, :] - values[:, None]
     size = rank_tolerance(len(values), values.dtype) * jnp.max(jnp.abs(values), initial=0.0)
     distinct = jnp.abs(apart) > size
+    # Two `where`: the division by equal eigenvalues must not reach the derivative as NaN.
     turn = jnp.where(distinct, changed / jnp.where(distinct, apart, 1.0), 0.0)
     return (values, vectors), (jnp.diagonal(changed), vectors @ turn)

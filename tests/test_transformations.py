@@ -19,7 +19,7 @@ STEP = 1e-3
 
 WINDOW = vg.simulate_window(2, points=4, lines=0, start_error=0.01)
 PACKED = WINDOW.pack()
-PROBLEM, STATE, INDEX = PACKED[0].with_term(vg.no_prior(2)), PACKED[1], PACKED[2]
+PROBLEM, STATE, INDEX = PACKED[0].with_term(vg.empty_prior(2)), PACKED[1], PACKED[2]
 STEPS = 0.01 * jnp.cos(jnp.arange(STATE.num_unknowns, dtype=float))
 MATCHES = jnp.ones(len(WINDOW.observations.point_edge))
 
@@ -44,7 +44,7 @@ def solved(share: jax.Array) -> vg.Solution:
 
 def reordered(share: jax.Array) -> jax.Array:
     prior = vg.terms.MarginalPrior(**{**vars(PROBLEM.marginal), "root": share * jnp.eye(16)})
-    return jnp.sum(vg.reorder(prior, np.array([1, -1])).root ** 2)
+    return jnp.sum(vg.permute_prior(prior, np.array([1, -1])).root ** 2)
 
 
 FUNCTIONS: dict[str, Function] = {
@@ -55,7 +55,7 @@ FUNCTIONS: dict[str, Function] = {
     "`covariances(...).poses`": lambda x: jnp.sum(jnp.log(jnp.diag(vg.covariances(weighted(x), STATE).poses[1]))),
     "`observability(...).whole.values`": lambda x: jnp.sum(vg.observability(weighted(x), STATE).whole.values[0, :2]),
     "`marginalise(...).root`": prior_left,
-    "`reorder(...).root`": reordered,
+    "`permute_prior(...).root`": reordered,
     "`SlotIndex.scatter_points`": lambda x: jnp.sum(
         INDEX.scatter_points(x * MATCHES, WINDOW.observations, PROBLEM.points.weight) ** 2
     ),

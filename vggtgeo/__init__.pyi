@@ -13,9 +13,9 @@ from .benchmark.runner import bench as bench
 from .bundle.analysis.covariances import covariances as covariances
 from .bundle.analysis.observability import observability as observability
 from .bundle.graduation import Graduation as Graduation
+from .bundle.marginalisation import empty_prior as empty_prior
 from .bundle.marginalisation import marginalise as marginalise
-from .bundle.marginalisation import no_prior as no_prior
-from .bundle.marginalisation import reorder as reorder
+from .bundle.marginalisation import permute_prior as permute_prior
 from .bundle.objective import energy as energy
 from .bundle.observations import Observations as Observations
 from .bundle.packing import pack as pack

@@ -4,7 +4,3 @@ from vggtgeo.geometry.camera_models import AbstractCamera as AbstractCamera
 from vggtgeo.geometry.camera_models import KannalaBrandt as KannalaBrandt
 from vggtgeo.geometry.camera_models import Pinhole as Pinhole
 from vggtgeo.geometry.camera_models import RadialTangential as RadialTangential
-from vggtgeo.geometry.camera_models import SquareKannalaBrandt as SquareKannalaBrandt
-from vggtgeo.geometry.camera_models import SquarePinhole as SquarePinhole
-from vggtgeo.geometry.camera_models import SquarePixels as SquarePixels
-from vggtgeo.geometry.camera_models import SquareRadialTangential as SquareRadialTangential

@@ -293,12 +293,12 @@ class EqualFocalLengths(vg.terms.CameraTerm):
 
 @pytest.mark.long
 def test_square_pixels_are_an_exact_tie() -> None:
-    # Proves `SquarePinhole`: from 5 % off, the optimum is that of a pinhole with `fx = fy`. Oracle: the pinhole under a
+    # Proves `shared_focal`: from 5 % off, the optimum is that of a pinhole with `fx = fy`. Oracle: the pinhole under a
     # stiff term that says so.
     window = vg.simulate_window(3, points=10, lines=1)
     given = (window.observations, window.start)
     guess, depth = 1.05 * window.intrinsics[1:], window.observations.depth_mean
-    found = solve(*vg.pack(*given, guess, depth, camera=vg.cameras.SquarePinhole)[:2]).state.intrinsics
+    found = solve(*vg.pack(*given, guess, depth, shared_focal=True)[:2]).state.intrinsics
     tie = EqualFocalLengths(weight=jnp.full(1, 1e8))
     tied = solve(*vg.pack(*given, np.append(guess[0], guess), depth, terms=[tie])[:2]).state.intrinsics
     np.testing.assert_allclose(np.append(found[0], found), tied, rtol=1e-6)
@@ -317,7 +317,7 @@ def test_square_pixels_are_an_exact_tie() -> None:
         ({"camera_of": [0, 2, 0, 1], "intrinsics": PINHOLES}, ("`camera_of`", 2, "`intrinsics`")),
         ({"camera_of": [0, 1], "intrinsics": PINHOLES}, ("`camera_of`", 4)),
         ({"intrinsics_sigma": [1.0, 2.0]}, ("`intrinsics_sigma`", "(2,)")),
-        ({"camera": vg.cameras.SquarePinhole, "intrinsics": [-1.0, 2, 3]}, ("`intrinsics`", "positive", "-1")),
+        ({"shared_focal": True, "intrinsics": [-1.0, 2, 3]}, ("`intrinsics`", "positive", "-1")),
     ],
 )
 def test_cameras_that_do_not_fit_are_refused(options: dict, named: tuple) -> None:

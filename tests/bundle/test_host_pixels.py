@@ -194,7 +194,7 @@ def test_noise_of_the_host_is_counted():
 def test_marginalisation_takes_the_pixels_along():
     """The prior that a leaving keyframe leaves, against dense elimination of its unknowns."""
     problem, initial, _ = vg.simulate_window(KEYFRAMES, POINTS, 0, host_noise=True).pack(
-        terms=[vg.no_prior(KEYFRAMES)], kernel=vg.kernels.Square()
+        terms=[vg.empty_prior(KEYFRAMES)], kernel=vg.kernels.Square()
     )
     state = vg.solve(problem, initial).state
     prior = vg.marginalise(problem, state, jnp.asarray(1))

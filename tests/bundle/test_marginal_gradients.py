@@ -86,7 +86,7 @@ def test_vectors_of_equal_eigenvalues_have_the_derivative_of_their_space() -> No
 def window() -> tuple[Problem, State]:
     """Four keyframes, one without an observation, some matches absent, an empty prior; poses off their optimum."""
     scene = make_scene(KEYFRAMES, 6, 1, noise=0.5, depth_error=0.02)
-    problem, initial, _ = scene.pack(terms=[vg.no_prior(KEYFRAMES)])
+    problem, initial, _ = scene.pack(terms=[vg.empty_prior(KEYFRAMES)])
     apart = (problem.edges.source == ALONE) | (problem.edges.target == ALONE)
     for term in (problem.points, problem.lines):
         problem = problem.with_term(term.reweighted(jnp.where(apart[:, None], 0.0, term.weight).at[0, :2].set(0.0)))
@@ -126,8 +126,8 @@ def test_prior_has_its_gradient_by_weights(leaving: int, window: tuple[Problem, 
         def leave(prior: vg.terms.MarginalPrior, number: jax.Array) -> tuple[vg.terms.MarginalPrior, None]:
             return vg.marginalise(seen.with_term(prior), state, number), None
 
-        prior, _ = jax.lax.scan(leave, vg.no_prior(KEYFRAMES), jnp.asarray([leaving, 0]))
-        moved = vg.reorder(prior, jnp.asarray([1, 2, 3, -1]))
+        prior, _ = jax.lax.scan(leave, vg.empty_prior(KEYFRAMES), jnp.asarray([leaving, 0]))
+        moved = vg.permute_prior(prior, jnp.asarray([1, 2, 3, -1]))
         poses = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, 0), elsewhere.poses)
         return jnp.sum(moved.residual(poses, elsewhere.parameters) ** 2) / 2
 
@@ -179,15 +179,15 @@ def test_energy_and_residuals_have_their_gradient(window: tuple[Problem, State])
 def test_reorder_and_gather_work_under_jit() -> None:
     # Proves that a traced prior and order, and traced arrays of slots, give what concrete ones give.
     scene = make_scene(3, 4, 1)
-    problem, initial, index = scene.pack(terms=[vg.no_prior(3)])
+    problem, initial, index = scene.pack(terms=[vg.empty_prior(3)])
     root = np.random.default_rng(0).normal(size=(22, 22))
     poses = jax.tree.map(lambda leaf: leaf[::-1], initial.poses)
-    prior = eqx.tree_at(lambda p: (p.root, p.poses), vg.no_prior(3), (jnp.asarray(root), poses))
+    prior = eqx.tree_at(lambda p: (p.root, p.poses), vg.empty_prior(3), (jnp.asarray(root), poses))
     order = np.array([2, -1, 0])
-    expected = vg.reorder(prior, order)
+    expected = vg.permute_prior(prior, order)
     np.testing.assert_array_equal(expected.root[:, :6], root[:, 12:18])
     np.testing.assert_array_equal(expected.root[:, 6:12], 0.0)
-    for found in (jax.jit(vg.reorder)(prior, order), jax.jit(lambda p: vg.reorder(p, order))(prior)):
+    for found in (jax.jit(vg.permute_prior)(prior, order), jax.jit(lambda p: vg.permute_prior(p, order))(prior)):
         jax.tree.map(np.testing.assert_array_equal, found, expected)
     np.testing.assert_array_equal(jax.jit(index.gather)(initial.inverse_depth), index.gather(initial.inverse_depth))
     gathered = jax.jit(lambda w: index.gather_points(w, scene.observations))(problem.points.weight)
@@ -200,4 +200,4 @@ def test_reorder_and_gather_work_under_jit() -> None:
 def test_an_order_of_another_kind_is_refused_when_traced(order: jax.Array) -> None:
     # Proves that type and shape of a traced order are checked.
     with raises("`order`", order.dtype):
-        jax.jit(vg.reorder)(vg.no_prior(2), order)
+        jax.jit(vg.permute_prior)(vg.empty_prior(2), order)

@@ -15,7 +15,7 @@ from vggtgeo.solvers.exact_model import exact_model
 from vggtgeo.solvers.kernels import Square
 
 from vggtgeo.bundle.linearise import linearise
-from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior, reorder
+from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit, permute_prior
 from vggtgeo.bundle.objective import energy, prepared
 from vggtgeo.bundle.problem import Problem, State
 
@@ -28,7 +28,7 @@ class _Made(NamedTuple):
 
 def _made(keyframes: int, points: int, lines: int, **options: Any) -> _Made:
     scene = make_scene(keyframes, points, lines, noise=0.5, depth_error=0.02)
-    problem, initial, _ = scene.pack(terms=[no_prior(keyframes)], **options)
+    problem, initial, _ = scene.pack(terms=[empty_prior(keyframes)], **options)
     return _Made(problem, initial, scene.at_truth()[1])
 
 
@@ -97,7 +97,7 @@ def test_reorder_moves_information_with_its_keyframe() -> None:
     made = _made(3, 6, 1)
     prior = marginalise_jit(made.problem, made.initial, jnp.asarray(0))
     order = np.array([1, 2, -1])
-    moved = reorder(prior, order)
+    moved = permute_prior(prior, order)
     shuffled = State(
         jax.tree.map(lambda leaf: leaf[jnp.asarray([1, 2, 0])], made.truth.poses),
         made.truth.intrinsics,

@@ -252,7 +252,7 @@ def test_a_problem_in_which_nothing_is_observed_is_refused() -> None:
     seen = SCENE.observations
     zero = {name: 0 * getattr(seen, name) for name in ("point_weight", "line_weight", "depth_weight")}
     start = SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth
-    for options in ({"intrinsics_sigma": 5.0}, {"terms": [vg.no_prior(3)]}):
+    for options in ({"intrinsics_sigma": 5.0}, {"terms": [vg.empty_prior(3)]}):
         with raises("`problem`", "weights"):
             pack(replace(seen, **zero), *start, **options)
     problem, state, _ = SCENE.pack()

@@ -16,7 +16,7 @@ from reported import raises
 from scenes import INTRINSICS
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
-from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem_file import LAYOUT, load_problem, save_problem, save_solution
 from vggtgeo.io.errors import InputError
@@ -122,7 +122,7 @@ def test_a_saved_problem_that_was_cut_or_renumbered_is_refused(tmp_path: Path) -
     # and numbers beyond an array were taken for its last row, with a solution and no word. Oracle: each array of the
     # file with each damage, all of which make another problem or none, and all of which are named.
     problem, state, index = SCENE.pack()
-    save_problem(tmp_path / "whole.npz", problem.with_term(no_prior(problem.num_keyframes)), state, index)
+    save_problem(tmp_path / "whole.npz", problem.with_term(empty_prior(problem.num_keyframes)), state, index)
     _, arrays = read(tmp_path / "whole.npz")
     refused: list[str] = []
     taken: list[str] = []

@@ -141,7 +141,7 @@ def test_derivatives_do_not_depend_on_the_rows() -> None:
         ).state.poses.translation()[1, 0]
         gradient = jax.jit(jax.grad(centre))(problem.points.target)
         gradients.append(index.gather_points(gradient, SCENE.observations))
-        window = problem.with_term(vg.no_prior(4))
+        window = problem.with_term(vg.empty_prior(4))
         priors.append(jax.jit(vg.marginalise)(window, start, jnp.asarray(1)))
     np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-6, atol=1e-12)
     assert float(jnp.abs(priors[0].root).max()) > 1

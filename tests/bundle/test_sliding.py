@@ -33,7 +33,7 @@ def stacked(seen: vg.data.SimulatedWindow, windows: Sequence[int] = range(WINDOW
         own = seen.observations.within(inside)
         parts.append((own, seen.start[list(inside)], seen.intrinsics, own.depth_mean))
     problems, initials, _ = vg.batches.pack_batch(
-        parts, terms=[vg.no_prior(KEYFRAMES)], **{"intrinsics_sigma": 3.0, **options}
+        parts, terms=[vg.empty_prior(KEYFRAMES)], **{"intrinsics_sigma": 3.0, **options}
     )
     return problems, initials
 
@@ -63,14 +63,14 @@ def test_the_observations_within_some_keyframes_are_theirs() -> None:
 @pytest.mark.parametrize("leaving", [0, 1])
 def test_a_step_moves_everything_to_its_new_place(leaving: int) -> None:
     # Proves where prior, poses, camera and held poses go, under `jit` with a traced `leaving`. Oracle: `marginalise`,
-    # `reorder` and indexing.
+    # `permute_prior` and indexing.
     problems, initials = stacked(long_window(), (0, 1))
     problem, state = pick((problems, initials), 0)
     following = pick((problems, initials), 1)
     step = jax.jit(vg.slide, static_argnames="constant_velocity")
     found, initial = step(problem, state, *following, leaving=leaving)
     staying = [place for place in range(KEYFRAMES) if place != leaving]
-    expected = vg.reorder(jax.jit(vg.marginalise)(problem, state, leaving), np.array([*staying, -1]))
+    expected = vg.permute_prior(jax.jit(vg.marginalise)(problem, state, leaving), np.array([*staying, -1]))
     curved = lambda prior: np.asarray(prior.root.T @ prior.root)
     np.testing.assert_allclose(curved(found.marginal), curved(expected), rtol=1e-9, atol=1e-9 * curved(expected).max())
     np.testing.assert_array_equal(found.fixed_pose, [leaving != 0, False, False, False])
@@ -98,8 +98,8 @@ def test_constant_velocity_goes_on() -> None:
 
 def test_windows_of_other_shapes_are_refused() -> None:
     # Proves that shapes, cameras and a missing keyframe are checked before anything is compiled.
-    problem, initial, _ = vg.simulate_window(3, points=4, lines=0).pack(terms=[vg.no_prior(3)])
-    smaller, start, _ = vg.simulate_window(2, points=4, lines=0).pack(terms=[vg.no_prior(2)])
+    problem, initial, _ = vg.simulate_window(3, points=4, lines=0).pack(terms=[vg.empty_prior(3)])
+    smaller, start, _ = vg.simulate_window(2, points=4, lines=0).pack(terms=[vg.empty_prior(2)])
     with raises("`next_problem`", 2):
         vg.slide(problem, initial, smaller, start)
     with pytest.raises(vg.InputError, match=r"`next_initial\.inverse_depth`"):

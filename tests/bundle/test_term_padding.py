@@ -17,7 +17,7 @@ from reported import raises
 
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
-from vggtgeo.bundle.marginalisation import reorder
+from vggtgeo.bundle.marginalisation import permute_prior
 
 OWN = [PositionFix, StepOfWheels, PointToPlane, LogCosh]
 LARGER = vg.PaddedSize(5, 8, 4, 4, terms=(("position_fix", 4), ("step_of_wheels", 3)))
@@ -69,7 +69,7 @@ def test_a_small_weight_has_the_derivative_that_a_weight_of_0_lacks() -> None:
 def test_padding_changes_neither_energy_nor_gradient(packed) -> None:
     # Proves that room for more keyframes, edges, landmarks and observations says nothing, for terms on edges, poses
     # and pairs and a marginal prior. Oracle: the problem without room; with one observation less it differs.
-    prior = vg.no_prior(3)
+    prior = vg.empty_prior(3)
     rng = np.random.default_rng(0)
     prior = eqx.tree_at(lambda t: (t.root, t.offset), prior, (rng.normal(size=(22, 22)), rng.normal(size=22)))
     terms = [*own_terms(), prior]
@@ -99,12 +99,12 @@ energy_terms = eqx.filter_jit(vg.analysis.energy_terms)
 
 
 def test_a_prior_of_more_keyframes_says_nothing_about_them() -> None:
-    # Proves how a dense prior grows. Oracle: `reorder`, which puts unknown keyframes behind the known ones.
-    prior = vg.no_prior(2)
+    # Proves how a dense prior grows. Oracle: `permute_prior`, which puts unknown keyframes behind the known ones.
+    prior = vg.empty_prior(2)
     rng = np.random.default_rng(0)
     prior = eqx.tree_at(lambda t: (t.root, t.offset), prior, (rng.normal(size=(16, 16)), rng.normal(size=16)))
     grown = prior.padded(3)
-    np.testing.assert_array_equal(grown.root[:16], reorder(prior, np.array([0, 1, -1])).root)
+    np.testing.assert_array_equal(grown.root[:16], permute_prior(prior, np.array([0, 1, -1])).root)
     assert float(jnp.abs(grown.root[16:]).max()) == 0.0
     assert grown.padded(3) is grown
     with raises("marginal", 3, 2):

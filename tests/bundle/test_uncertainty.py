@@ -16,8 +16,7 @@ from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.kernels import Huber
 
 import vggtgeo as vg
-from vggtgeo.bundle.analysis.covariances import Covariances, covariances
-from vggtgeo.bundle.analysis.redundancy import changing
+from vggtgeo.bundle.analysis.covariances import Covariances, changing, covariances
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.linearise import scale_direction
 from vggtgeo.bundle.objective import energy

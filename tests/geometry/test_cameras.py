@@ -14,11 +14,9 @@ from vggtgeo.geometry.camera_models import (
     KannalaBrandt,
     Pinhole,
     RadialTangential,
-    SquareKannalaBrandt,
-    SquarePinhole,
-    SquarePixels,
-    SquareRadialTangential,
+    with_shared_focal,
 )
+from vggtgeo.io.errors import InputError
 
 FOCAL = (310.0, 290.0, 321.5, 238.25)
 MATRIX = np.array([[FOCAL[0], 0, FOCAL[2]], [0, FOCAL[1], FOCAL[3]], [0, 0, 1.0]])
@@ -94,20 +92,28 @@ def test_derivatives_are_finite_differences(name: str) -> None:
                 assert error < 1e-5, (function, order, column, error)
 
 
-@pytest.mark.parametrize("square", [SquarePinhole, SquareRadialTangential, SquareKannalaBrandt])
-def test_square_pixels_are_one_focal_length(square: type[SquarePixels]) -> None:
+@pytest.mark.parametrize("model", [Pinhole, RadialTangential, KannalaBrandt])
+def test_a_shared_focal_length_is_both_of_the_model(model: type[AbstractCamera]) -> None:
     # Proves the models with `fx = fy`, both ways, and that their focal length is both of the model's. Oracle: the model
     # itself with one number twice, and the sum of its two derivatives.
-    given = next(jnp.asarray(values) for kind, values in CAMERAS.values() if kind is square.model)[1:]
+    shared = with_shared_focal(model)
+    assert with_shared_focal(model) is shared
+    given = next(jnp.asarray(values) for kind, values in CAMERAS.values() if kind is model)[1:]
     whole = jnp.concatenate([given[:1], given])
-    assert len(square.names) == len(given) == len(square.model.names) - 1
+    assert shared.names == ("f", *model.names[2:])
     for at, call in ((jnp.asarray([0.2, -0.1, 1.0]), "project"), (jnp.asarray([350.0, 200.0]), "unproject")):
-        tied = lambda parameters, at=at, call=call: getattr(square(parameters), call)(at)
-        free = lambda parameters, at=at, call=call: getattr(square.model(parameters), call)(at)
+        tied = lambda parameters, at=at, call=call: getattr(shared(parameters), call)(at)
+        free = lambda parameters, at=at, call=call: getattr(model(parameters), call)(at)
         np.testing.assert_array_equal(tied(given), free(whole))
         by_tied, by_free = jax.jacfwd(tied)(given), jax.jacfwd(free)(whole)
         np.testing.assert_allclose(by_tied[:, 0], by_free[:, 0] + by_free[:, 1], rtol=1e-12)
         np.testing.assert_allclose(by_tied[:, 1:], by_free[:, 2:], rtol=1e-12, atol=1e-15)
+
+
+def test_a_shared_focal_length_needs_two() -> None:
+    # Proves that a model without `fx` and `fy` is refused. Oracle: the error names the argument and the model.
+    with pytest.raises(InputError, match=r"`shared_focal`.*SharedFocalPinhole"):
+        with_shared_focal(with_shared_focal(Pinhole))
 
 
 def test_without_distortion_they_are_what_they_generalise() -> None:

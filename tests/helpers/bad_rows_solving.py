@@ -116,7 +116,7 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`pack`: `alpha` that is an array", pack(seen={"alpha": np.ones(3)})),
     ("`pack`: `alpha` that is a text", pack(seen={"alpha": "1"})),
     ("`pack`: a deviation that is a text", pack(intrinsics_sigma="5")),
-    ("`pack`: a term that is in no list", pack(terms=vg.no_prior(3))),
+    ("`pack`: a term that is in no list", pack(terms=vg.empty_prior(3))),
     ("`pack`: a size that is a tuple", pack(size=(3, 4))),
     ("`pack`: complex numbers as `dtype`", pack(dtype=complex)),
     ("`pack`: half precision as `dtype`", pack(dtype="float16")),
@@ -169,7 +169,7 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
         with_pair(lambda p, s: vg.slide(p, s, *vg.simulate_window(2).pack()[:2])),
     ),
     ("`within`: a keyframe twice", lambda _: SCENE.observations.within([0, 0])),
-    ("`reorder`: a keyframe twice", lambda _: vg.reorder(vg.no_prior(3), [0, 0, 1])),
+    ("`permute_prior`: a keyframe twice", lambda _: vg.permute_prior(vg.empty_prior(3), [0, 0, 1])),
     ("`solve_batch` of one window", with_pair(vg.batches.solve_batch)),
     (
         "`solve_batch`: two problems and one state",
@@ -187,5 +187,5 @@ SOLVING: tuple[tuple[str, Callable[[Path], Any]], ...] = (
     ("`solve`: an adjoint's name", with_pair(lambda p, s: vg.solve(p, s, adjoint="arrow"))),
     ("`pack`: Barron's kernel of shape 3", pack(kernel=vg.kernels.Barron(1.5, 3.0))),
     ("`pack`: a size of texts", lambda _: SCENE.pack(size=vg.PaddedSize("3", 40, 9, 2))),
-    ("`reorder` by a text", lambda _: vg.reorder(vg.no_prior(3), "210")),
+    ("`permute_prior` by a text", lambda _: vg.permute_prior(vg.empty_prior(3), "210")),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vggtgeo.io.errors import MOST, one_line
+from vggtgeo.io.errors import MAX_LENGTH, one_line
 
 
 def test_names_cannot_break_or_clear_a_terminal() -> None:
@@ -13,6 +13,6 @@ def test_names_cannot_break_or_clear_a_terminal() -> None:
 def test_a_file_is_not_told_as_a_whole() -> None:
     """Of a long message begin and end are told. Oracle: its length, and both."""
     told = one_line("begin " + "x" * 10**6 + " end")
-    assert len(told) <= MOST + len(" ... ")
+    assert len(told) <= MAX_LENGTH + len(" ... ")
     assert told.startswith("begin x")
     assert told.endswith("x end")

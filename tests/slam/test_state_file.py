@@ -20,7 +20,7 @@ from same_leaves import differences
 from vggtgeo.models.roles import LineMatches
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
-from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.persistence import Format, by_name
@@ -34,7 +34,7 @@ from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import STATE, load_state, save_state
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import SeenPoints, Waiting
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import WindowPrior
 
 MIDDLE = 4
 """Frame of the recorded run whose state is saved."""
@@ -74,7 +74,9 @@ def full(slam: Slam) -> Slam:
             axes=(np.eye(3),),
             pose_sigma=np.ones((2, 2)),
         ),
-        window=replace(slam.window, prior=WindowPrior(adjustment.keyframes, no_prior(4)), iterations=tries, held=(0,)),
+        window=replace(
+            slam.window, prior=WindowPrior(adjustment.keyframes, empty_prior(4)), iterations=tries, held=(0,)
+        ),
         camera=replace(
             slam.camera,
             lens=Camera((140.0, 140.0, 80.0, 60.0), 160, 120, (-0.1, 0.0, 0.0, 0.0), known=False),

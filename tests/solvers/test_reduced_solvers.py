@@ -25,7 +25,7 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
-from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.bundle.node_order import longest, narrow_order
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
@@ -193,7 +193,7 @@ def test_the_choice_follows_the_graph() -> None:
     loops = np.stack([i[:5], i[-5:]], 1)
     assert choose_reduced_solver(many(20, chain[:18])) == DenseCholesky()
     assert choose_reduced_solver(many(60, chain)) == BandCholesky(2)
-    assert choose_reduced_solver(many(60, chain).with_term(no_prior(60, jnp.float64))) == DenseCholesky()
+    assert choose_reduced_solver(many(60, chain).with_term(empty_prior(60, jnp.float64))) == DenseCholesky()
     closed = choose_reduced_solver(many(60, np.concatenate([chain, loops])))
     assert isinstance(closed, BandCholesky)
     assert closed.reach <= 6
@@ -201,7 +201,7 @@ def test_the_choice_follows_the_graph() -> None:
     assert isinstance(ring, BandCholesky)
     assert ring.reach <= 4
     assert sorted(np.asarray(ring.place)) == list(i)
-    assert choose_reduced_solver(many(60, chain).with_term(no_prior(60, jnp.float64))) == DenseCholesky()
+    assert choose_reduced_solver(many(60, chain).with_term(empty_prior(60, jnp.float64))) == DenseCholesky()
     # Random chords make a graph without any narrow order.
     many_nodes = np.arange(200)
     chain = np.stack([many_nodes[:-2], many_nodes[2:]], 1)

@@ -92,6 +92,7 @@ def _named(number: int) -> Iterator[None]:
 
 def _same_terms(windows: Sequence[Sequence[GivenTerm]]) -> list[list[GivenTerm]]:
     """Return the same kinds of terms in the same order for each window; missing ones have no observation."""
+    # Reversed, so that of a name the first window's term decides the order and the kind.
     kinds = {term.name: term for terms in reversed(windows) for term in terms}
     own = [{term.name: term for term in terms} for terms in windows]
     for number, (found, terms) in enumerate(zip(own, windows, strict=True)):
@@ -172,6 +173,8 @@ def solve_batch(
         single = lambda pair: solve(*pair, solver=solver, adjoint=adjoint)
         if size is None:
             return jax.vmap(single)((problems, initials))
+        # In turn: under `vmap` every window iterates until the last has converged, which on a CPU costs more than it
+        # gains.
         if size == 1:
             return jax.lax.map(single, (problems, initials))
         return jax.lax.map(single, (problems, initials), batch_size=size)

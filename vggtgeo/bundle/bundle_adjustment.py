@@ -66,6 +66,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
 
     def restore_fixed(self, point: State) -> State:
         initial = point if self.start is None else self.start
+        # Fixed coordinates pass through from the initial state, so the optimum has a derivative by them.
         fixed_pose = self.problem.fixed_pose[:, None]
         poses = jnp.where(fixed_pose, initial.poses.wxyz_xyz, point.poses.wxyz_xyz)
         intrinsics = jnp.where(self.problem.fixed_intrinsics, initial.intrinsics, point.intrinsics)
@@ -92,6 +93,7 @@ class BundleAdjustment(AbstractArrowProblem[State]):
         fraction = self.problem.fraction
         if fraction is None:
             return depth
+        # Zero in value: only the derivative by the fractions is added.
         moved = fraction - jax.lax.stop_gradient(fraction)
         change = slopes(depth, jax.lax.stop_gradient(fraction)) * moved
         return depth.at[:, self.problem.first_segment :].add(change.reshape(len(depth), -1))
@@ -115,12 +117,14 @@ def _shortened(depth: Float[Array, "h l"], moved: Float[Array, "h l"], segments:
     change, room = moved - depth, depth - _lower_bound(depth)
     too_far = -change > room
     share = jnp.where(too_far, room / jnp.where(too_far, -change, 1.0), 1.0)
+    # One factor for all samples of a segment keeps them on a line.
     share = jnp.min(share.reshape(len(depth), segments, -1), 2, keepdims=True)
     share = jnp.broadcast_to(share, (*share.shape[:2], depth.shape[1] // segments)).reshape(depth.shape)
     return jnp.where(share < 1, depth + share * change, moved)
 
 
 def _lower_bound(depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
+    # A landmark already below the bound may stay where it is, but not go farther.
     return jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
 
 

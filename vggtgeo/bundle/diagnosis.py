@@ -127,6 +127,7 @@ class Diagnosis(eqx.Module):
     def _contradicted(self, k: int) -> str:
         saved, redundancy = float(self.saved[k]), int(self.redundancy)
         rest = (float(self.energy) - saved) / max(redundancy - lie.TANGENT, 1)
+        # F-test of six more unknowns: the noise level of the weights is unknown, so the other residuals provide it.
         limit = float(stats.f.isf(SIGNIFICANCE, lie.TANGENT, max(redundancy - lie.TANGENT, 1)))
         if not saved > limit * lie.TANGENT * max(rest, 0.0) or not saved > stats.chi2.isf(SIGNIFICANCE, lie.TANGENT):
             return ""
@@ -284,6 +285,7 @@ def _share(which: Bool[Array, "*b"], present: Bool[Array, "*b"]) -> Float[Array,
 
 
 def _rejected(term: AbstractTerm, own: Observed) -> Float[Array, ""]:
+    # `w |r|^2` of Gaussian noise is chi-square with as many degrees of freedom as the residual has entries.
     level = float(stats.chi2.isf(SIGNIFICANCE, own.entries))
     # The derivative of the force `rho'(s) r` along the residual: negative where the kernel redescends.
     weight = term.kernel.weight(own.squared)
@@ -301,6 +303,7 @@ def _unresolved(problem: Problem, term: AbstractTerm, state: State, slopes: _Slo
         if problem.camera_of is not None:
             focal = focal[problem.camera_of[target]]
         depth = state.inverse_depth[row, term.first_slot : term.first_slot + term.weight.shape[1]]
+        # The relative pose has the rounding error of the position with the larger step.
         farther = jnp.maximum(away[source], away[target])[:, None]
         return _share(finer_than_precision(term.weights, (focal * depth) ** 2, farther, eps), term.weights != 0)
     if slopes is not None and isinstance(term, PoseTerm | PairTerm):
@@ -361,6 +364,7 @@ def _saved(
     finite = jnp.all(jnp.isfinite(balanced), (1, 2)) & jnp.all(jnp.isfinite(gradient), 1)
     safe = jnp.where(finite[:, None, None], balanced, jnp.eye(lie.TANGENT, dtype=balanced.dtype))
     values, vectors = jnp.linalg.eigh(safe)
+    # A direction that the term does not observe would otherwise divide rounding errors by rounding errors.
     kept = values > 100 * lie.TANGENT * jnp.finfo(values.dtype).eps
     forces = jnp.einsum("kab,ka->kb", vectors, jnp.where(finite[:, None], gradient, 0.0) / scale)
     step = jnp.einsum("kab,kb->ka", vectors, jnp.where(kept, forces / jnp.where(kept, values, 1.0), 0.0)) / scale

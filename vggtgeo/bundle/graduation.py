@@ -59,12 +59,15 @@ class Graduation(eqx.Module):
                 state,
                 args=BundleAdjustment(wide),
                 max_steps=self.iterations,
+                # A stage that ends early still leaves a better start.
                 throw=False,
             )
             return found.value, None
 
         factors = jnp.asarray(self.factors, initial.intrinsics.dtype)
+        # The path to the optimum has no part in its derivative; without this it would be differentiated all the same.
         detached = jax.lax.stop_gradient((problem, initial))
         problem, state = detached
         state, _ = jax.lax.scan(stage, state, factors)
+        # Fixed coordinates again from `initial`, with their derivative, which the line above has cut off.
         return BundleAdjustment(problem, initial).restore_fixed(jax.lax.stop_gradient(state))

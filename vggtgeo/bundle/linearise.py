@@ -54,6 +54,7 @@ def linearise(
     relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
     degree, size = problem.edges.of_host.shape[1], lie.TANGENT + cameras.seen
     apart = cameras.seen - cameras.size  # parameters of the target's camera, if it can differ from the host's
+    # Rows of `cross`: `eta` of each edge, the target's camera of each edge (if several), the host's camera.
     wide = lie.TANGENT * degree
     common = wide + apart * degree
 
@@ -71,6 +72,7 @@ def linearise(
             if apart:
                 by_target = part[None, lie.TANGENT : lie.TANGENT + apart]
                 cross = jax.lax.dynamic_update_slice(cross, by_target, (row, wide + apart * index, column))
+            # All edges of a row add to the host camera's rows; those of relative pose and target camera have their own.
             tail, start = part[None, lie.TANGENT + apart :], (row, zero + common, column)
             shared = jax.lax.dynamic_slice(cross, start, (1, *tail.shape[1:]))
             cross = jax.lax.dynamic_update_slice(cross, shared + tail, start)
@@ -94,6 +96,7 @@ def linearise(
         for axis in range(2):
             of_axis = slice(axis * points, (axis + 1) * points)
             cross = cross.at[:, -2, of_axis].add(by_pixel[:, axis])
+    # The last column of the Gram matrix is the gradient, and `eta` comes first.
     force = gram[:, : lie.TANGENT, size]
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     system = ArrowSystem(
@@ -113,6 +116,7 @@ def linearise(
     )
     if not joined:
         return system
+    # Before the change of basis: the bound is on the inverse depths themselves.
     system = replace(system, held=_held(problem, state, system.cross[:, -2, num_offsets(state) :]))
     return join_landmarks(system, None if problem.fraction is None else jax.lax.stop_gradient(problem.fraction))
 
@@ -174,6 +178,7 @@ def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
 def scale_direction(problem: Problem, state: State) -> Float[Array, "c 1"]:
     """Return the unit motion of the poses under a change of scale about the first fixed camera, or camera 0."""
     rotations, translations = state.poses.rotation().as_matrix(), state.poses.translation()
+    # 0 if no pose is fixed, which is as good a centre as any.
     held = jnp.argmax(problem.fixed_pose)
     anchor = -rotations[held].T @ translations[held]
     outward = translations + rotations @ anchor
@@ -318,6 +323,7 @@ def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool
     if not problem.positive_depth:
         return None
     alone = jnp.arange(gradient.shape[1]) < problem.first_segment
+    # Karush-Kuhn-Tucker: active only if the energy falls towards the bound, so that a landmark can leave it again.
     held = (state.inverse_depth <= MIN_INVERSE_DEPTH) & (gradient > 0) & alone
     return jnp.pad(held, ((0, 0), (num_offsets(state), 0)))
 
@@ -342,6 +348,7 @@ def _node_factors(
             whole = jnp.zeros((len(gradient), 2 * block + tail, 2 * block + tail), gradient.dtype)
             whole = whole.at[:, apart[:, None], apart].set(hessian)
             spread = jnp.zeros((len(gradient), 2 * block + tail), gradient.dtype).at[:, apart].set(gradient)
+            # The index after the last node means none (`NodeFactors`).
             no_node = jnp.full_like(touched[0], problem.num_keyframes)
             found.append(NodeFactors(touched[0], no_node, whole, spread))
     if not found:
@@ -374,6 +381,7 @@ def _dense_terms(
         hessian, gradient = hessian + own, gradient.at[-tail:].add(force)
     if not problem.dense_terms:
         return hessian, gradient
+    # Dense terms couple all poses, so the matrix grows to all dense coordinates.
     hessian = jnp.pad(hessian, (problem.num_camera - tail, 0))
     for dense in problem.dense_terms:
         own, force = dense.model(state.poses, state.parameters, correction, exact)

@@ -46,12 +46,12 @@ _MAX_KEYFRAMES = 1000
 _Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
-def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: int = 4) -> MarginalPrior:
+def empty_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: int = 4) -> MarginalPrior:
     """Return an empty prior (zero information) for `keyframes` keyframes and `parameters` camera parameters.
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.no_prior(4).root.shape
+        >>> vg.empty_prior(4).root.shape
         (28, 28)
 
     """
@@ -71,15 +71,15 @@ def no_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: in
 def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -> MarginalPrior:
     """Marginalise keyframe `leaving`: return the prior over the other poses and the camera.
 
-    The problem must have a `marginal` term (at first `problem.with_term(no_prior(n))`). The result has the same shape,
-    with zero information about keyframe `leaving`. Pure; `leaving` may be traced.
+    The problem must have a `marginal` term (at first `problem.with_term(empty_prior(n))`). The result has the same
+    shape, with zero information about keyframe `leaving`. Pure; `leaving` may be traced.
 
     Raises:
         InputError: `leaving` is out of range, or `state` does not match `problem` or is not finite.
         ValueError: `problem` has no `marginal` term.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
-        >>> window = problem.with_term(vg.no_prior(4))
+        >>> window = problem.with_term(vg.empty_prior(4))
         >>> prior = jax.eval_shape(vg.marginalise, window, solution.state, jax.numpy.asarray(1))
         >>> prior.root.shape
         (28, 28)
@@ -97,6 +97,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     check_linearisation(problem, point, finite)
     leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
     leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
+    # Known exactly, hence conditioned on; eliminating them would treat them as unknown.
     held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics.reshape(-1)])
     quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
     root, offset = unless(finite, square_root(quadratic, gradient))
@@ -105,8 +106,8 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     )
 
 
-def reorder(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPrior:
-    """Permute a prior: keyframe `order[i]` comes to position i; -1 inserts a keyframe without information.
+def permute_prior(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPrior:
+    """Permute the keyframes of a prior: keyframe `order[i]` comes to position i; -1 inserts an unknown keyframe.
 
     order: int [n]. Pure; `prior` and `order` may be traced. The values of a traced order are not checked.
 
@@ -115,7 +116,7 @@ def reorder(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPrior:
 
     Example: the first of three keyframes has left, and a new one takes the last position.
         >>> import numpy as np, vggtgeo as vg
-        >>> vg.reorder(vg.no_prior(3), np.array([1, 2, -1])).root.shape
+        >>> vg.permute_prior(vg.empty_prior(3), np.array([1, 2, -1])).root.shape
         (22, 22)
 
     """
@@ -148,6 +149,7 @@ def _order_of(given: Any, count: int) -> Int[Array, " n"]:
 
 def _linearisation_point(prior: MarginalPrior, state: State) -> State:
     """Return the prior's linearisation points where it has information, the current estimate elsewhere."""
+    # A column without entries has no information, so its linearisation point is free.
     weight, tail = jnp.sum(prior.root**2, 0), len(prior.intrinsics)
     pose_known = jnp.sum(weight[:-tail].reshape(-1, lie.TANGENT), 1) > 0
     intrinsics_known = weight[-tail:] > 0
@@ -171,6 +173,8 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
     """Return the part of a term that is removed with a keyframe; terms on the camera alone stay in the problem."""
     goes: Array
     if isinstance(term, EdgeTerm):
+        # Observations of other hosts in this keyframe are dropped: as a prior they would couple their landmarks, and
+        # the structure would no longer be an arrow.
         goes = (problem.edges.source == leaving)[:, None]
     elif isinstance(term, SlotTerm | HostPixel):
         goes = (problem.host_of_row == leaving)[:, None]
@@ -179,6 +183,7 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
     elif isinstance(term, PairTerm):
         goes = (term.first == leaving) | (term.second == leaving)
     else:
+        # The earlier prior becomes part of the new one. Terms on the camera stay in the problem and would count twice.
         goes = jnp.asarray(isinstance(term, DenseTerm) and not isinstance(term, CameraTerm))
     return term.reweighted(jnp.where(goes, term.weight, jnp.zeros_like(term.weight)))
 
@@ -191,11 +196,13 @@ def _eliminate(
     quadratic = jnp.where(free[:, None] & free[None, :], quadratic, 0.0)
     gradient = jnp.where(free, gradient, 0.0)
     inner = jnp.where(rows[:, None] & rows[None, :], quadratic, 0.0)
+    # A pseudo-inverse: the leaving pose may be undetermined by the terms that leave with it.
     inverse = jnp.linalg.pinv(inner, hermitian=True)
     coupling = jnp.where(~rows[:, None] & rows[None, :], quadratic, 0.0)
     remaining = jnp.where(~rows[:, None] & ~rows[None, :], quadratic, 0.0)
     remaining = remaining - coupling @ inverse @ coupling.T
     gradient = jnp.where(rows, 0.0, gradient - coupling @ inverse @ gradient)
+    # Products of a Schur complement are symmetric up to rounding only, and `eigh` below reads one triangle.
     return (remaining + remaining.T) / 2, gradient
 
 
@@ -209,6 +216,7 @@ def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) ->
     safe = _balance(quadratic)
     values, vectors = jnp.linalg.eigh(quadratic / safe[:, None] / safe[None, :])
     floor = len(values) * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), initial=0.0)
+    # A hundred times the rounding error: noise in the null space would become information along the gauge.
     kept = values > 100 * floor
     roots = jnp.sqrt(jnp.where(kept, values, 1.0))
     root = jnp.where(kept[:, None], roots[:, None] * vectors.T * safe[None, :], 0.0)
@@ -251,7 +259,7 @@ def _marginal_term(problem: Problem) -> MarginalPrior:
         if isinstance(term, MarginalPrior):
             return term
     raise ValueError(
-        "`problem` has no `marginal` term; add `problem.with_term(no_prior(n))` before the first marginalisation"
+        "`problem` has no `marginal` term; add `problem.with_term(empty_prior(n))` before the first marginalisation"
     )
 
 

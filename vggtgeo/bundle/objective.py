@@ -87,6 +87,7 @@ def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
         return sum_ + sum(term.energy(seen) for term, seen in of_edge(problem, view, data)), None
 
     edges = (places(problem), motions_of(relative_poses(problem, state)), edge_data(problem))
+    # A scan keeps one edge's projections in memory, not those of all edges.
     total, _ = jax.lax.scan(body, total, edges)
     return total
 
@@ -179,6 +180,7 @@ def places(problem: Problem) -> Place:
 def view_of(cameras: Cameras, hosts: Hosts, place: Place, motion: Motions) -> EdgeView:
     """Return the slots of a row, seen along the edge at `place` with that relative pose."""
     own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, place.row, keepdims=False), hosts)
+    # Once for an edge: all its terms share the projection.
     free = 0 if hosts.offset is None else hosts.offset.shape[1]
     motions = motion.rotation, motion.translation
     seen = motion.relative, *motions, cameras, place.ends, own.pixels, own.inverse_depth

@@ -22,6 +22,7 @@ from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.packing_checks import (
     as_poses,
+    check_camera,
     check_dtype,
     check_fixed,
     check_intrinsics,
@@ -54,7 +55,7 @@ from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
-from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole
+from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, with_shared_focal
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
@@ -75,6 +76,7 @@ def pack(
     fixed_pose: np.ndarray | None = None,
     fixed_intrinsics: np.ndarray | bool = False,
     camera: type[AbstractCamera] = Pinhole,
+    shared_focal: bool = False,
     camera_of: np.ndarray | None = None,
     kernel: AbstractKernel | None = None,
     terms: Sequence[GivenTerm] = (),
@@ -94,8 +96,8 @@ def pack(
         intrinsics_sigma: standard deviation of the intrinsics' prior in pixels; None = no prior.
         fixed_pose: bool `[n]`; None: only the first pose is fixed.
         fixed_intrinsics: which intrinsics are fixed: one bool, one for each parameter of a camera, or their full shape.
-        camera: camera model: `Pinhole`, `RadialTangential`, `KannalaBrandt`, one of these with `fx = fy`
-            (`SquarePinhole`, ...), or your own class.
+        camera: camera model: `Pinhole`, `RadialTangential`, `KannalaBrandt`, or your own class.
+        shared_focal: one focal length, `fx = fy = f`: `intrinsics` are then `f, cx, cy`, and the distortion's.
         camera_of: int `[n]`: camera of each keyframe, a row of `intrinsics`; None: one camera for all.
         kernel: robust kernel of points, lines and depths; None = `Cauchy(1.5)`, the best of `benchmarks/robustness.py`.
             Its width is in standard deviations, of residuals times the root of their weight: 1.5 px for a match of
@@ -134,6 +136,8 @@ def pack(
     check_observations(observations, poses)
     check_positive("inverse_depth", inverse_depth, len(observations.host))
     warn_if_far(inverse_depth)
+    check_camera(camera)
+    camera = with_shared_focal(camera) if shared_focal else camera
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
     terms = check_terms(terms, observations, len(poses))
     guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
@@ -162,6 +166,7 @@ def pack(
     if observations.segment is not None:
         present = _per_slot(index, np.ones(len(observations.host)), 0.0, dtype)
         problem, depths = _with_segments(problem, depths, present, size)
+    # Padding keyframes are fixed and unobserved, but a quaternion of length zero would be NaN when normalised.
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
     start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
     return problem, State(start, jnp.asarray(intrinsics, dtype), depths, offset), index
@@ -191,6 +196,7 @@ def _layout(
     rows = rows_of_keyframes(slots, size)
     edges, order = sort_edges(observations.edges)
     stored = pad_edges(edges, size, rows)
+    # At least 1, since a kind without slots has no landmark to divide for.
     length = np.where(slots.is_line, max(size.lines, 1), max(size.points, 1))
     part, within = (np.zeros_like(slots.within), slots.within) if size.rows is None else np.divmod(slots.within, length)
     slot = np.where(slots.is_line, size.points + within, within)

@@ -94,6 +94,7 @@ def _check_values(observations: Observations) -> None:
     check_real("alpha", observations.alpha, "finite and not negative")
     if not (np.isfinite(observations.alpha) and observations.alpha >= 0):
         raise InputError(f"`alpha` must be finite and not negative, got {observations.alpha}")
+    # Data of absent observations (weight 0) may be anything, also NaN.
     used = lambda weight: np.asarray(weight) > 0
     finite = lambda values: np.isfinite(np.asarray(values, float)).all(1)
     for name, weight in (("point_target", observations.point_weight), ("line_coefficients", observations.line_weight)):
@@ -200,12 +201,18 @@ def _check_shapes(observations: Observations, poses: np.ndarray) -> None:
             raise InputError(f"`{name}` must have shape {shape}, got {np.shape(given[name])}")
 
 
-def check_intrinsics(camera: Any, intrinsics: np.ndarray, camera_of: np.ndarray | None, keyframes: int) -> None:
-    """Check the number of parameters, positive focal lengths, and the camera of each keyframe."""
+def check_camera(camera: Any) -> None:
+    """Check that `camera` is a camera class."""
     if not (isinstance(camera, type) and issubclass(camera, AbstractCamera)):
         raise InputError(
             f"`camera` must be a camera class, such as `vggtgeo.cameras.RadialTangential`, got {camera!r:.60}"
         )
+
+
+def check_intrinsics(
+    camera: type[AbstractCamera], intrinsics: np.ndarray, camera_of: np.ndarray | None, keyframes: int
+) -> None:
+    """Check the number of parameters, positive focal lengths, and the camera of each keyframe."""
     names, cameras = ", ".join(camera.names), "" if camera_of is None else "g, "
     if intrinsics.ndim != 1 + (camera_of is not None) or intrinsics.shape[-1] != len(camera.names):
         raise InputError(
@@ -281,6 +288,7 @@ def check_size(size: PaddedSize, needed: PaddedSize) -> None:
         raise InputError(f"`size.lines` must be a multiple of `size.samples`, {needed.samples}, got {size.lines}")
     for name in ("keyframes", "points", "lines", "degree", "rows", "edges"):
         have, need = getattr(size, name), getattr(needed, name)
+        # Stored edges are laid out without gaps, so their number must be exact.
         exact = name == "edges" or (name == "rows" and size.edges is not None)
         if have is not None and (have < need or (exact and have != need)):
             raise InputError(f"`size.{name}` must be {'' if exact else 'at least '}{need} for this problem, got {have}")

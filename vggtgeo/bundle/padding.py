@@ -248,6 +248,7 @@ def _scattered(values: ArrayLike, into: ArrayLike, where: tuple[np.ndarray, np.n
             f"`values` must have shape {(len(column), *whole.shape[2:])}, got {given.shape}: a row an observation, in "
             "the order of the arguments of `pack`"
         )
+    # `pack` has checked that landmarks and matches are distinct, so XLA need not order the writes.
     return whole.at[where].set(given.astype(whole.dtype), unique_indices=True)
 
 
@@ -376,6 +377,7 @@ def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEd
     host = np.repeat(np.arange(size.keyframes), rows)
     rank = np.arange(len(edges)) - np.searchsorted(source, np.arange(size.keyframes))[source]
     degree = np.bincount(source, minlength=size.keyframes)
+    # A size without `edges`, or for another graph: all rows get the same number of edges.
     if size.edges != np.sum(rows * degree):
         degree = np.full(size.keyframes, size.degree)
     of_row = degree[host]

@@ -113,6 +113,7 @@ def _check_measured(term: PoseTerm | PairTerm | CameraTerm) -> None:
             raise InputError(f"`{term.name}.{field}` must have shape {wanted}, got {jnp.shape(value)}")
         if isinstance(value, jax.core.Tracer) or isinstance(term.weight, jax.core.Tracer):
             continue
+        # Placeholders of padding are not checked.
         known = np.asarray(value, np.float64)[np.asarray(term.weight) > 0]
         if field == "measured":
             known = np.linalg.norm(known[:, :4], axis=1)

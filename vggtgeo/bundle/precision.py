@@ -29,6 +29,7 @@ def check_precision(given: Mapping[str, Any], dtype: DTypeLike | None, positive:
         found = np.asarray(values)
         if found.dtype.kind != "f":
             continue
+        # In double precision, since half precision could not hold the limits.
         size = np.abs(found, dtype=np.promote_types(found.dtype, np.float64))
         wrong = np.isfinite(size) & (size > largest)
         if name in positive:

@@ -27,7 +27,7 @@ from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole
+from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, SharedFocal
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
@@ -166,6 +166,7 @@ class Problem(eqx.Module):
     host: Int[Array, " h"] | None = None
 
     def __getattr__(self, name: str) -> Any:
+        # `vars`, not `self.terms`: while Equinox builds or copies a module, fields are missing and this would recurse.
         for term in vars(self).get("terms", ()):
             if getattr(term, "name", None) == name:
                 return term
@@ -276,6 +277,11 @@ class Problem(eqx.Module):
     def host_of_row(self) -> Int[Array, " h"]:
         """Keyframe that hosts each row of landmarks."""
         return jnp.arange(self.num_keyframes) if self.host is None else self.host
+
+    @property
+    def shared_focal(self) -> bool:
+        """Whether the cameras have one focal length, `fx = fy = f`."""
+        return issubclass(self.camera, SharedFocal)
 
     @property
     def num_parameters(self) -> int:

@@ -39,10 +39,10 @@ PROBLEM_CLASSES: tuple[type, ...] = (
     *(Problem, State, Edges, SlotIndex, jaxlie.SE3, jaxlie.SO3),
     *(Square, Huber, Cauchy, GemanMcClure, Barron),
     *(cameras.Pinhole, cameras.RadialTangential, cameras.KannalaBrandt),
-    *(cameras.SquarePinhole, cameras.SquareRadialTangential, cameras.SquareKannalaBrandt),
+    *map(cameras.with_shared_focal, (cameras.Pinhole, cameras.RadialTangential, cameras.KannalaBrandt)),
 )
 """Classes of the package that a saved problem may have, besides those of `bundle/terms/`."""
-PROBLEM = Format("problem", 2, by_name(PROBLEM_CLASSES), True, ": pass your own classes as `terms`")
+PROBLEM = Format("problem", 3, by_name(PROBLEM_CLASSES), True, ": pass your own classes as `terms`")
 
 LAYOUT: dict[str, tuple[str | int, ...]] = {
     "edges": ("E", 2),
@@ -214,7 +214,9 @@ def _load_saved(
     path: Path, terms: Sequence[type], convert: Callable[[str, np.ndarray], Any]
 ) -> tuple[Problem, State, SlotIndex]:
     try:
-        layout = PROBLEM.with_classes((*_package_terms(), *terms))
+        models = [kind for kind in terms if issubclass(kind, cameras.AbstractCamera)]
+        shared = map(cameras.with_shared_focal, filter(cameras.has_two_focal_lengths, models))
+        layout = PROBLEM.with_classes((*_package_terms(), *terms, *shared))
     except ValueError as error:
         raise InputError(f"`terms`: {error}") from None
     saved, _ = layout.read(path, np.asarray)

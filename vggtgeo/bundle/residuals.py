@@ -170,6 +170,7 @@ def count_rows(problem: Problem, term: AbstractTerm, state: State) -> Int[Array,
 
 def _size(term: AbstractTerm, residual: Float[Array, "m *b"]) -> tuple[Float[Array, ""], Int[Array, ""]]:
     squared = jnp.sum(residual**2, 0)
+    # Weighted as in the normal equations, so the size is that of the residuals that the solution rests on.
     trusted = term.weights * term.kernel.weight(term.weights * squared)
     return jnp.sqrt(jnp.sum(trusted * squared) / jnp.sum(trusted)), jnp.sum(term.present())
 

@@ -117,6 +117,7 @@ def _check_edges(problem: Problem) -> None:
             raise InputError("`problem.host` must be ascending and contain every keyframe")
         if np.any(np.diff(row) < 0) or not np.array_equal(host[row], source):
             raise InputError("`problem.edges.row_of` must be ascending and consistent with `problem.host`")
+    # Recomputed rather than trusted: a wrong position would add derivatives to another edge without any error.
     position = np.arange(len(row)) - np.searchsorted(row, np.arange(rows))[row]
     found = np.asarray(edges.of_host)
     if position.max(initial=-1) < found.shape[1]:

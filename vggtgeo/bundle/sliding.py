@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.bundle.marginalisation import marginalise, reorder
+from vggtgeo.bundle.marginalisation import marginalise, permute_prior
 from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie
@@ -37,7 +37,7 @@ def slide(
     and `grad`. Keyframes of the next window: the remaining ones in their order, and a new one in the last position.
 
     Args:
-        problem: the solved window, `n >= 2` keyframes, with a `marginal` term (`no_prior(n)` in the first).
+        problem: the solved window, `n >= 2` keyframes, with a `marginal` term (`empty_prior(n)` in the first).
         state: its solution.
         next_problem: the observations of the next window, in the same shapes. The prior is added, and fixed poses stay
             fixed; its own `fixed_pose` is used for the new keyframe only.
@@ -61,7 +61,7 @@ def slide(
         >>> windows = [(seen, long.start[k : k + 3], long.intrinsics, seen.depth_mean) for k, seen in enumerate(parts)]
         >>> (first, second), (start, guess) = (
         ...     [jax.tree.map(lambda leaf: leaf[k], tree) for k in (0, 1)]
-        ...     for tree in vg.batches.pack_batch(windows, terms=[vg.no_prior(3)], fixed_intrinsics=True)[:2]
+        ...     for tree in vg.batches.pack_batch(windows, terms=[vg.empty_prior(3)], fixed_intrinsics=True)[:2]
         ... )
         >>> problem, initial = vg.slide(first, vg.solve(first, start).state, second, guess)
         >>> bool(vg.solve(problem, initial).converged), problem.fixed_pose.tolist()
@@ -72,7 +72,8 @@ def slide(
     check_pair(next_problem, next_initial, "next_initial")
     _check_alike(problem, next_problem)
     staying = _staying(leaving, problem.num_keyframes)
-    prior = reorder(marginalise(problem, state, leaving), jnp.append(staying, -1))
+    # The last position is the new keyframe, about which the prior knows nothing.
+    prior = permute_prior(marginalise(problem, state, leaving), jnp.append(staying, -1))
     poses = state.poses.wxyz_xyz
     newest = _extrapolated(poses) if constant_velocity else next_initial.poses.wxyz_xyz[-1]
     fixed = jnp.append(problem.fixed_pose[staying], next_problem.fixed_pose[-1])

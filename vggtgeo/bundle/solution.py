@@ -186,6 +186,7 @@ def _solve_jit(
     graduation: Graduation | None,
     diagnosis: bool,
 ) -> Solution:
+    # Steps of a segment keep its samples on a line, so they must start on one.
     initial = BundleAdjustment(problem).straightened(initial)
     if graduation is not None:
         initial = graduation.start(problem, initial, solver)
@@ -196,11 +197,14 @@ def _solve_jit(
         args=BundleAdjustment(problem, initial),
         max_steps=solver.max_iterations,
         adjoint=adjoint,
+        # Failure is a value, `termination`: an exception inside `jit` would lose the state.
         throw=False,
     )
     last = jax.lax.stop_gradient(eqx.filter(found.state, eqx.is_array))
     last = eqx.combine(last, found.state)
+    # The diagnosis reports; a derivative of it would only cost compilation.
     fixed = jax.lax.stop_gradient((problem, initial, found.value))
+    # Precision is judged at the initial state: a solve that lacked digits may have ended anywhere.
     faults = diagnose(prepared(fixed[0]), *fixed[1:], last.energy) if diagnosis else None
     codes: Any = Termination
     termination = last.termination

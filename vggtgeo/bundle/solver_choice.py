@@ -54,6 +54,7 @@ def choose_reduced_solver(problem: Problem) -> AbstractReducedSolver:
     reach = int(lengths.max(initial=1))
     if reach <= ORDERED_LIMIT:
         return BandCholesky(reach)
+    # A closed loop has one long edge in time order, and none in a folded one.
     place = narrow_order(problem.num_keyframes, ends)
     folded = int(_reaches(place, ends, alone).max(initial=1))
     if min(folded, reach) <= BAND_LIMIT:
@@ -99,4 +100,5 @@ def coupled_pairs(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 def _reaches(place: np.ndarray, ends: np.ndarray, alone: np.ndarray) -> np.ndarray:
     """Return the reach of a band that each pair of nodes needs in that order."""
     apart = np.abs(place[ends[:, 0]] - place[ends[:, 1]])
+    # Edges couple nodes up to twice their length apart (see `coupled_pairs`), pairs only their own ends.
     return np.where(alone, (apart + 1) // 2, apart)

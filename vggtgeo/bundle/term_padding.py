@@ -81,6 +81,7 @@ def _lengthened(term: AbstractTerm, count: int) -> AbstractTerm:
         filling = jnp.ones if eqx.is_inexact_array(leaf) else jnp.zeros
         return jnp.concatenate([leaf, filling((more, *leaf.shape[1:]), leaf.dtype)])
 
+    # Indices of keyframes are lengthened too, but are not data of an observation.
     touched = {name: getattr(term, name) for name in term.structure - {"weight", "kernel"}}
     changed = term.holding(jax.tree.map(longer, {**term.data(), **touched}))
     weight = jnp.concatenate([term.weight, jnp.zeros(more, term.weight.dtype)])

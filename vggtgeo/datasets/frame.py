@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import LATEST, Trajectory
+from vggtgeo.geometry.trajectory import MAX_TIME, Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
@@ -98,7 +98,7 @@ def check_frame(frame: Frame, camera: Camera) -> None:
     image, depth, time = given.image, given.depth, given.timestamp
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(f"`{frame.name}` has an image {described(image)}; it must be uint8 [H, W, 3], RGB")
-    if not isinstance(time, numbers.Real) or not -LATEST <= given.timestamp <= LATEST:
+    if not isinstance(time, numbers.Real) or not -MAX_TIME <= given.timestamp <= MAX_TIME:
         shown = time if isinstance(time, float) else f"{time!r:.60}"
         raise InputError(f"`{frame.name}` has the time {shown}; it must be a number of seconds")
     if depth is not None:

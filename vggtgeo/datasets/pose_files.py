@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.geometry.trajectory import FARTHEST, LATEST, LONGEST, SHORTEST, Trajectory, rising
+from vggtgeo.geometry.trajectory import MAX_COORDINATE, MAX_QUATERNION, MAX_TIME, MIN_QUATERNION, Trajectory, rising
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 from vggtgeo.io.text_files import whole_text
 
@@ -78,7 +78,7 @@ def trajectory_of(
     poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     times = np.asarray(times, np.float64)[: len(poses)]
     known = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    near = known & (np.abs(poses[:, :3, 3]) <= FARTHEST).all(axis=1) & (np.abs(times) <= LATEST)
+    near = known & (np.abs(poses[:, :3, 3]) <= MAX_COORDINATE).all(axis=1) & (np.abs(times) <= MAX_TIME)
     turned = near & have_rotations(np.nan_to_num(poses, nan=0.0, posinf=0.0, neginf=0.0))
     for lost, why, kind in (
         (~known, "a NaN or an infinity", NoteWarning),
@@ -122,7 +122,7 @@ def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    turned = (length >= SHORTEST) & (length <= LONGEST)
+    turned = (length >= MIN_QUATERNION) & (length <= MAX_QUATERNION)
     rotations = Rotation.from_quat(np.where(turned, quaternions, [0.0, 0.0, 0.0, 1.0])).as_matrix()
     unknown = np.where(np.isfinite(length), 0.0, np.nan)
     poses[:, :3, :3] = np.where(turned[..., None], rotations, unknown[..., None])

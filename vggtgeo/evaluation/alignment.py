@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vggtgeo.evaluation.association import check_trajectories
-from vggtgeo.geometry.trajectory import FARTHEST, Trajectory
+from vggtgeo.geometry.trajectory import MAX_COORDINATE, Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import real_numbers
 
@@ -126,6 +126,8 @@ def _check(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise InputError("`source` and `target` must be finite; leave points with NaN or infinity out")
     farthest = max(np.abs(source).max(), np.abs(target).max())
-    if farthest > FARTHEST:
-        raise InputError(f"`source` or `target` has coordinates up to {farthest:.3g} m, at most {FARTHEST:g} are valid")
+    if farthest > MAX_COORDINATE:
+        raise InputError(
+            f"`source` or `target` has coordinates up to {farthest:.3g} m, at most {MAX_COORDINATE:g} are valid"
+        )
     return source, target

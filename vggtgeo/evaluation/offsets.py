@@ -197,7 +197,7 @@ def _with(free: np.ndarray, name: str, wanted: bool = True) -> np.ndarray:
 
 
 def _chance(fit: Fit, part: slice) -> float:
-    """p-value of an offset by the F test; 1 if it is not determined."""
+    """Return the p-value of an offset by the F test; 1 if it is not determined."""
     known, value = fit.determined[part], fit.unknowns.offsets[part]
     if not known.any():
         return 1.0

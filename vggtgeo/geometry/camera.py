@@ -24,7 +24,8 @@ from vggtgeo.geometry import pinhole
 from vggtgeo.io.errors import InputError
 
 GUESSED_FIELD_OF_VIEW = math.radians(60.0)
-"""Of the longer image side: between phones (about 70 deg) and narrower depth and headset cameras (57 deg)."""
+"""Field of view of the longer image side: between phones (about 70 deg) and narrower depth and headset cameras (57
+deg)."""
 
 _CONVERGED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-8)
 """OpenCV's own five iterations leave 0.3 pixels in the corners of a wide lens (k1 = -0.3)."""
@@ -100,19 +101,19 @@ class Camera:
         return replace(self, distortion=(), fisheye=False)
 
     def resized(self, width: int, height: int) -> Self:
-        """Return the same camera of its images resized to `width` x `height` pixels; a pixel's middle is a whole
-        number.
+        """Return the camera for its images resized to `width` x `height` pixels.
+
+        Pixel centres are whole numbers.
         """
         check_sides(width, height)
         across, down = width / self.width, height / self.height
         fx, fy, cx, cy = self.intrinsics
+        # Pixel centres are whole numbers, so the image begins at -0.5 at every size.
         centre = across * (cx + 0.5) - 0.5, down * (cy + 0.5) - 0.5
         return replace(self, intrinsics=(across * fx, down * fy, *centre), width=width, height=height)
 
     def undistorted(self, pixels: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
-        """Return where pixels of this camera's images are in those of `pinhole`, float64; any may lie outside the
-        image.
-        """
+        """Return pixels of this camera as pixels of `pinhole`, float64; they may lie outside the image."""
         flat = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
         if not self.distorts or not len(flat):
             return flat.reshape(np.shape(pixels))
@@ -142,17 +143,17 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Undistorter:
-    """Resamples images and depth of a lens with distortion to the ideal pinhole of the same intrinsics.
+    """Resampling of images and depth of a lens with distortion to the ideal pinhole of the same intrinsics.
 
-    Pixels that looked outside the original repeat its nearest border pixel (no artificial edge for detectors)
-    and have no depth; `valid` is False there. Without distortion, inputs are handed back as they are,
-    uncopied.
+    Pixels from outside the original repeat its nearest border pixel (no artificial edge for detectors) and have no
+    depth; `valid` is False there. Without distortion, inputs are returned without a copy.
 
     Fields:
-        camera: the ideal pinhole of what comes out.
-        valid: bool [H, W], or None where every pixel is valid.
+        camera: the ideal pinhole of the result.
+        valid: bool [H, W], or None if every pixel is valid.
         maps: OpenCV's fixed-point maps for bilinear interpolation, or None for the identity.
         nearest: int16 [H, W, 2] source pixel (x, y) for nearest-neighbour interpolation, or None.
+
     """
 
     camera: Camera
@@ -177,6 +178,7 @@ class Undistorter:
         inside = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
         maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
         limits = np.iinfo(np.int16)
+        # A wide lens maps corners far outside, beyond the range of OpenCV's fixed-point maps.
         nearest = np.clip(np.rint(np.stack([x, y], axis=-1)), limits.min, limits.max).astype(np.int16)
         return cls(camera.pinhole, None if inside.all() else inside, (maps[0], maps[1]), nearest)
 
@@ -188,7 +190,7 @@ class Undistorter:
         return cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        """Return the undistorted depth (metres, NaN = none), by nearest neighbour: no depth between surfaces."""
+        """Return the undistorted depth (metres, NaN = unknown), by nearest neighbour: no depth between surfaces."""
         if self.nearest is None:
             return depth
         self._check_size(depth)
@@ -212,14 +214,14 @@ class Undistorter:
 
 
 def check_sides(width: Any, height: Any) -> None:
-    """InputError unless both are whole numbers of pixels."""
+    """Raise InputError unless both are whole numbers of pixels."""
     whole = isinstance(width, numbers.Integral) and isinstance(height, numbers.Integral)
     if not whole or width < 1 or height < 1:
         raise InputError(f"image size is {width} x {height}; both must be at least 1 pixel, whole numbers")
 
 
 def check_intrinsics(values: object) -> tuple[float, float, float, float]:
-    """`values` as fx, fy, cx, cy: four finite numbers, focal lengths positive; else InputError."""
+    """Return `values` as fx, fy, cx, cy; raise InputError unless finite and with positive focal lengths."""
     numbers = _finite_numbers("intrinsics", values)
     if len(numbers) != 4:
         raise InputError(f"`intrinsics` has {len(numbers)} numbers; expected four: fx, fy, cx, cy in pixels")
@@ -230,7 +232,7 @@ def check_intrinsics(values: object) -> tuple[float, float, float, float]:
 
 
 def check_distortion(values: object) -> tuple[float, ...]:
-    """`values` as 0, 4, 5 or 8 finite distortion coefficients in OpenCV's order; else InputError."""
+    """Return 0, 4, 5 or 8 finite distortion coefficients in OpenCV's order; raise InputError for others."""
     numbers = _finite_numbers("distortion", values)
     if len(numbers) not in _DISTORTION_LENGTHS:
         raise InputError(

@@ -1,15 +1,15 @@
-"""Camera models as differentiable functions of their parameters: from a point in front of the camera to its pixel, and
-back to its viewing ray.
+"""Camera models as differentiable functions of their parameters: projection of points, and viewing rays of pixels.
 
-Each model is a module that holds one vector of parameters, so that bundle adjustment can move, hold or differentiate
-it. A point is given up to a positive factor, `z > 0`; a ray has `z = 1`, so fields of view stay below 180 degrees.
+Each model is a module with one vector of parameters, so that bundle adjustment can estimate, fix or differentiate it. A
+point is given up to a positive factor, `z > 0`; a ray has `z = 1`, so fields of view stay below 180 degrees.
 """
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from types import new_class
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -17,20 +17,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from vggtgeo.io.errors import InputError
+
 MIN_RELATIVE_DEPTH = 1e-2
-"""Lower bound of `z` in `project`, in units of the point's depth in its own camera: a point nearer than this to the
-camera's plane, or behind it, projects as if it lay there, far outside the image, where a robust kernel sees it as an
-outlier; the projection never divides by zero."""
+"""Lower bound of `z` in `project`, relative to the depth in the host camera. A point nearer to the camera's plane, or
+behind it, is projected as if at this bound, far outside the image, where a robust kernel treats it as an outlier; the
+projection never divides by zero."""
 
 _NEWTON_STEPS = 8
-"""To undo a distortion: quadratic convergence reaches the last digits long before."""
+"""Newton steps to invert a distortion: convergence is quadratic, so that all digits are reached long before."""
 
 
 class AbstractCamera(eqx.Module):
-    """A camera model: focal lengths and principal point first, then what the model adds.
+    """A camera model: focal lengths and principal point first, then further parameters.
 
     Fields:
-        parameters: [q], as `names` lists them: pixels, then the distortion's without a unit.
+        parameters: [q], as listed in `names`: pixels, then distortion without a unit.
 
     Example:
         >>> vg.cameras.KannalaBrandt.names[:4]
@@ -45,11 +47,11 @@ class AbstractCamera(eqx.Module):
 
     @abc.abstractmethod
     def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Return pixel of a point in camera coordinates (any positive multiple of it), pixels."""
+        """Return the pixel of a point in camera coordinates (any positive multiple of it)."""
 
     @abc.abstractmethod
     def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Return viewing ray of a pixel, with `z = 1`."""
+        """Return the viewing ray of a pixel, with `z = 1`."""
 
 
 class Pinhole(AbstractCamera):
@@ -156,21 +158,15 @@ class KannalaBrandt(AbstractCamera):
 
 
 def _drawn_radius(camera: KannalaBrandt, angle: Float[Array, ""]) -> Float[Array, ""]:
-    """Return where a fisheye draws a ray at this angle from its axis, in focal lengths."""
+    """Return the radius at which a fisheye draws a ray at this angle from its axis, in focal lengths."""
     return angle * camera._stretch(angle)
 
 
-class SquarePixels(AbstractCamera):
-    """A model whose pixels are square: one focal length, exactly `fx = fy = f`, and the rest of `model`'s parameters.
+class SharedFocal(AbstractCamera):
+    """A model with one focal length, exactly `fx = fy = f`, and the rest of `model`'s parameters.
 
     Fields:
         parameters: [q], as `names` lists them.
-
-    Example: of a model of one's own, as of this package's fisheye.
-        >>> class SquareFisheye(vg.cameras.SquarePixels):
-        ...     model = vg.cameras.KannalaBrandt
-        >>> SquareFisheye.names
-        ('f', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
 
     """
 
@@ -190,50 +186,36 @@ class SquarePixels(AbstractCamera):
         return self.model(jnp.concatenate([self.parameters[:1], self.parameters]))
 
 
-class SquarePinhole(SquarePixels):
-    """The pinhole with square pixels.
-
-    Fields:
-        parameters: [q], as `names` lists them.
-
-    Example:
-        >>> import jax.numpy as jnp, vggtgeo as vg
-        >>> vg.cameras.SquarePinhole(jnp.array([500.0, 320.0, 240.0])).project(jnp.array([0.1, 0.2, 1.0])).tolist()
-        [370.0, 340.0]
-
-    """
-
-    model = Pinhole
+def has_two_focal_lengths(model: type[AbstractCamera]) -> bool:
+    """Return whether the first parameters of a model are `fx` and `fy`."""
+    return model.names[:2] == ("fx", "fy")
 
 
-class SquareRadialTangential(SquarePixels):
-    """`RadialTangential` with square pixels.
+# Cached: JAX compiles anew for another class, even if it is equal.
+@cache
+def with_shared_focal(model: type[AbstractCamera]) -> type[SharedFocal]:
+    """Return a model with one focal length in place of `fx` and `fy`.
 
-    Fields:
-        parameters: [q], as `names` lists them.
+    Raises:
+        InputError: the first parameters of `model` are not `fx` and `fy`.
 
     Example:
-        >>> vg.cameras.SquareRadialTangential.names
-        ('f', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2')
-
-    """
-
-    model = RadialTangential
-
-
-class SquareKannalaBrandt(SquarePixels):
-    """`KannalaBrandt` with square pixels.
-
-    Fields:
-        parameters: [q], as `names` lists them.
-
-    Example:
-        >>> vg.cameras.SquareKannalaBrandt.names
+        >>> from vggtgeo.geometry.camera_models import with_shared_focal
+        >>> with_shared_focal(vg.cameras.KannalaBrandt).names
         ('f', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
 
     """
-
-    model = KannalaBrandt
+    if not has_two_focal_lengths(model):
+        raise InputError(
+            f"`shared_focal` needs a `camera` whose first parameters are fx and fy, got `{model.__name__}` with "
+            f"{', '.join(model.names)}"
+        )
+    # The module of `model`: a program is kept on disk by the names of its classes, if those are the package's.
+    body = {"model": model, "__module__": model.__module__, "__doc__": f"`{model.__name__}` with one focal length."}
+    made: type[SharedFocal] = new_class(
+        f"SharedFocal{model.__name__}", (SharedFocal,), exec_body=lambda space: space.update(body)
+    )
+    return made
 
 
 class Cameras(eqx.Module):
@@ -241,9 +223,9 @@ class Cameras(eqx.Module):
 
     Example: keyframes 0 and 2 were taken by the first of two cameras.
         >>> import jax.numpy as jnp
-        >>> from vggtgeo.geometry.camera_models import Cameras, SquarePinhole
-        >>> both = jnp.array([[500.0, 320.0, 240.0], [300.0, 160.0, 120.0]])
-        >>> float(Cameras(both, SquarePinhole, jnp.array([0, 1, 0])).of(1).parameters[0])
+        >>> from vggtgeo.geometry.camera_models import Cameras, Pinhole
+        >>> both = jnp.array([[500.0, 500.0, 320.0, 240.0], [300.0, 300.0, 160.0, 120.0]])
+        >>> float(Cameras(both, Pinhole, jnp.array([0, 1, 0])).of(1).parameters[0])
         300.0
 
     """
@@ -256,13 +238,14 @@ class Cameras(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return number of parameters of one camera, `k`."""
+        """Number of parameters of one camera, `k`."""
         return self.parameters.shape[-1]
 
     @property
     def seen(self) -> int:
-        """Return number of parameters that an edge sees: those of the target's camera and of the host's, once if all
-        keyframes share one.
+        """Number of parameters that an edge depends on.
+
+        Those of the target's camera and of the host's; once if all keyframes share one camera.
         """
         return self.size if self.group is None else 2 * self.size
 
@@ -280,8 +263,9 @@ class Cameras(eqx.Module):
     def along(
         self, ends: tuple[Int[Array, ""], Int[Array, ""]], steps: list[Array]
     ) -> tuple[AbstractCamera, AbstractCamera]:
-        """Host's and target's camera of an edge `(i, j)`, after steps of the parameters that it sees: the target's,
-        then the host's, or those of the camera that all share.
+        """Return the cameras of host and target of an edge `(i, j)`, after steps of their parameters.
+
+        steps: of the target's camera, then of the host's; or of the camera that all share.
         """
         camera = self.of(ends[1], steps[0])
         return (camera if self.group is None else self.of(ends[0], steps[1])), camera
@@ -296,8 +280,9 @@ def _ray(flat: Float[Array, "2"]) -> Float[Array, "3"]:
 
 
 def _norm(flat: Float[Array, "2"]) -> Float[Array, ""]:
-    """Length of a vector; its derivatives at zero are zero, not NaN."""
+    """Return the length of a vector; its derivatives at zero are zero, not NaN."""
     squared = jnp.sum(flat * flat)
+    # Two `where`: the derivative of the root at zero is infinite, also in the branch that is not taken.
     somewhere = squared > 1e-12
     return jnp.where(somewhere, jnp.sqrt(jnp.where(somewhere, squared, 1.0)), 0.0)
 
@@ -306,7 +291,7 @@ def _norm(flat: Float[Array, "2"]) -> Float[Array, ""]:
 def _inverted(
     function: Callable[[Any, Array], Array], camera: AbstractCamera, value: Float[Array, "*d"]
 ) -> Float[Array, "*d"]:
-    """`x` with `function(camera, x) = value`, a number or two, by Newton's method from `x = value`."""
+    """Return `x` with `function(camera, x) = value`, a number or two, by Newton's method from `x = value`."""
 
     def step(_: Int[Array, ""] | int, x: Array) -> Array:
         return x - _divided(function(camera, x) - value, jax.jacfwd(function, 1)(camera, x))
@@ -318,7 +303,7 @@ def _inverted(
 def _inverted_jvp(
     function: Callable[[Any, Array], Array], at: tuple[Any, Array], along: tuple[Any, Array]
 ) -> tuple[Array, Array]:
-    """Return the implicit function theorem, in which `x` is again an inverse: exact to any order."""
+    """Differentiate by the implicit function theorem, in which `x` is again an inverse: exact to any order."""
     camera, value = at
     x = _inverted(function, camera, value)
     _, moved = jax.jvp(lambda camera: function(camera, x), (camera,), along[:1])
@@ -326,7 +311,7 @@ def _inverted_jvp(
 
 
 def _divided(vector: Float[Array, "*d"], matrix: Float[Array, "*dd"]) -> Float[Array, "*d"]:
-    """`matrix^-1 vector`, written out: a factorisation for each of many thousand pixels takes many times as long."""
+    """Return `matrix^-1 vector`, written out: a factorisation for each of many thousand pixels is many times slower."""
     if vector.ndim == 0:
         return vector / matrix
     (a, b), (c, d) = matrix

@@ -1,4 +1,4 @@
-"""Cells of a regular grid by one number each, so that they can be sorted and counted quickly."""
+"""Cells of a regular grid as single numbers, for fast sorting and counting."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ _LARGEST = 2**62
 
 
 def cell_numbers(cells: np.ndarray) -> np.ndarray:
-    """Return one number int64 [n] for each cell int [n, 3]: the same for the same cell, in the order of x, then y, then
-    z.
+    """Return one number int64 [n] for each cell int [n, 3], in the order of x, then y, then z.
 
-    `np.unique` of rows takes ten times as long as of these. Where the box around the cells has more of them than there
-    are numbers (a mesh of 50 m at a thousandth of 2 cm), places in the order stand for coordinates.
+    `np.unique` of rows takes ten times as long. If the box around the cells has too many cells for int64 (a mesh of 50
+    m at a thousandth of 2 cm), ranks replace coordinates.
     """
     if not len(cells):
         return np.zeros(0, np.int64)
@@ -27,6 +26,6 @@ def cell_numbers(cells: np.ndarray) -> np.ndarray:
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:
-    """Return the place of each value among the different ones, int64 [n], fewer than n."""
+    """Return the rank of each value among the distinct ones, int64 [n]."""
     places: np.ndarray = np.unique(values, return_inverse=True)[1].astype(np.int64)
     return places

@@ -35,6 +35,7 @@ def gauss_newton(
         full = step()
         for halvings in range(trials):
             trial = moved(current, full * 0.5**halvings)
+            # The Jacobian is behind a function, so a rejected trial costs an energy only.
             trial_energy, trial_step = evaluate(trial)
             if trial_energy < energy:
                 break

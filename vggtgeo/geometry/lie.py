@@ -44,20 +44,20 @@ def exp(tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
 
 
 def relative(source: jaxlie.SE3, target: jaxlie.SE3) -> jaxlie.SE3:
-    """`T_target T_source^-1`: maps the source camera's frame to the target camera's."""
+    """Return `T_target T_source^-1`: source camera -> target camera."""
     return cast(target @ source.inverse(), source.wxyz_xyz.dtype)
 
 
 def move(pose: jaxlie.SE3, tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
-    """`exp(tangent) T`, with a unit quaternion."""
+    """Return `exp(tangent) T`, with a unit quaternion."""
     return cast((exp(tangent) @ pose).normalize(), pose.wxyz_xyz.dtype)
 
 
 def move_at_zero(pose: jaxlie.SE3, tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
-    """`exp(tangent) T` for a tangent that is zero: the same value and first two derivatives as `move`.
+    """Return `exp(tangent) T` for a zero tangent, with the value and the first two derivatives of `move`.
 
-    A residual is differentiated twice at most by a step at zero, where the terms of third order of `exp` vanish. What
-    is left compiles faster: `q = (1 - w.w / 8, w / 2)`, `t = v + (w x v) / 2`.
+    A residual is differentiated at most twice by a step at zero, where the terms of third order of `exp` vanish. The
+    rest compiles faster: `q = (1 - w.w / 8, w / 2)`, `t = v + (w x v) / 2`.
     """
     v, w = tangent[..., :3], tangent[..., 3:]
     scalar = 1 - jnp.sum(w * w, -1, keepdims=True) / 8
@@ -66,12 +66,13 @@ def move_at_zero(pose: jaxlie.SE3, tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
 
 
 def log(pose: jaxlie.SE3) -> Float[Array, "*n 6"]:
-    """Return the tangent of a motion, the inverse of `exp` up to a rotation of pi; all its derivatives are finite at
+    """Return the tangent of a motion, the inverse of `exp` up to a rotation of pi, with finite derivatives at the
     identity.
 
     jaxlie's own logarithm has NaN second derivatives there, where a prior is linearised and usually evaluated.
     """
     wxyz, t = pose.wxyz_xyz[..., :4], pose.wxyz_xyz[..., 4:]
+    # `q` and `-q` are one rotation; this sign gives the angle of at most pi.
     wxyz = jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
     cosine, axis = wxyz[..., :1], wxyz[..., 1:]
     squared = jnp.sum(axis * axis, -1, keepdims=True)
@@ -96,7 +97,7 @@ _log_jit = jax.jit(log)
 
 
 def boxminus(pose: jaxlie.SE3, base: jaxlie.SE3) -> Float[Array, "*n 6"]:
-    """`log(T T_base^-1)`: the left tangent that moves `base` to `pose`."""
+    """Return `log(T T_base^-1)`: the left tangent that moves `base` to `pose`."""
     return log(cast(pose @ base.inverse(), pose.wxyz_xyz.dtype))
 
 
@@ -107,5 +108,5 @@ def steps(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def adjoint(pose: jaxlie.SE3) -> Float[Array, "*n 6 6"]:
-    """`Ad(T)`: carries tangents through `T exp(x) = exp(Ad(T) x) T`."""
+    """Return `Ad(T)`: `T exp(x) = exp(Ad(T) x) T`."""
     return pose.adjoint().astype(pose.wxyz_xyz.dtype)

@@ -1,4 +1,4 @@
-"""Two-ends lines, before they are arrays: where each sample lies on its segment, and depths that are straight along it.
+"""Line segments before packing: positions of samples along their segment, and inverse depths affine along it.
 
 Along the image of a 3D line, inverse depth is an affine function of the pixel. So the samples of a segment share two
 unknowns instead of having one each (see `solvers/segments.py`).
@@ -16,7 +16,7 @@ from vggtgeo.io.errors import InputError
 
 @dataclass(frozen=True)
 class SegmentSlots:
-    """Where the line samples of a problem go: `slot = samples * rank + position`."""
+    """Slots of the line samples of a problem: `slot = samples * rank + position`."""
 
     rank: np.ndarray
     """int `[B]`: number of the sample's segment among those of its host."""
@@ -29,7 +29,7 @@ class SegmentSlots:
 
 
 def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
-    """Return number the samples of each segment, and the segments of each host, in the order in which they are given.
+    """Number the samples of each segment, and the segments of each host, in the given order.
 
     Args:
         host: int `[B]`, keyframe of each line sample.
@@ -65,7 +65,7 @@ def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
 
 
 def fractions(pixels: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Return position of each sample along its segment, 0 at the first and 1 at the last one; 0 where absent.
+    """Return the position of each sample along its segment, 0 at the first and 1 at the last one; 0 for absent samples.
 
     Args:
         pixels: `[n, g, q, 2]`.
@@ -84,7 +84,7 @@ def fractions(pixels: np.ndarray, present: np.ndarray) -> np.ndarray:
 def straightened(inverse_depth: np.ndarray, fraction: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Return the affine functions of `fraction` nearest to the inverse depths, all `[n, g, q]`.
 
-    Where the least-squares line is not positive all along, the mean.
+    The mean where the least-squares line is not positive everywhere.
     """
     weight = present.astype(inverse_depth.dtype)
     count = np.maximum(weight.sum(-1, keepdims=True), 1.0)
@@ -94,5 +94,6 @@ def straightened(inverse_depth: np.ndarray, fraction: np.ndarray, present: np.nd
     slope = mean((fraction - centre) * np.where(present, inverse_depth, 0.0)) / np.where(spread > 0, spread, 1.0)
     line = level + slope * (fraction - centre)
     ends = np.minimum(level - slope * centre, level + slope * (1 - centre))
+    # A line through noisy samples may cross infinity; the mean is positive.
     line = np.where(ends > 0, line, level)
     return np.where(count * level > 0, line, 1.0)

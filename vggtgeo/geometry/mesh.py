@@ -23,9 +23,11 @@ from vggtgeo.io.given import path_of, real_numbers
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Fields: vertices float32 [n, 3], world, metres; faces int32 [m, 3], counter-clockwise from outside; normals
-    float32 [n, 3], unit length; colours uint8 [n, 3], RGB. InputError for other shapes, or a face of a vertex that is
-    not there.
+    """A coloured triangle mesh.
+
+    Fields: vertices float32 [n, 3], world, metres; faces int32 [m, 3], counter-clockwise from outside; normals float32
+    [n, 3], unit length; colours uint8 [n, 3], RGB. InputError for other shapes, or a face with a missing vertex.
+
     """
 
     vertices: np.ndarray
@@ -68,7 +70,7 @@ class Mesh:
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> Mesh:
-        """Read what `save_ply` wrote."""
+        """Read a file of `save_ply`."""
         path = path_of("path", path)
         try:
             head = check_head(path)

@@ -13,24 +13,26 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.io.given import path_of, real_numbers
 
-LONGEST_HEAD = 65_536
+MAX_HEADER = 65_536
 UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyHeaderParseError, PlyParseError)
-"""What the parser raises for files that are none, or that declare more than they hold."""
+"""Errors of the parser for files that are invalid, or declare more than they contain."""
 
 _NORMAL = ("nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")
-_NEAREST, _FARTHEST = 1e-30, 1e10
-"""Metres, or millimetres of the largest coordinates that surveyors have; bytes in the wrong order are often less than
-the least."""
+_MIN_SIZE, _MAX_SIZE = 1e-30, 1e10
+"""Range of valid coordinates, metres (or millimetres of the largest coordinates in surveying). Bytes in the wrong order
+often give smaller numbers."""
 _LINE_END = 2
-"""Bytes that some programs write behind the last element."""
+"""Bytes that some programs write after the last element."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Fields: points float [n, 3], world, metres; colours uint8 [n, 3], RGB; confidence float32 [n] in [0,
-    1], or None; normals float32 [n, 3] of unit length, 0 where not known, or None. InputError for other shapes or a NaN
-    among the points.
+    """A coloured point cloud.
+
+    Fields: points float [n, 3], world, metres; colours uint8 [n, 3], RGB; confidence float32 [n] in [0, 1], or None;
+    normals float32 [n, 3] of unit length, 0 if unknown, or None. InputError for other shapes or a NaN among the points.
+
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -83,8 +85,11 @@ class PointCloud:
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> "PointCloud":
-        """Read the points, colours (black where there are none), confidence and normals of a PLY file; InputError for
-        any file that holds no such points.
+        """Read points, colours (black if missing), confidence and normals of a PLY file.
+
+        Raises:
+            InputError: the file has no such points.
+
         """
         path = path_of("path", path)
         try:
@@ -108,27 +113,30 @@ class PointCloud:
 
 
 def columns_of(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:
-    """[n, c] of the properties of these names; ValueError where one is no number, but a list."""
+    """Return the properties of these names as columns, [n, c]; raise ValueError for a list property."""
     names = tuple(names)
     for name in names:
         if vertices[name].dtype.kind not in "fiu" or vertices[name].ndim != 1:
-            raise ValueError(f"the property `{name}` is no number")
+            raise ValueError(f"the property `{name}` must be a number, not a list")
     return np.column_stack([vertices[name] for name in names])
 
 
 def check_places(points: np.ndarray) -> np.ndarray:
-    """Return the same points; ValueError for places of nowhere, as bytes in the wrong order give."""
+    """Return the same points; raise ValueError for implausible coordinates.
+
+    Bytes in the wrong order give such numbers.
+    """
     sizes = np.abs(points[np.isfinite(points)])
-    if ((sizes > _FARTHEST) | ((sizes > 0) & (sizes < _NEAREST))).any():
+    if ((sizes > _MAX_SIZE) | ((sizes > 0) & (sizes < _MIN_SIZE))).any():
         raise ValueError(
-            f"its coordinates go from {sizes.min():.3g} to {sizes.max():.3g} m, which are no places; maybe the order "
-            "of its bytes is not the one that its header says"
+            f"its coordinates, from {sizes.min():.3g} to {sizes.max():.3g} m, are implausible; the byte order in its "
+            "header may be wrong"
         )
     return points
 
 
 def bytes_of_colours(values: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
-    """Return colours as bytes, of bytes, of 16 bits, or of floats up to 1 or 255; black where there is none."""
+    """Return colours as bytes, from bytes, 16 bits, or floats up to 1 or 255; black for NaN."""
     if values.dtype == np.uint8:
         return values
     known = np.nan_to_num(values.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
@@ -137,7 +145,7 @@ def bytes_of_colours(values: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
 
 
 def check_end(path: str | os.PathLike[str], head: bytes, data: PlyData) -> None:
-    """ValueError for a file that holds more than its header declares: the count of a copy that was cut or joined."""
+    """Raise ValueError for a file that contains more than its header declares: a truncated or concatenated copy."""
     with open(path, "rb") as handle:
         handle.seek(len(head))
         handle.readline()
@@ -148,11 +156,11 @@ def check_end(path: str | os.PathLike[str], head: bytes, data: PlyData) -> None:
             more = os.path.getsize(path) - handle.tell() - sum(map(_size_of, data.elements)) - _LINE_END
             rest = f"{more + _LINE_END} bytes"
     if more > 0:
-        raise ValueError(f"it has {rest} behind what its header declares")
+        raise ValueError(f"it has {rest} more than its header declares")
 
 
 def _size_of(element: PlyElement) -> int:
-    """Return bytes of an element in a binary file."""
+    """Return the bytes of an element in a binary file."""
     lists = [entry for entry in element.properties if isinstance(entry, PlyListProperty)]
     own = {entry.name for entry in lists}
     plain = sum(element.data.dtype[name].itemsize for name in element.data.dtype.names or () if name not in own)
@@ -165,16 +173,18 @@ def _size_of(element: PlyElement) -> int:
 
 
 def check_head(path: str | os.PathLike[str]) -> bytes:
-    """Return the header of a PLY file; ValueError for a long file without one, which would be read to its end as one
-    line, and where it declares more than a byte each could hold: space for lists is taken before they are read.
+    """Return the header of a PLY file.
+
+    ValueError for a long file without a header, which would be read to its end as one line, and for a header that
+    declares more elements than the file has bytes: memory for lists is allocated before they are read.
     """
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe has no end
-        raise ValueError("it is no regular file")
+        raise ValueError("it is not a regular file")
     with open(path, "rb") as handle:
-        start = handle.read(LONGEST_HEAD)
+        start = handle.read(MAX_HEADER)
     end = re.search(rb"^end_header\s", start, re.MULTILINE)
-    if end is None and os.path.getsize(path) > LONGEST_HEAD:
-        raise ValueError(f"its first {LONGEST_HEAD} bytes have no `end_header`")
+    if end is None and os.path.getsize(path) > MAX_HEADER:
+        raise ValueError(f"its first {MAX_HEADER} bytes have no `end_header`")
     head = start if end is None else start[: end.start()]
     declared = sum(int(count) for count in re.findall(rb"^element\s+\S+\s+(\d+)\s*$", head, re.MULTILINE))
     size = os.path.getsize(path)

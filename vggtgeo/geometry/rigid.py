@@ -33,6 +33,7 @@ def centres(poses: np.ndarray) -> np.ndarray:
 def angle_between(first: np.ndarray, second: np.ndarray) -> float:
     """Return the angle of the relative rotation, radians."""
     cosine = (np.trace(first[:3, :3].T @ second[:3, :3]) - 1) / 2
+    # Rounding may leave the cosine of equal rotations above 1.
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
@@ -102,10 +103,9 @@ def fraction(motion: np.ndarray, share: float) -> np.ndarray:
 def exponential(tangent: np.ndarray) -> np.ndarray:
     """Return the motion [4, 4] of a translation and a rotation vector, float64 [6].
 
-    Exp on R^3 x SO(3): to first order that of SE(3), and as good a retraction.
-
-    By Rodrigues' formula in Python's own numbers: a call that lets other threads run, as OpenCV's do, may wait for them
-    sixty times as long as it takes.
+    Exp on R^3 x SO(3): equal to that of SE(3) to first order, and as good a retraction. By Rodrigues' formula with
+    Python's numbers: a call that releases Python's lock, as OpenCV's do, may wait for it sixty times as long as it
+    takes.
     """
     tx, ty, tz, x, y, z = map(float, tangent)
     square = x * x + y * y + z * z

@@ -18,10 +18,10 @@ from vggtgeo.io.given import path_of, real_numbers
 from vggtgeo.io.text_files import whole_text
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
-SHORTEST, LONGEST = 0.5, 2.0
-"""Of a quaternion in a file: other columns have other lengths."""
-FARTHEST, LATEST = 1e15, 1e20
-"""Lengths and times in a file, far beyond any: squares of them are numbers, and nanoseconds since 1970 are less."""
+MIN_QUATERNION, MAX_QUATERNION = 0.5, 2.0
+"""Range of lengths of a quaternion in a file; other columns have other lengths."""
+MAX_COORDINATE, MAX_TIME = 1e15, 1e20
+"""Largest coordinates and times in a file: their squares are finite, and nanoseconds since 1970 are less."""
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -57,12 +57,12 @@ class Trajectory:
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"]:
-        """Return camera centres in the world, metres."""
+        """Camera centres in the world, metres."""
         return self.poses[:, :3, 3]
 
     @property
     def rotations(self) -> Float[np.ndarray, "n 3 3"]:
-        """Return camera -> world rotations."""
+        """Camera -> world rotations."""
         return self.poses[:, :3, :3]
 
     @property
@@ -71,7 +71,7 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     def to_dict(self) -> dict[str, list]:
-        """Times, positions and quaternions (x, y, z, w), as plain lists."""
+        """Return times, positions and quaternions (x, y, z, w) as plain lists."""
         quaternions = Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
         return {
             "timestamps": self.timestamps.tolist(),
@@ -131,10 +131,11 @@ def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
             f"{timestamps[row]:.6f}: sort them, and keep one pose for a time"
         )
     rotations = poses[:, :3, :3]
+    # `R R' = I` holds for reflections too, which the determinant below excludes.
     off = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
     bad = (off > _ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0)
     if bad.any():
-        raise InputError(f"pose {int(np.argmax(bad))} of {count} has no rotation in its upper left 3 x 3 block")
+        raise InputError(f"pose {int(np.argmax(bad))} of {count} must have a rotation in its upper left 3 x 3 block")
     bad = np.abs(poses[:, 3] - np.eye(4)[3]).max(axis=1, initial=0.0) > _ROTATION_TOLERANCE
     if bad.any():
         row = int(np.argmax(bad))
@@ -146,14 +147,14 @@ def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
 def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:
     file = path_of("path", path)
     if not file.is_file():
-        raise InputError(f"`{file}` is not there or is no file; give a trajectory in the TUM format")
+        raise InputError(f"`{file}` does not exist or is not a file; give a trajectory in the TUM format")
     rows = []
     for number, line in enumerate(whole_text(file).splitlines(), start=1):
         text = line.split("#", 1)[0].replace(",", " ").strip()
         if text:
             rows.append(_parse_row(f"`{file}`, line {number}", text))
     if not rows:
-        raise InputError(f"`{file}` holds no pose; a line must be `timestamp tx ty tz qx qy qz qw`")
+        raise InputError(f"`{file}` has no pose; a line must be `timestamp tx ty tz qx qy qz qw`")
     return np.array(rows)
 
 
@@ -167,13 +168,13 @@ def _parse_row(where: str, text: str) -> list[float]:
         raise InputError(f"{where}: found {text!r}; expected 8 numbers: `timestamp tx ty tz qx qy qz qw`") from None
     if not np.isfinite(row).all():
         raise InputError(f"{where}: found a NaN or an infinity in {text!r}; leave such poses out of the file")
-    if max(map(abs, row[1:4])) > FARTHEST or abs(row[0]) > LATEST:
+    if max(map(abs, row[1:4])) > MAX_COORDINATE or abs(row[0]) > MAX_TIME:
         raise InputError(
-            f"{where}: found a number that is no time or place in {text!r}; leave such poses out of the file"
+            f"{where}: found a number too large for a time or a position in {text!r}; leave such poses out of the file"
         )
     if np.linalg.norm(row[4:]) < 1e-6:
         raise InputError(f"{where}: the quaternion has length zero; expected a unit quaternion `qx qy qz qw`")
-    if not SHORTEST <= np.linalg.norm(row[4:]) <= LONGEST:
+    if not MIN_QUATERNION <= np.linalg.norm(row[4:]) <= MAX_QUATERNION:
         raise InputError(
             f"{where}: the quaternion has length {np.linalg.norm(row[4:]):.3g}; expected about 1: are the columns "
             "`timestamp tx ty tz qx qy qz qw`?"
@@ -182,8 +183,9 @@ def _parse_row(where: str, text: str) -> list[float]:
 
 
 def rising(path: str | os.PathLike[str], times: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    """Return which poses of a file make a trajectory, and in which order: sorted, and of each time the first; both with
-    an InputWarning that names the file.
+    """Return the rows of a file that make a trajectory: sorted by time, the first of equal times.
+
+    Warns (InputWarning, with the name of the file) if rows were sorted or dropped.
     """
     order = np.argsort(times, kind="stable")
     if (np.diff(times) < 0).any():

@@ -53,7 +53,7 @@ class LeftOutWarning(InputWarning):
         self.frames = frames
 
 
-MOST = 1200
+MAX_LENGTH = 1200
 """Characters of a line; a message may quote a whole damaged file."""
 _LONG_WORD = re.compile(r"[^\s]{500,}")
 """Longer words are no file names, which have at most 255 characters."""
@@ -64,7 +64,7 @@ def shortened(message: str) -> str:
     return _LONG_WORD.sub(lambda word: f"{word[0][:60]}...{word[0][-60:]}", message)
 
 
-def one_line(message: str, most: int = MOST) -> str:
+def one_line(message: str, most: int = MAX_LENGTH) -> str:
     """Return `message` without line breaks and control characters (a file name may contain a code that clears the
     screen), at most `most` characters, its middle left out.
     """

@@ -17,7 +17,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.sliding import slide
 from vggtgeo.bundle.solution import Solution, solve
@@ -105,7 +105,9 @@ def slid_error_and_gradient(
 def _with_priors(windows: Batch, weight: Array) -> Problem:
     """Return the stacked problems with these weights and an empty prior each; the baseline only in the first."""
     count, keyframes = windows.truth.shape[:2]
-    empty = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), no_prior(keyframes, weight.dtype))
+    empty = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), empty_prior(keyframes, weight.dtype)
+    )
     problem = windows.problem.with_term(windows.problem.points.reweighted(weight)).with_term(empty)
     if all(term.name != BaselinePrior.name for term in problem.terms):
         return problem

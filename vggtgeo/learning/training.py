@@ -171,7 +171,7 @@ def train(
 
 
 def compare(batch: Batch, network: Callable[[Array], Array], judge: Judge = error_and_gradient) -> PoseErrors:
-    """Pose errors on `batch` with a confidence of one, saliency, `network`, and what an oracle knows; `judge` as in
+    """Return pose errors on `batch` with a confidence of one, saliency, `network`, and an oracle; `judge` as in
     `train`.
     """
     ones = jnp.ones_like(batch.saliency)

@@ -121,9 +121,11 @@ def _dense_points(
         other = depth_maps[j]
         assert other is not None
         confirmed[good] |= _confirmed(points[good], keyframes[j], other.depth, intrinsics)
+    # Without neighbours there is no second opinion, and a map of one keyframe would be empty.
     good &= confirmed if neighbours else True
     rows, columns = rows[good], columns[good]
     sigma = np.maximum(own.sigma[rows, columns] * own.depth[rows, columns], 1e-3).astype(np.float64)
+    # Information of the depth; the bound of a millimetre keeps one sample from dominating its voxel.
     weight = own.confidence[rows, columns] / sigma**2
     return _Points.of(points[good], keyframe.image[rows, columns], normals[good], weight)
 

@@ -52,6 +52,7 @@ def confirm(own: PosedDepth, others: Sequence[PosedDepth], min_views: int) -> De
     nan = np.float32(np.nan)
     return DepthMap(
         np.where(good, mean, nan).astype(np.float32),
+        # The best variance, not that of the mean: views share images and poses, so their errors do not average out.
         np.where(good, np.sqrt(best) / mean, nan).astype(np.float32),
         np.where(good, 1.0 - 0.5**count, 0.0).astype(np.float32),
     )
@@ -69,6 +70,7 @@ def _depth_by(other: PosedDepth, own: PosedDepth, depth: np.ndarray, rays: np.nd
     inside, rows, columns = pinhole.visible(flat, other.intrinsics, other.depth_map.shape)
     z, variance = np.full(len(flat), np.nan, np.float32), np.full(len(flat), np.nan, np.float32)
     seen, sigma = other.depth_map.depth[rows, columns], other.depth_map.sigma[rows, columns]
+    # The ratio of depths is the same along nearly equal rays, whatever the distance between the two cameras.
     z[inside] = depth.reshape(-1)[inside] * seen / flat[inside, 2]
     variance[inside] = (sigma * z[inside]) ** 2
     return z.reshape(depth.shape), variance.reshape(depth.shape)

@@ -90,6 +90,7 @@ def dense_map(slam: Slam, mode: str = "auto") -> DenseMap:
 
     """
     check_dense(mode, any(keyframe.images.has_depth for keyframe in slam.keyframes))
+    # Each submap by itself: the relative pose of two is unknown.
     depth_maps: dict[int, DepthMap | None] = {}
     submaps = pieces_by_size(slam)
     for numbers in submaps:

@@ -18,7 +18,7 @@ from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.state import Slam
 
-NEAREST = 4
+MAX_VIEWS = 4
 """Keyframes from which a frame's depth is taken."""
 DISTANCE_SCALE, ANGLE_SCALE = 0.3, np.deg2rad(20)
 """Metres and radians of equal weight in the distance between views."""
@@ -47,6 +47,7 @@ def rendered_depth(pose: np.ndarray, intrinsics: np.ndarray, views: Sequence[Pos
         relative = (pose @ rigid.invert(view.pose)).astype(np.float32)
         local = local @ relative[:3, :3].T + relative[:3, 3]
         inside, rows, columns = pinhole.visible(local, intrinsics, (height, width))
+        # A z-buffer: the nearest surface hides those behind it.
         np.minimum.at(coarse, (rows // COARSE, columns // COARSE), local[inside, 2])
     crude = np.repeat(np.repeat(coarse, COARSE, 0), COARSE, 1)[:height, :width]
     depth = np.where(np.isfinite(crude), crude, np.float32(np.nan))
@@ -95,4 +96,4 @@ class FrameDepths:
             return float(metres) / DISTANCE_SCALE + float(rigid.angle_between(other, pose)) / ANGLE_SCALE
 
         same = sorted((number for number in self._views if self._submap[number] == submap), key=distance)
-        return (self._views[number] for number in same[:NEAREST])
+        return (self._views[number] for number in same[:MAX_VIEWS])

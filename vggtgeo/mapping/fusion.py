@@ -35,7 +35,7 @@ def fused_mesh(
     depth_maps: Sequence[DepthMap | None],
     intrinsics: np.ndarray,
     voxel: float = 0.02,
-    least_views: int = 2,
+    min_views: int = 2,
 ) -> Mesh:
     """Return one coloured mesh of all keyframes' depth, world frame.
 
@@ -44,11 +44,11 @@ def fused_mesh(
         depth_maps: one per keyframe, None if unknown.
         intrinsics: float64 [4], pixels.
         voxel: edge of a voxel, metres.
-        least_views: number of keyframes that must measure a voxel, if there are as many; 1 if other views have
+        min_views: number of keyframes that must measure a voxel, if there are as many; 1 if other views have
             confirmed each depth already.
 
     """
-    fusion = SurfaceFusion(intrinsics, voxel, least_views)
+    fusion = SurfaceFusion(intrinsics, voxel, min_views)
     fusion.update(keyframes, depth_maps)
     return fusion.mesh
 
@@ -81,7 +81,7 @@ class SurfaceFusion:
     Args:
         intrinsics: float64 [4], pixels.
         voxel: edge of a voxel, metres.
-        least_views: as in `fused_mesh`.
+        min_views: as in `fused_mesh`.
         bound: motion of a view's surface, voxels, above which it is fused again; measured where depth is large.
 
     Raises:
@@ -90,21 +90,21 @@ class SurfaceFusion:
     Example:
         >>> import numpy as np, vggtgeo as vg
         >>> update = next(vg.run(vg.simulate("room", 3, size=(160, 120))))
-        >>> fusion = vg.callbacks.SurfaceFusion(update.intrinsics, voxel=0.1, least_views=1)
+        >>> fusion = vg.callbacks.SurfaceFusion(update.intrinsics, voxel=0.1, min_views=1)
         >>> fusion.update(update.adjusted_keyframes) > 0, fusion.update(update.adjusted_keyframes)
         (True, 0)
 
     """
 
-    def __init__(self, intrinsics: np.ndarray, voxel: float = 0.02, least_views: int = 2, bound: float = 0.5):
+    def __init__(self, intrinsics: np.ndarray, voxel: float = 0.02, min_views: int = 2, bound: float = 0.5):
         check_positive("voxel", voxel, "metres")
         check_real("bound", bound, "voxels, 0 or more")
         if not bound >= 0:
             raise InputError(f"`bound` must be voxels, 0 or more, got {bound}")
-        check_whole("least_views", least_views, 1)
+        check_whole("min_views", min_views, 1)
         given = real_array("intrinsics", intrinsics, (4,)).astype(np.float64)
         self._intrinsics = np.array(check_intrinsics(given.tolist()))
-        self._voxel, self._least_views, self._bound = voxel, least_views, bound
+        self._voxel, self._min_views, self._bound = voxel, min_views, bound
         self._fused: dict[int, _Fused] = {}
         self._touched: dict[Block, set[int]] = defaultdict(set)
         self._parts: dict[Block, Mesh] = {}
@@ -169,8 +169,9 @@ class SurfaceFusion:
         return set(blocks)
 
     def _fuse(self, changed: set[Block]) -> int:
-        min_count = min(self._least_views, len(self._fused))
+        min_count = min(self._min_views, len(self._fused))
         if min_count != self._min_count:
+            # Another number of required views may change every block.
             changed, self._min_count = set(self._touched), min_count
         # Blocks share layers of voxels, which must be fused from the same views in each.
         near = sorted({other for block in changed for other in neighbourhood(block)} & self._touched.keys())

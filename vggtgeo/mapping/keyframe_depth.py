@@ -67,6 +67,8 @@ def optimised_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> np.n
     mass, moment = np.zeros(shape), np.zeros(shape)
     np.add.at(mass, cell, weight)
     np.add.at(moment, cell, weight * correction)
+    # Blur mass and moment alike and divide (homogeneous coordinates of the bilateral grid): empty cells do not count as
+    # 0.
     mass, moment = (gaussian_filter(grid, 1.0, mode="constant") for grid in (mass, moment))
     return depth * np.exp(_slice(moment / (mass + PRIOR_WEIGHT), (log_depth - low) / DEPTH_CELL + 1))
 
@@ -153,7 +155,7 @@ def _neighbours(
 
 
 def _points(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Sampled points of a depth map in the camera frame, float32 [3, n], metres."""
+    """Return sampled points of a depth map in the camera frame, float32 [3, n], metres."""
     rows, columns = np.mgrid[STEP // 2 : depth.shape[0] : STEP, STEP // 2 : depth.shape[1] : STEP].reshape(2, -1)
     z = depth[rows, columns]
     known = np.isfinite(z)
@@ -178,6 +180,7 @@ def _averaged(depth: np.ndarray, others: list[tuple[np.ndarray, np.ndarray]], in
         seen = mass > MIN_MASS
         total[seen] += moment[seen] / mass[seen]
         views[seen] += 1
+    # Corrections are smooth, depth is not: only the correction is upsampled, so that edges stay sharp.
     correction = cv2.resize((total / views).astype(np.float32), (cells[1] * STEP, cells[0] * STEP))
     return depth * np.exp(correction[:height, :width])
 

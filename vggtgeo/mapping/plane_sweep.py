@@ -93,6 +93,7 @@ class _Window:
         warped, mean, square, product, spare = self._buffers
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         cv2.warpPerspective(other, homography, warped.shape[::-1], dst=warped, flags=flags, borderValue=-1e4)
+        # The border value is negative, which no image is.
         inside = warped >= 0
         np.maximum(warped, 0, out=warped)
         self._mean_into(mean, warped)
@@ -100,6 +101,7 @@ class _Window:
         self._mean_into(product, cv2.multiply(self._image, warped, dst=spare))
         square -= np.multiply(mean, mean, out=spare)
         np.maximum(square, 0, out=square)
+        # Without it the correlation of untextured windows would be that of their noise.
         square += NOISE**2
         np.sqrt(square, out=square)
         product -= np.multiply(self._mean, mean, out=spare)
@@ -111,7 +113,7 @@ class _Window:
         return inside, product
 
     def _mean_into(self, mean: np.ndarray, image: np.ndarray) -> None:
-        """As `box`, to 1e-7 of the largest value, in two thirds of its time."""
+        """Compute `box`, accurate to 1e-7 of the largest value, in two thirds of its time."""
         cv2.sepFilter2D(image, cv2.CV_32F, self._taps, self._taps, dst=mean, borderType=cv2.BORDER_REFLECT_101)
 
 

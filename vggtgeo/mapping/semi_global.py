@@ -68,6 +68,7 @@ def _paths(
             jnp.concatenate([before[:, 1:], wall], axis=1), jnp.concatenate([wall, before[:, :-1]], axis=1)
         )
         penalty = smooth + (jump - smooth) / (1.0 + (grey - grey_before) ** 2 / EDGE**2)
+        # Subtracting the lowest cost keeps the sums bounded along the path, and does not change the choice.
         best = jnp.minimum(jnp.minimum(before, aside + smooth), lowest + penalty[:, None]) - lowest
         path = here + jnp.where(inside[:, None], best, 0.0)
         return (path, grey), path
@@ -83,8 +84,10 @@ def _sub_plane(total: Float[Array, "h w k"]) -> tuple[Float[Array, "h w"], Float
     inner = jnp.clip(best, 1, planes - 2)
     below, at, above = (jnp.take_along_axis(total, (inner + k)[..., None], 2)[..., 0] for k in (-1, 0, 1))
     bend = below - 2.0 * at + above
+    # Vertex of the parabola through three costs; a flat bottom has none.
     offset = jnp.where(bend > 1e-6, 0.5 * (below - above) / jnp.maximum(bend, 1e-6), 0.0)
     place = jnp.where(best == inner, inner + jnp.clip(offset, -0.5, 0.5), best)
+    # Costs of neighbouring planes are alike, so the second minimum is sought beyond them.
     near = jnp.abs(jnp.arange(planes) - best[..., None]) < 3
     margin = jnp.where(near, jnp.inf, total).min(axis=2) - total.min(axis=2)
     return place, margin

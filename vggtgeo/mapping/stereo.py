@@ -37,7 +37,7 @@ class StereoSettings:
 
     Fields: views, maximum number of neighbours. planes, number of depths. size, longer side of the images in the
     search, pixels. window, width of the correlation window there, odd. smooth and jump, penalties of the semi-global
-    matching, in units of 1 - correlation. margin, minimum margin of a pixel's plane, same unit. least_views, number of
+    matching, in units of 1 - correlation. margin, minimum margin of a pixel's plane, same unit. min_views, number of
     neighbours that must confirm a depth.
     """
 
@@ -48,10 +48,10 @@ class StereoSettings:
     smooth: float = 0.04
     jump: float = 0.5
     margin: float = 0.02
-    least_views: int = 2
+    min_views: int = 2
 
     def __post_init__(self) -> None:
-        minima = {"views": 1, "planes": 8, "size": 32, "window": 3, "least_views": 1}
+        minima = {"views": 1, "planes": 8, "size": 32, "window": 3, "min_views": 1}
         for name, minimum in minima.items():
             if getattr(self, name) < minimum:
                 raise InputError(f"`{name}` must be at least {minimum}, got {getattr(self, name)}")
@@ -88,7 +88,7 @@ def stereo_depths(
     result: list[DepthMap | None] = []
     for i, own in enumerate(found):
         others = [other for j in views[i] if (other := found[j]) is not None]
-        confirmed = None if own is None else confirm(own, others, settings.least_views)
+        confirmed = None if own is None else confirm(own, others, settings.min_views)
         if confirmed is None or confirmed.empty:
             result.append(None)
         else:
@@ -138,13 +138,16 @@ def _planes(points: np.ndarray, photo: Photo, count: int) -> np.ndarray | None:
     inside, _, _ = pinhole.visible(local, photo.intrinsics, (photo.grey.shape[0], photo.grey.shape[1]))
     if np.count_nonzero(inside) < MIN_POINTS:
         return None
+    # Quantiles, since a few points are outliers; the margins leave room for surfaces without key points.
     low, high = np.quantile(1.0 / local[inside, 2], [0.02, 0.98])
+    # Equal steps in inverse depth are about equal steps in the image.
     return np.linspace(0.6 * low, 1.5 * high, count)
 
 
 def upsample(depth_map: DepthMap, shape: Sequence[int]) -> DepthMap:
     """Return the depth map at (height, width): interpolated on one surface, nearest neighbour at depth edges."""
     size = (shape[1], shape[0])
+    # Inverse depth is affine in the pixel on a plane, where this interpolation is therefore exact.
     linear = cv2.resize(1.0 / depth_map.depth, size, interpolation=cv2.INTER_LINEAR)
     nearest, sigma, confidence = (
         cv2.resize(part, size, interpolation=cv2.INTER_NEAREST_EXACT)

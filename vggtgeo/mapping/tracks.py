@@ -98,6 +98,7 @@ def _connect(keyframes: Sequence[Keyframe], pairs: Sequence[Pair]) -> tuple[np.n
     pixel_of[j] = np.concatenate(targets)  # sub-pixel refined, more accurate than the key point
     _, component = connected_components(coo_array((np.ones(len(i), bool), (i, j)), shape=(loose, loose)), False)
     used = np.unique(np.concatenate([i, j]))
+    # A point has one place in an image: of several, all but the first are mismatches.
     _, once = np.unique(np.stack([component[used], view_of[used]]), axis=1, return_index=True)
     used = used[once]
     return component[used], view_of[used], pixel_of[used]
@@ -149,6 +150,7 @@ def _solve_sums(count: int, track: np.ndarray, matrix: np.ndarray, vector: np.nd
     normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(normal, track, matrix)
     np.add.at(right, track, vector)
+    # Nearly parallel rays leave the depth free; `_has_parallax` removes such points afterwards.
     damping = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
     return np.linalg.solve(normal + damping * np.eye(3), right[..., None])[..., 0]
 

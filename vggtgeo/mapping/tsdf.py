@@ -128,6 +128,7 @@ def _packed(view: View) -> Array:
     return jnp.asarray(packed)
 
 
+# Donated, so that XLA updates the sums in place.
 @partial(jax.jit, donate_argnums=0)
 def _with_view(
     sums: Float[Array, "n i j k 6"],
@@ -170,6 +171,7 @@ def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, min_count: in
     """Marching cubes in one block, in cubes known at all corners; None without a surface."""
     weight = volume[..., 4]
     known = volume[..., 5] >= min_count
+    # Unknown corners are "in front": marching cubes must not close a surface there.
     distance = np.where(known, volume[..., 0] / np.where(known, weight, 1), 1.0)
     if not ((distance[known] < 0).any() and (distance[known] > 0).any()):
         return None
@@ -212,6 +214,8 @@ def merge_meshes(parts: Sequence[Mesh], voxel: float) -> Mesh:
     vertices, normals, colours = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "colours")
     )
+    # Shared voxels are computed alike in both blocks, so vertices on a border agree far better than a thousandth of a
+    # voxel.
     keys = np.rint(vertices / (1e-3 * voxel)).astype(np.int64)
     _, first, row = np.unique(cell_numbers(keys), return_index=True, return_inverse=True)
     faces = row.reshape(-1)[faces]

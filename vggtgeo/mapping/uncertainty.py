@@ -76,6 +76,7 @@ def support(reference: Photo, others: Sequence[Photo], inverse_depth: np.ndarray
         common += np.where(good, rate, 0)
         agree += good
         views += inside
+    # Half of the squared difference of two images is the variance of one.
     noise = np.maximum(squares / np.maximum(agree, 1), NOISE**2) / 2
     spread = np.maximum(information + box(common * common, window), 1e-12)
     known = window**2 * np.maximum(information, 0) ** 2 / (noise * spread)
@@ -98,8 +99,10 @@ def _bend(inverse_depth: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _seen(reference: Photo, other: Photo, inverse_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Grey level of `other` at each pixel's point (below 0 outside), its derivative with respect to inverse depth, and
-    the pixels that the projection moves per inverse depth; float32 [H, W] each.
+    """Return the grey level of `other` at each pixel's point, its derivative, and the pixels moved; float32 [H, W]
+    each.
+
+    The grey level is below 0 outside. Derivative and motion are with respect to inverse depth.
     """
     height, width = inverse_depth.shape
     relative = (other.pose @ np.linalg.inv(reference.pose)).astype(np.float32)
@@ -113,6 +116,7 @@ def _seen(reference: Photo, other: Photo, inverse_depth: np.ndarray) -> tuple[np
     u, v = place[0] / z, place[1] / z
     fx, fy, cx, cy = other.intrinsics.astype(np.float32)
     along_x, along_y = fx * (move[0] - u * move[2]) / z, fy * (move[1] - v * move[2]) / z
+    # Outside of the image, where `remap` reads the border value.
     at_x, at_y = np.where(behind, -1e4, fx * u + cx), np.where(behind, -1e4, fy * v + cy)
     look = lambda image, outside: cv2.remap(
         image, at_x.astype(np.float32), at_y.astype(np.float32), cv2.INTER_LINEAR, borderValue=outside

@@ -32,13 +32,13 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.perception.still_parts import (
-    APART,
-    PICTURES,
-    StillParts,
-    find_still_parts,
+from vggtgeo.slam.perception.static_overlay import (
+    MAX_IMAGES,
+    STRIDE,
+    StaticOverlay,
+    find_static_overlay,
     small_grey,
-    still_parts_of,
+    static_overlay_of,
 )
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import prior_summary
@@ -347,8 +347,8 @@ class StaticOverlaySearch(Callback):
     """
 
     def __init__(self) -> None:
-        self.found: StillParts | None = None
-        self._overlay: StillParts | None = None
+        self.found: StaticOverlay | None = None
+        self._overlay: StaticOverlay | None = None
         self._searched = False
         self._images: list[np.ndarray] = []
         self._size = (0, 0)
@@ -358,7 +358,7 @@ class StaticOverlaySearch(Callback):
     def search(self, source: Source, selection: tuple[int, int | None, int]) -> None:
         """Search in a sample of the first frames, before the run; warn where an overlay is left out."""
         self._searched = True
-        self._overlay = find_still_parts(source.sample_images(*selection, PICTURES, APART))
+        self._overlay = find_static_overlay(source.sample_images(*selection, MAX_IMAGES, STRIDE))
         if self._overlay is None or not self._overlay.separable:
             return
         self.found = self._overlay
@@ -370,18 +370,18 @@ class StaticOverlaySearch(Callback):
         )
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        """Keep 20 to 40 images, evenly spread over at most the first `PICTURES * APART` frames."""
-        if self._searched or self._frames >= PICTURES * APART:
+        """Keep 20 to 40 images, evenly spread over at most the first `MAX_IMAGES * STRIDE` frames."""
+        if self._searched or self._frames >= MAX_IMAGES * STRIDE:
             return
         if self._frames % self._stride == 0:
             self._size = frame.image.shape[1], frame.image.shape[0]
             self._images.append(small_grey(frame.image))
-            if len(self._images) == 2 * PICTURES:
+            if len(self._images) == 2 * MAX_IMAGES:
                 self._images, self._stride = self._images[::2], 2 * self._stride
         self._frames += 1
 
     def findings(self) -> tuple[Finding, ...]:
         """Return the findings for the verdict, after the last frame."""
         if not self._searched:
-            self._overlay = still_parts_of(self._images, self._size)
+            self._overlay = static_overlay_of(self._images, self._size)
         return check_still_parts(self._overlay, left_out=self.found is not None)

@@ -1,4 +1,4 @@
-"""Callbacks of a run: progress bars, viewers, recorders. None of them changes the result."""
+"""Callbacks of a run: progress bars, viewers, recorders. They do not change the result."""
 
 from __future__ import annotations
 
@@ -22,31 +22,32 @@ class Callback:
     """
 
     def on_warm_up(self, problem: Problem, state: State) -> None:
-        """Before the first frame: compile for windows of the shape of `problem`."""
+        """Called before the first frame, to compile for windows of the shape of `problem`."""
 
     def on_begin(self, name: str, total: int | None) -> None:
-        """Everything is compiled; frames come next: `total` of them, None where nobody knows."""
+        """Called after compilation, before the first frame. total: number of frames, None if unknown."""
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        """The state after `frame` (as it was read, before undistortion)."""
+        """Called with the state after `frame` (as read, before undistortion)."""
 
     def so_far(self) -> Any:
-        """What a run that is killed and resumed must hand to `on_resume`: numbers, texts, arrays, tuples of them. Asked
-        between two frames; what is given is never changed later. None: nothing.
+        """Return data for `on_resume` in a resumed run: numbers, texts, arrays, tuples of them; None: nothing.
+
+        Called between two frames; the result must not be changed later.
         """
         return None
 
     def on_resume(self, so_far: Any, slam: Slam) -> None:
-        """After `on_begin`, where a run goes on: what `so_far` gave after the last frame of `slam`."""
+        """Called after `on_begin` of a resumed run, with the result of `so_far` after the last frame of `slam`."""
 
     def on_adjust(self, slam: Slam) -> None:
-        """The state after the last frame, before the adjustment of the whole map."""
+        """Called with the state after the last frame, before the global adjustment."""
 
     def on_stage(self, name: str) -> None:
-        """A stage after the last frame begins, which may take some seconds."""
+        """Called when a stage after the last frame starts, which may take some seconds."""
 
     def on_message(self, message: str) -> None:
-        """Something that the user should know at once."""
+        """Called with an urgent message for the user."""
 
     def on_finish(self, slam: Slam, cloud: PointCloud) -> None:
-        """The state after the last adjustment, and the map."""
+        """Called with the state after the last adjustment, and the map."""

@@ -1,9 +1,9 @@
-"""Maps that outlast their run: saved as a file, loaded by another run, which finds itself in it and goes on from there.
+"""Known maps: saved as a file, and loaded by another run, which relocalises in the map and extends it.
 
-A map is a state that no frame has been tracked in: keyframes with all that was measured in them, their matches, what
-ties them, the camera. Its keyframes are of no frame of the run that uses it, so their frames and times (s) count up to
--1: before the first frame of any run, in their order. Clocks of two runs may show the same time (a video begins at 0),
-so that times alone would not tell their keyframes apart: the one at which a keyframe was recorded is kept beside.
+A map is a state without tracked frames: keyframes with their measurements, matches, factors, and the camera. Its
+keyframes belong to no frame of the run that uses it, so their frame numbers and times (s) count up to -1, before the
+first frame of any run, in their order. Clocks of two runs may show the same time (a video starts at 0), so the time at
+which a keyframe was recorded is stored separately.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 
 MAP = Format("map", VERSION, by_name(STATE_CLASSES))
 MIN_REDESCRIBED = 0.2
-"""Minimum share of a keyframe's key points that its stored image, described again, must match. The same descriptors
-give 0.7 or more, others nearly none."""
+"""Minimum share of a keyframe's key points matched by a new description of its stored image. The same descriptors give
+0.7 or more, others nearly none."""
 FEW = 20
 """Number of key points below which this is not checked."""
 SAME_CAMERA = 0.02
@@ -38,7 +38,7 @@ standard deviation of a calibration (`PRIOR` in `camera/calibration.py`)."""
 
 
 def as_map(slam: Slam) -> Slam:
-    """What of a run's state is its map."""
+    """Return the map of a run's state."""
     slam = settled(slam)
     count = len(slam.keyframes)
     keyframes = tuple(
@@ -57,11 +57,11 @@ def as_map(slam: Slam) -> Slam:
 
 
 def save_map(path: str | os.PathLike[str], slam: Slam) -> None:
-    """Writes the map of a state (the last of a run, best after `vggtgeo.finish`), atomically; no pickles.
+    """Write the map of a state (the last of a run, best after `vggtgeo.finish`), atomically; no pickles.
 
     Raises:
         InputError: the state has no keyframe.
-        TypeError: a matcher's descriptors are of a class that files do not know.
+        TypeError: a matcher's descriptors are of a class that files do not support.
 
     """
     if not slam.keyframes:
@@ -93,11 +93,12 @@ def load_map(path: str | os.PathLike[str]) -> Slam:
 
 
 def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
-    """The state before the first frame of a run with this camera and matcher in a known map, or in that of the state of
-    a run that is still in memory, whose frames and times are not of this run.
+    """Return the state before the first frame of a run with this camera and matcher in a known map.
+
+    known: a map, or the state of a run in memory, with frames and times of that run.
 
     Raises:
-        InputError: there is no keyframe, the map is of another camera, or its key points are another matcher's.
+        InputError: there is no keyframe, the map is of another camera, or its key points are of another matcher.
 
     """
     if not known.keyframes:
@@ -129,7 +130,7 @@ def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
 
 
 def _check_matcher(known: Slam, points: PointMatcher) -> None:
-    """InputError where a run's matcher does not know a picture of the map by the key points that the map has of it."""
+    """Raise InputError if a run's matcher does not recognise an image of the map by its stored key points."""
     keyframe = max(known.keyframes, key=lambda keyframe: len(keyframe.features))
     if len(keyframe.features) < FEW or getattr(points, "simulated", False):
         return  # a simulated matcher knows the frames of its own sequence alone, to the bit

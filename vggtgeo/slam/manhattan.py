@@ -1,10 +1,9 @@
-"""Worlds of three perpendicular directions: what a keyframe's line segments say about its rotation.
+"""Manhattan worlds: rotation of a keyframe from line segments along three perpendicular directions.
 
-A keyframe's segments give the rotation C of the world's axes into the camera. The axes themselves, in the frame of the
-map, are the mean of what the first keyframes say, and then stay. From there on each keyframe has a measured rotation
-M = C A^T, whose error does not grow with the length of the path, as that of the estimated one does. It enters the
-adjustment as a term on the keyframe's pose (`RotationPrior`), and goes into the prior when the keyframe leaves, like
-any other information.
+A keyframe's segments give the rotation C of the world's axes into the camera. The axes A in the frame of the map are
+the mean over the first keyframes, and then fixed. From there on each keyframe has a measured rotation M = C A^T, whose
+error does not grow with the length of the path. It enters the adjustment as a term on the keyframe's pose
+(`RotationPrior`), and is marginalised with the keyframe like any other information.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRotation
 from vggtgeo.slam.state import Slam
 
 FIRST_VIEWS = 8
-"""Keyframes whose mean is the direction of the axes; the path has hardly drifted by then."""
-LARGEST_DISAGREEMENT = np.deg2rad(3.0)
-"""Between the measured and the tracked rotation; beyond it, the segments are taken to lie along other directions."""
+"""Keyframes whose mean gives the axes; the drift is still small."""
+MAX_DISAGREEMENT = np.deg2rad(3.0)
+"""Largest angle between the measured and the tracked rotation; beyond it, the segments are along other directions."""
 
 
 def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
-    """The state after the newest keyframe's segments have spoken, where they show the axes of the world."""
+    """Return the state with a rotation factor for the newest keyframe, if its segments show the axes of the world."""
     if not settings.line.manhattan:
         return slam
     keyframe = slam.keyframes[slam.window.members[-1]]
@@ -44,7 +43,7 @@ def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
             map=replace(slam.map, axes=(*slam.map.axes, rotation.T @ nearest_frame(view.rotation, rotation @ axes))),
         )
     off = Rotation.from_matrix(rotation @ axes @ view.rotation.T).as_rotvec()
-    if np.linalg.norm(off) > LARGEST_DISAGREEMENT:
+    if np.linalg.norm(off) > MAX_DISAGREEMENT:
         return slam
     # `view.information` is that of `Log(R M^T)` at the tracked pose; degrees apart, the root at zero is the same.
     measured = MeasuredRotation(keyframe.number, view.rotation @ axes.T, view.information)
@@ -52,5 +51,5 @@ def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
 
 
 def mean_rotation(rotations: tuple[np.ndarray, ...]) -> np.ndarray:
-    """The rotation nearest to all of `rotations` [3, 3] (chordal mean)."""
+    """Return the rotation nearest to all of `rotations` [3, 3] (chordal mean)."""
     return Rotation.from_matrix(np.asarray(rotations)).mean().as_matrix()

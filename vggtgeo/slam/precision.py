@@ -1,4 +1,4 @@
-"""The pipeline's own floating-point precision, whatever the caller has set for JAX."""
+"""Floating-point precision of the pipeline, independent of the caller's JAX configuration."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _Result = TypeVar("_Result")
 
 
 def in_double_precision(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """Run `function` with JAX's 64-bit types switched on, as they are in the program; the caller's switch stays.
+    """Run `function` with JAX's 64-bit types enabled; the caller's setting is restored.
 
-    The prior of the keyframes that have left is a product of many solves, and in single precision its weakest
-    directions (scale, drift) are lost in the rounding of its strongest.
+    The prior of marginalised keyframes is a product of many solves. In single precision its weakest directions (scale,
+    drift) are lost in the rounding errors of its strongest.
 
-    What callers set to find faults of their own is off as well: here NaN means none, compiled programs are called that
-    cannot be run line by line, and types are mixed.
+    The caller's debugging options are disabled as well: here NaN means unknown, compiled programs cannot run line by
+    line, and types are mixed.
     """
 
     @wraps(function)

@@ -214,11 +214,10 @@ def in_order(frames: Iterable[Frame], camera: Camera, last: float = -math.inf) -
 
 
 def with_own_depth(frames: Iterable[Frame], before: Collection[Frame] = ()) -> Iterator[Frame]:
-    """The frames, without depth where it is to the last bit that of another picture, the one before.
+    """Yield the frames, without the depth image if it is identical to the previous frame's.
 
-    Recorders that store a depth image with each picture repeat it where the depth camera is slower: it is what was seen
-    from where the camera was then. At half the rate of the pictures a walk of 6 cm a frame was 4.1 cm off, and called
-    good; with the depth of every second picture alone 1.3. before: the frames before the first one.
+    A recorder with a slower depth camera repeats its images: such a depth was measured at an earlier camera pose.
+    before: the frames before the first one.
     """
     last, repeated = None, False
     for number, frame in enumerate(chain(before, frames)):

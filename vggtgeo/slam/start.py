@@ -1,4 +1,4 @@
-"""The start where the first keyframe has no depth: a later frame may have some, or two views give a first map."""
+"""Initialisation without depth in the first keyframe: from a later frame with depth, or from two views."""
 
 from __future__ import annotations
 
@@ -22,22 +22,24 @@ from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 MAX_WAITING = 90
 MIN_SHARED = 100
-"""Matches that a waiting frame shares with the present one, if it is to begin the map in place of the first keyframe:
-`TwoViewStart` needs 60 of them to agree. The initialiser of ORB-SLAM (Mur-Artal, Montiel, Tardos, 2015) takes another
-reference below as many."""
+"""Matches that a waiting frame must share with the current one to start the map instead of the first keyframe:
+`TwoViewStart` needs 60 inliers. The initialiser of ORB-SLAM (Mur-Artal, Montiel, Tardos, 2015) changes its reference
+below the same number."""
 
 
 def without_depth(roles: Roles) -> Roles:
-    """The same roles, but nobody asks for metric depth: that of a map whose scale is free would contradict it."""
+    """Return the same roles without metric depth, which would contradict the scale of a map that was started without
+    it.
+    """
     return replace(roles, depth=NoDepth()) if roles.metric else roles
 
 
 def begin_again_with_depth(
     slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings
 ) -> Slam | None:
-    """The map begins at this frame in place of the first keyframe, whose depth is not known.
+    """Return the state of a map that starts at this frame instead of the first keyframe, whose depth is unknown.
 
-    None where this frame's depth is known at fewer than `min_inliers` key points.
+    None if this frame has depth at fewer than `min_inliers` key points.
     """
     depth = roles.depth.estimate(frame.image, frame.depth, tuple(slam.intrinsics))
     if not np.any(np.isfinite(depth.depth)):
@@ -65,10 +67,10 @@ def begin_again_with_depth(
 
 
 def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Roles, settings: SlamSettings) -> Slam:
-    """Try to start a map of free scale from the first keyframe and this frame; until that works, the frame waits.
+    """Try to start a map without metric depth from the first keyframe and this frame; until then the frame waits.
 
-    A first keyframe that shows nothing of this frame any more gives its place to a frame that does: a video may begin
-    at a wall, or turn away before it has moved.
+    A first keyframe that shares nothing with this frame is replaced: a video may start at a wall, or turn away before
+    it moves.
     """
     first, matches, guess = _two_views(slam, frame, features, roles)
     if guess.result not in (GeometryResult.SUCCESS, GeometryResult.LOW_PARALLAX, GeometryResult.AMBIGUOUS):
@@ -112,7 +114,7 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
 
 
 def _two_views(slam: Slam, frame: Frame, features: Features, roles: Roles) -> tuple[Keyframe, PointMatches, StartGuess]:
-    """The first keyframe, its matches with the frame, and what both say of motion and structure."""
+    """The first keyframe, its matches with the frame, and the estimated motion and structure of both."""
     first = slam.keyframes[slam.window.members[-1]]
     matches = roles.points.match(first.features, features)
     guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics, (first.image, frame.image))
@@ -120,8 +122,9 @@ def _two_views(slam: Slam, frame: Frame, features: Features, roles: Roles) -> tu
 
 
 def _later_first(slam: Slam, features: Features, roles: Roles, settings: SlamSettings) -> Slam | None:
-    """The state whose map will begin at the oldest waiting frame that shares enough with the present one, as all behind
-    it do; None where the last one does not: the present one may be blurred or dark.
+    """Return the state whose map will start at the oldest waiting frame with enough matches with the current one.
+
+    All frames after it must have as many. None if the last one has not: the current one may be blurred or dark.
     """
     chosen, old = None, slam.keyframes[slam.window.members[-1]]
     for waiting in reversed(slam.tracker.waiting):
@@ -159,7 +162,7 @@ def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
 
 
 def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
-    """Give the frames that waited their poses by the new map, as far as they are to be believed."""
+    """Track the waiting frames in the new map, and keep the accepted poses."""
     placed = {}
     for waiting in slam.tracker.waiting:
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")

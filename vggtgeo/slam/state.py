@@ -1,4 +1,4 @@
-"""The one value that the pipeline folds over frames."""
+"""The state of the pipeline, folded over the frames."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from vggtgeo.slam.window.window import Window
 
 @dataclass(frozen=True, eq=False)
 class PendingWindow:
-    """An adjustment of the window that goes on beside tracking, see `pending_window.py`.
+    """An adjustment of the window that runs beside tracking, see `pending_window.py`.
 
-    due: number of frames from which on the state has its result. begun: the state that it began with. result: that
+    due: number of frames at which the state takes its result. begun: the state that it started from. result: that
     state, adjusted.
     """
 
@@ -28,7 +28,7 @@ class PendingWindow:
     result: Future[Slam]
 
     def __reduce__(self) -> tuple[Callable[..., PendingWindow], tuple[int, Slam, Slam]]:
-        """So that states pickle, and copy: with the result, which is waited for."""
+        """Wait for the result, so that states can be pickled and copied."""
         return _done, (self.due, self.begun, self.result.result())
 
 
@@ -40,15 +40,15 @@ def _done(due: int, begun: Slam, result: Slam) -> PendingWindow:
 
 @dataclass(frozen=True, eq=False)
 class Slam:
-    """Everything known after some frames: four values, one a stage, that know nothing of each other.
+    """The state after some frames: four independent values, one a stage.
 
     Fields:
         map: Keyframes, their matches and factors.
         camera: Estimate of the intrinsics.
         tracker: The pose of every frame, and the motion of the camera.
         window: The keyframes that are adjusted together.
-        pending: The adjustment of the newest keyframe's window, while it goes on.
-        notes: What the user should know.
+        pending: The running adjustment of the newest keyframe's window.
+        notes: Notes for the user.
 
     """
 
@@ -76,7 +76,7 @@ class Slam:
 
     @property
     def adjusted_keyframes(self) -> tuple[Keyframe, ...]:
-        """All but the newest, where that one's window is still being adjusted."""
+        """All keyframes but the newest if its window is still being adjusted."""
         return self.keyframes if self.pending is None else self.keyframes[:-1]
 
     @property

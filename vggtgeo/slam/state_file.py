@@ -1,9 +1,8 @@
-"""The state of the pipeline as a file: `step` goes on from it as from the state that was saved, to the last bit.
+"""The state of the pipeline as a file: `step` continues from it exactly as from the saved state.
 
-Everything is stored, also what could be made again (the view of the reference, the last window's problem): that needs
-the poses and the camera of the moment when it was made, which are gone, and costs more to compute than to read.
-A window that is adjusted beside tracking is waited for, and its result is stored apart: it is taken up at the frame at
-which it is due.
+Everything is stored, also what could be recomputed (the view of the reference, the last window's problem): that would
+need the poses and the camera at the time of its computation, and costs more to compute than to read. For a pending
+window adjustment the result is awaited and stored separately: it is used at the frame at which it is due.
 """
 
 from __future__ import annotations
@@ -45,8 +44,7 @@ from vggtgeo.slam.state_checks import check_state
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, Waiting
 from vggtgeo.slam.window.adjustment import Adjustment
-from vggtgeo.slam.window.window import Window
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import Window, WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
@@ -81,11 +79,11 @@ STATE = Format("state", VERSION, by_name(STATE_CLASSES))
 
 
 def save_state(path: str | os.PathLike[str], slam: Slam) -> None:
-    """Writes a state, atomically; no pickles.
+    """Write a state, atomically; no pickles.
 
     Raises:
-        TypeError: the state holds something of a class that is not in `STATE_CLASSES` (the descriptors of a matcher of
-            your own, say).
+        TypeError: the state has an object of a class that is not in `STATE_CLASSES` (for example descriptors of a
+            user's matcher).
 
     """
     STATE.write(path_of("path", path), slam)
@@ -104,7 +102,7 @@ def load_state(path: str | os.PathLike[str]) -> Slam:
 
 
 def checked_state(path: Path, found: object) -> Slam:
-    """What was read, if its parts belong together; InputError otherwise."""
+    """Return a loaded state if its parts are consistent; raise InputError otherwise."""
     if not isinstance(found, Slam):
         raise InputError(f"`{path}` holds a {type(found).__name__}; expected the state of a run")
     try:

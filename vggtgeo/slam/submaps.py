@@ -9,7 +9,7 @@ from vggtgeo.slam.state import Slam
 
 
 def pieces_by_size(slam: Slam) -> tuple[tuple[int, ...], ...]:
-    """Numbers of the keyframes of each piece: first the piece that most frames with a pose hang on."""
+    """Return the numbers of the keyframes of each submap, first of the one with the most frames."""
     if not slam.keyframes:
         return ()
     label = piece_of(slam.map)
@@ -19,7 +19,7 @@ def pieces_by_size(slam: Slam) -> tuple[tuple[int, ...], ...]:
 
 
 def lost_stretches(slam: Slam) -> tuple[tuple[int, int], ...]:
-    """First and last row of `slam.frames` of each stretch of frames that have no pose."""
+    """Return the first and last row of `slam.frames` of each stretch of frames without a pose."""
     lost = np.array([False, *(not record.tracked for record in slam.frames), False])
     first, past = np.flatnonzero(np.diff(lost)).reshape(-1, 2).T
     return tuple((int(i), int(j) - 1) for i, j in zip(first, past, strict=True))

@@ -10,7 +10,7 @@ from typing import TypeVar
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-MOST_THREADS = 4
+MAX_THREADS = 4
 """More wait for Python's lock: the pieces here are some milliseconds long."""
 
 
@@ -23,5 +23,5 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item],
     workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, len(todo))
     if alone or workers < 2:
         return [function(item) for item in todo]
-    with ThreadPoolExecutor(min(workers, MOST_THREADS), thread_name_prefix="work") as pool:
+    with ThreadPoolExecutor(min(workers, MAX_THREADS), thread_name_prefix="work") as pool:
         return list(pool.map(function, todo))

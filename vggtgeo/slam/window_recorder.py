@@ -1,4 +1,4 @@
-"""What each adjustment of the window left, for the page of a run and for viewers."""
+"""Records of the window adjustments, for the report of a run and for viewers."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from vggtgeo.slam.state import Slam
 
 @dataclass(frozen=True)
 class WindowRecord:
-    """What one adjustment of the window left: number and time of its newest keyframe's frame, residuals, effort.
+    """Record of one window adjustment: number and time of its newest keyframe's frame, residuals, iterations.
 
-    rms, counts: RMS residual and number of observations of each term on landmarks and poses, by its name, where it has
-    any; units: of the residuals (`px`, `sigma`). iterations: tried steps. energy: `1/2 sum rho` before and after.
+    rms, counts: RMS residual and number of observations of each term on landmarks and poses that has any, by its name;
+    units: of the residuals (`px`, `sigma`). iterations: tried steps. energy: `1/2 sum rho` before and after.
     """
 
     frame: int
@@ -34,7 +34,7 @@ class WindowRecord:
 
 
 class WindowRecorder(Callback):
-    """Collects a `WindowRecord` of each adjustment."""
+    """Collect a `WindowRecord` of each adjustment."""
 
     def __init__(self) -> None:
         self.records: list[WindowRecord] = []

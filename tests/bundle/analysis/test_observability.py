@@ -40,7 +40,7 @@ from vggtgeo.bundle.analysis.observability_report import (
     weak_directions,
 )
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
-from vggtgeo.bundle.marginalisation import no_prior
+from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.figures.plot import plot
@@ -350,7 +350,7 @@ def test_what_the_sparse_way_refuses(sparse: Observe, loop: tuple[Problem, State
     with raises(3, "`jit`", error=ValueError):
         jax.eval_shape(sparse, problem, state)
     with raises("`marginal`", "couples all", error=ValueError):
-        sparse(problem.with_term(no_prior(KEYFRAMES)), state)
+        sparse(problem.with_term(empty_prior(KEYFRAMES)), state)
     with raises("`state`", "float32", "float64", error=ValueError):
         sparse(*packed(WELL, at_truth=True, dtype=np.float32))
     with pytest.raises(InputError, match=r"`problem`.*`points`"):

@@ -59,7 +59,7 @@ def test_one_file_is_all(added: ModuleType, tmp_path: Path) -> None:
     truth = SCENE.at_truth()[1]
     centres = truth.poses.inverse().translation()
     heights = added.CameraHeight(keyframe=[1, 2], height=centres[1:, 1], weight=jnp.full(2, 1e8))
-    problem, start, index = SCENE.pack(terms=[heights, vg.no_prior(3)])
+    problem, start, index = SCENE.pack(terms=[heights, vg.empty_prior(3)])
     without = problem.with_term(heights.reweighted(jnp.zeros(2)), replace=True)
 
     energy, size = (

@@ -21,7 +21,6 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.camera_models import SquarePinhole
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
 from vggtgeo.slam.global_map.global_adjustment import _taken_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
@@ -57,7 +56,7 @@ def found_in(window: vg.data.SimulatedWindow, focal: float) -> FoundLens:
         guess,
         1.0 / window.observations.depth_mean,
         intrinsics_sigma=np.full(3, 0.3 * guess[0]),
-        camera=SquarePinhole,
+        shared_focal=True,
     )
     problem = packed[0]
     size = (round(2 * cy + 1), round(2 * cx + 1))
@@ -98,7 +97,7 @@ def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
     window = vg.simulate_window(3, 12, 0)
     _, _, cx, cy = window.intrinsics
     guess = window.observations, window.start, np.array([window.intrinsics[0], cx, cy])
-    problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, camera=SquarePinhole)
+    problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, shared_focal=True)
     for focal in (-1.0, float("nan")):
         ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[0].set(f))
         assert find_lens(problem, state, (480, 640), ends_at) is None
@@ -111,7 +110,7 @@ def test_few_keyframes_tell_no_lens() -> None:
         window = vg.simulate_window(keyframes, 12, 0)
         _, _, cx, cy = window.intrinsics
         guess = window.observations, window.start, np.array([window.intrinsics[0], cx, cy])
-        problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, camera=SquarePinhole)
+        problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, shared_focal=True)
         packed.append(find_lens(problem, state, (480, 640), lambda _, state: state))
     few, enough = packed
     assert few is not None

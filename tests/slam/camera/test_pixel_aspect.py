@@ -24,7 +24,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.lens import find_lens
 from vggtgeo.slam.camera.pixel_aspect import FoundAspect, find_aspect
 from vggtgeo.slam.global_map import global_adjustment
-from vggtgeo.slam.global_map.global_adjustment import adjust_all, camera_of
+from vggtgeo.slam.global_map.global_adjustment import adjust_all, shares_focal
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
 _solve = eqx.filter_jit(vg.solve)
@@ -75,7 +75,7 @@ def as_square(window: vg.data.SimulatedWindow, squeeze: float) -> tuple[Problem,
         guess,
         depths,
         intrinsics_sigma=np.full(3, 0.3 * f),
-        camera=vg.cameras.SquarePinhole,
+        shared_focal=True,
     )
     return packed[0], solve(*packed[:2])
 
@@ -132,9 +132,7 @@ def test_what_ends_in_no_camera_is_none() -> None:
     window = vg.simulate_window(3, 12, 0)
     f, _, cx, cy = window.intrinsics
     depths = 1.0 / window.observations.depth_mean
-    problem, state, _ = vg.pack(
-        window.observations, window.start, np.array([f, cx, cy]), depths, camera=vg.cameras.SquarePinhole
-    )
+    problem, state, _ = vg.pack(window.observations, window.start, np.array([f, cx, cy]), depths, shared_focal=True)
     for focal in (-1.0, float("nan")):
         ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[1].set(f))
         assert find_aspect(problem, state, ends_at) is None
@@ -157,7 +155,7 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(global_adjustment, "can_undistort", lambda slam: False)
     slam = recorded_run().states[-1]
     guess = replace(slam, camera=replace(slam.camera, sigma=np.full(4, 100.0), self_calibrated=False), pending=None)
-    assert camera_of(guess) is vg.cameras.SquarePinhole
+    assert shares_focal(guess)
     done = adjust_all(guess, SETTINGS)
     fx, fy, *_ = done.intrinsics
     assert fy / fx == pytest.approx(1.2, rel=0.02)
@@ -166,7 +164,7 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     again = replace(
         guess, camera=replace(guess.camera, intrinsics=done.intrinsics, given=done.intrinsics, self_calibrated=True)
     )
-    assert camera_of(again) is vg.cameras.Pinhole
+    assert not shares_focal(again)
     adjust_all(again, SETTINGS)
     assert len(tried) == 1
 

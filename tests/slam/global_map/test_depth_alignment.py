@@ -15,7 +15,7 @@ from scipy.linalg import expm
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.global_map.depth_alignment import FARTHEST, LEAST_COSINE, Surface, align, align_pairs
+from vggtgeo.slam.global_map.depth_alignment import MAX_DISTANCE, MIN_COSINE, Surface, align, align_pairs
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 INTRINSICS = np.array([260.0, 255.0, 159.5, 119.5])
@@ -70,7 +70,7 @@ def residuals_of(source: Surface, target: Surface, at: np.ndarray) -> tuple[np.n
         if not (0 <= column < target.points.shape[1] and 0 <= row < target.points.shape[0]):
             continue
         q, n = target.points[row, column], target.normals[row, column]
-        if np.linalg.norm(p - q) < FARTHEST and n @ facing > LEAST_COSINE:
+        if np.linalg.norm(p - q) < MAX_DISTANCE and n @ facing > MIN_COSINE:
             rows.append((p, q, n, own))
     p, q, n, own = (np.array(column) for column in zip(*rows, strict=True))
     residual = np.sum(n * (p - q), 1)

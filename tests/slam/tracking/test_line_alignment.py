@@ -16,7 +16,7 @@ from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.covisibility import Directed, match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
-from vggtgeo.slam.tracking.evidence import LARGEST_SIGMA, tangent, worst_sigma
+from vggtgeo.slam.tracking.evidence import MAX_SIGMA, tangent, worst_sigma
 from vggtgeo.slam.tracking.line_alignment import END_SIGMA, align_lines
 from vggtgeo.slam.window.line_triangulation import with_segment_depths
 
@@ -122,7 +122,7 @@ def test_what_parallel_lines_do_not_say_is_missing() -> None:
         found = align_lines(keyframe, seen, _Same(), wrong, 1e-2 * np.eye(6), INTRINSICS)
         assert found is not None
         sigma = worst_sigma(found.information)[0]
-        assert sigma > LARGEST_SIGMA, f"{sigma:.2f} m claimed along the lines"
+        assert sigma > MAX_SIGMA, f"{sigma:.2f} m claimed along the lines"
         off = tangent(found.motion @ rigid.invert(MOTION))[:3]
         assert abs(off @ across) < 0.02, f"{100 * abs(off @ across):.1f} cm across the lines"
         assert abs(off[1]) < 0.02, f"{100 * abs(off[1]):.1f} cm across the lines"

@@ -371,7 +371,7 @@ def test_a_place_that_drift_has_moved_is_used_again(
     again, and a motion ties the old to the new. Where odometry says that they are 2 m away, the place only looks the
     same, and nothing ties it. Oracle: the renderer's poses, relative to the old keyframe.
     """
-    monkeypatch.setattr(relocalisation, "MOST_DRIFT", 1.0)  # the room is small for so much drift
+    monkeypatch.setattr(relocalisation, "MAX_DRIFT", 1.0)  # the room is small for so much drift
     frames, camera, truth = room
     slam, old = _run(frames, camera), 3
     assert min(slam.window.members) > old - 1

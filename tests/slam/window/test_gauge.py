@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.arrow import reduce
 
 from vggtgeo.bundle.linearise import free_coordinates, linearise
-from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior
+from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
@@ -25,8 +25,7 @@ from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.window.sliding_window import make_room
-from vggtgeo.slam.window.window import Window
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import Window, WindowPrior
 
 KEYFRAMES, POINTS = 7, 12
 SOLVE = eqx.filter_jit(solve)
@@ -66,7 +65,7 @@ def _random_graph(seed: int, few: int = 1) -> tuple[SimulatedWindow, Problem, St
     ties = _ties(window, ends, (rng.random(2) < 0.5).astype(float))
     fixed = np.isin(np.arange(KEYFRAMES), rng.permutation(KEYFRAMES)[: rng.integers(0, 4)])
     observed = replace(window, observations=replace(seen, point_weight=here.astype(float)))
-    problem, initial, _ = observed.pack(terms=(no_prior(KEYFRAMES), ties), fixed_pose=fixed)
+    problem, initial, _ = observed.pack(terms=(empty_prior(KEYFRAMES), ties), fixed_pose=fixed)
     return observed, problem, initial
 
 
@@ -122,7 +121,7 @@ def test_each_piece_of_a_random_graph_has_one_gauge(seed: int) -> None:
 def test_what_is_held_is_said() -> None:
     """A keyframe without any match is named in a note, and stays where it was; oracle: the graph as it was cut."""
     window = simulate_window(KEYFRAMES, POINTS, 0, noise=0.0, depth_error=0.0, start_error=0.02)
-    problem, initial, _ = window.pack(terms=(no_prior(KEYFRAMES), _ties(window, np.zeros((2, 2), int), np.zeros(2))))
+    problem, initial, _ = window.pack(terms=(empty_prior(KEYFRAMES), _ties(window, np.zeros((2, 2), int), np.zeros(2))))
     apart = np.asarray(problem.edges.source)[:, None] == 3
     apart = apart | (np.asarray(problem.edges.target)[:, None] == 3)
     cut = problem.with_term(problem.points.reweighted(jnp.where(apart, 0.0, problem.points.weight)))
@@ -180,7 +179,7 @@ def test_a_unit_that_nothing_tells_is_held() -> None:
     window = simulate_window(KEYFRAMES, POINTS, 0, noise=0.0, depth_error=0.0, start_error=0.0)
     seen = replace(window.observations, depth_weight=np.zeros(KEYFRAMES * POINTS))
     bare = replace(window, observations=seen)
-    problem, initial, _ = bare.pack(terms=(no_prior(KEYFRAMES),))
+    problem, initial, _ = bare.pack(terms=(empty_prior(KEYFRAMES),))
     assert _null_dimensions(problem, initial) == 1
     held, gauge = with_one_gauge(problem, initial, KEYFRAMES, metric=False)
     assert gauge.loose == (tuple(range(KEYFRAMES)),)

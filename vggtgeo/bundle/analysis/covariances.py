@@ -16,16 +16,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.analysis.redundancy import changing
 from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
-from vggtgeo.bundle.objective import prepared, prepared_energy
+from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
 from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
+from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm, node_derivatives
+from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
@@ -202,6 +203,7 @@ def _covariances_jit(
     first: Int[Array, " h"] | None,
 ) -> Covariances:
     ready = prepared(problem)
+    # The reweighted Hessian: the exact one may be indefinite, and is no information matrix.
     system = linearise(ready, state)
     found = covariance(system, solver, rows)
     known = Covariances(
@@ -235,4 +237,30 @@ def variance_factor(problem: Problem, state: State, rank: Int[Array, ""]) -> Flo
     rows = jnp.asarray(sum(count_rows(problem, term, state) for term in terms))
     redundancy = rows - rank
     factor = 2 * prepared_energy(problem.with_terms(terms), state) / jnp.maximum(redundancy, 1)
+    # Without redundancy residuals vanish whatever the noise, so the weights are taken at their word.
     return jnp.where(redundancy > 0, factor, jnp.ones_like(factor))
+
+
+def changing(problem: Problem, term: AbstractTerm, state: State) -> AbstractTerm:
+    """Return a prepared term without the observations of fixed coordinates, which do not count as redundancy.
+
+    Landmarks are always free, so terms on them are unchanged; a dense term couples everything.
+    """
+    free_parameters = ~problem.fixed_intrinsics
+    free: Bool[Array, "m d"]
+    if isinstance(term, CameraTerm):
+        slopes = jnp.moveaxis(jax.jacfwd(term.residuals)(state.parameters), 1, 0)
+        free = jnp.broadcast_to(free_parameters.reshape(-1), (len(slopes), problem.num_parameters))
+    elif isinstance(term, PoseTerm | PairTerm):
+        slopes = node_derivatives(term, state.poses.wxyz_xyz, cameras_of(problem, state))[1]
+        parts = [jnp.repeat(~problem.fixed_pose[index][:, None], lie.TANGENT, 1) for index in term.touched()]
+        if isinstance(term, PoseTerm):
+            cameras = problem.camera_of
+            own = free_parameters if cameras is None else free_parameters[cameras[term.keyframe]]
+            parts.append(jnp.broadcast_to(own, (len(slopes), free_parameters.shape[-1])))
+        free = jnp.concatenate(parts, 1)
+    else:
+        return term
+    # By derivatives, not by class: without any, an observation has no influence on the optimum, whatever its kind.
+    moves = jnp.any((slopes != 0) & free[:, None, :], (1, 2))
+    return term.reweighted(jnp.where(moves, term.weight, 0.0))

@@ -131,6 +131,7 @@ def _found(
 ) -> Observability:
     count, directions, first = len(systems), coordinates.common, num_offsets(state)
     part = lambda start, end: jax.tree.map(lambda leaf: leaf[start:end], spectra)
+    # A direction `x` is `D^1/2 x` in balanced coordinates.
     balanced = directions * coordinates.scale
     size = jnp.linalg.norm(balanced, axis=1, keepdims=True)
     return Observability(

@@ -29,6 +29,7 @@ def sparse_matrix(blocks: Blocks, layout: SparseLayout) -> sp.csr_array:
     inner = sp.bsr_array((values, np.asarray(layout.column), starts), shape=(size, size))
     border = sp.csr_array(np.asarray(blocks.border, float)[:, :, :-1].reshape(size, -1))
     whole = sp.block_array([[inner, border], [border.T, sp.csr_array(corner)]], format="csr")
+    # Blocks above and below the diagonal are summed in different orders.
     return (whole + whole.T) / 2
 
 
@@ -46,6 +47,7 @@ def weakest(matrix: sp.csr_array, count: int) -> tuple[Float[np.ndarray, " v"], 
         return values[:count], vectors[:, :count]
     factor = definite_factor(matrix + SHIFT * sp.eye_array(size))
     inverse = LinearOperator(matrix.shape, matvec=factor.solve, dtype=float)
+    # ARPACK's own start is random; a fixed one makes the result reproducible.
     start = np.random.default_rng(0).normal(size=size)
     found = eigsh(matrix, k=count, sigma=-SHIFT, OPinv=inverse, v0=start)[1]
     basis = np.linalg.qr(found)[0]

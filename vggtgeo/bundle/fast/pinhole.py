@@ -71,6 +71,7 @@ def project(ray_x: Array, ray_y: Array, depth: Array, edge: OneEdge) -> Projecti
     rows = tuple(
         rotation[i, 0] * ray_x + rotation[i, 1] * ray_y + rotation[i, 2] + depth * translation[i] for i in range(3)
     )
+    # As `camera_models._flat`: finite behind the camera, where the robust kernel then sees an outlier.
     z = jnp.maximum(rows[2], MIN_RELATIVE_DEPTH)
     inverse_z = 1 / z
     in_front = jnp.where(rows[2] > MIN_RELATIVE_DEPTH, 1.0, 0.0).astype(z.dtype)
@@ -154,6 +155,7 @@ def second_order(
     g = (a * fx * at.inverse_z, b * fy * at.inverse_z, -(a * fx * at.x + b * fy * at.y) * at.inverse_z * at.in_front)
     moments = _moments(g, force, at)
     half = jnp.concatenate([_focal_products(moments, edge), _centre_products(moments, edge)], 1)
+    # The columns of focal lengths and centre come after the six of the relative pose; the transpose is added below.
     half = jnp.pad(half, ((0, 0), (6, 0)))
     turn = _cross_product(translation, g)
     # `y_0` and `y_1` move with inverse depth by the translation.

@@ -36,4 +36,5 @@ class BaselinePrior(PairTerm):
 
     def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, ""]:
         squared = jnp.sum(lie.relative(first, second).translation() ** 2)
+        # A logarithm has no optimum at zero length, where all points would collapse; the bound keeps it finite there.
         return jnp.log(jnp.maximum(squared, 1e-24) / self.length**2) / (2 * self.sigma)

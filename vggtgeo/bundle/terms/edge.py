@@ -36,7 +36,7 @@ from vggtgeo.bundle.terms.term import (
 )
 from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.camera_models import Cameras, Pinhole, SquarePinhole
+from vggtgeo.geometry.camera_models import Cameras, Pinhole, with_shared_focal
 
 Rows = tuple[Float[Array, " p"], ...]
 """Entries of a residual, one array each: XLA does not vectorise the loop around a stacked array."""
@@ -264,6 +264,7 @@ class EdgeTerm(AbstractTerm):
         pixels: Float[Array, "2 p"] | None = None,
     ) -> Float[Array, "m p"]:
         """Return residuals after a (zero) step of each part, at the given depths and optional pixels in the host."""
+        # At zero in value: only the derivatives of the step matter, and this form compiles faster.
         relative = lie.move_at_zero(view.relative, parts[0])
         host, camera = view.cameras.along(view.ends, parts[1:])
 
@@ -452,7 +453,7 @@ def products(left: Float[Array, "... mp"], right: Float[Array, "... mp"], slots:
 
 def pinhole_parameters(cameras: Cameras) -> Float[Array, "4"] | None:
     """Return `fx, fy, cx, cy` if the hand-written derivatives apply: one pinhole camera for all keyframes."""
-    if cameras.group is not None or cameras.kind not in (Pinhole, SquarePinhole):
+    if cameras.group is not None or cameras.kind not in (Pinhole, with_shared_focal(Pinhole)):
         return None
     own = cameras.parameters
     return own if cameras.kind is Pinhole else jnp.concatenate([own[:1], own])

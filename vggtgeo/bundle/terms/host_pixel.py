@@ -54,6 +54,7 @@ class HostPixel(AbstractTerm):
             bend = 2 * self.weights**2 * self.kernel.curvature(self.weights * squared)
         else:
             soft = reweighting(self.kernel, self.weights, squared, correction).soft
+            # The squared scale of the residual's own direction in `reweighting`, without forming the rows.
             bend = -pull * (1 - soft * soft) / jnp.where(squared > 0, squared, 1.0)
         hessian = jnp.stack([pull + bend * u * u, pull + bend * v * v, bend * u * v], 1)
         return hessian, jnp.stack([pull * u, pull * v], 1)

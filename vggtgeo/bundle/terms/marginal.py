@@ -30,7 +30,7 @@ class MarginalPrior(DenseTerm):
         kernel: robust kernel of each observation.
 
     Example:
-        >>> vg.no_prior(3).root.shape
+        >>> vg.empty_prior(3).root.shape
         (22, 22)
 
     """
@@ -59,6 +59,7 @@ class MarginalPrior(DenseTerm):
             return self
         new, split = lie.TANGENT * more, lie.TANGENT * known
         root = jnp.insert(self.root, jnp.full(new, split), 0.0, axis=1)
+        # Any pose will do, as the new columns of the root are zero.
         nothing = jaxlie.SE3.identity((more,)).wxyz_xyz.astype(root.dtype)
         poses = jaxlie.SE3(jnp.concatenate([self.poses.wxyz_xyz, nothing]))
         return dataclasses.replace(

@@ -216,7 +216,7 @@ class DenseTerm(AbstractTerm):
         kernel: robust kernel of each observation.
 
     Example: the prior of a marginalisation.
-        >>> isinstance(vg.no_prior(3), vg.terms.DenseTerm)
+        >>> isinstance(vg.empty_prior(3), vg.terms.DenseTerm)
         True
 
     """

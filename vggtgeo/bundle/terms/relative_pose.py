@@ -48,6 +48,7 @@ class RelativePose(PairTerm):
         self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
     ) -> ValueAndJacobian:
         """Differentiate by the tangent of the relative pose, `eta = x_j - Ad(T_j T_i^-1) x_i`: half of the cost."""
+        # A subclass with a residual of its own needs the automatic derivative.
         if type(self).residual is not RelativePose.residual:
             return super().derivatives(data, touched, poses, cameras)
         relative = lie.relative(*(jaxlie.SE3(poses[index]) for index in touched))

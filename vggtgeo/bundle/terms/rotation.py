@@ -35,6 +35,7 @@ class RotationPrior(PoseTerm):
     unit = "sigma"
 
     def residual(self, pose: jaxlie.SE3, camera: AbstractCamera) -> Float[Array, "3"]:
+        # As rigid motions without translation, since `lie.boxminus` has finite second derivatives at zero.
         measured = jaxlie.SE3.from_rotation(jaxlie.SO3(self.measured))
         rotation = jaxlie.SE3.from_rotation(pose.rotation())
         return self.root @ lie.boxminus(rotation, measured)[3:]

@@ -177,6 +177,7 @@ class AbstractTerm(eqx.Module):
 
     def holding(self, data: dict[str, Any]) -> Self:
         """Return the term with other data, such as those of one observation: this is `self` in `residual`."""
+        # Without `__init__`: its converters and checks would run for every observation while tracing.
         one = object.__new__(type(self))
         for field in dataclasses.fields(self):
             object.__setattr__(one, field.name, data.get(field.name, getattr(self, field.name)))
@@ -197,6 +198,7 @@ class AbstractTerm(eqx.Module):
             return jnp.where(mask, leaf, 1.0)
 
         kept = self.holding(jax.tree.map(safe, self.data()))
+        # `present` is False for NaN and for negative weights, which must not pass as absent.
         return kept.reweighted(jnp.where(present, self.weight, jnp.where(self.weights == 0, 0.0, jnp.nan)))
 
 
@@ -264,6 +266,7 @@ def softened(kernel: AbstractKernel, s: Array, correction: Float[Array, ""]) -> 
     """
     weight = kernel.weight(s)
     pulled = weight > 0
+    # The clip at 1 keeps the Hessian positive semidefinite where the kernel redescends.
     lost = -2 * s * kernel.curvature(s) / jnp.where(pulled, weight, 1.0)
     return jnp.sqrt(1 - correction * jnp.clip(lost, 0.0, 1.0))
 

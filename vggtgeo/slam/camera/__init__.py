@@ -1,1 +1,1 @@
-"""The camera where it is not known, or not well: focal length, lens, shutter, what of the picture stays still."""
+"""Estimation of an unknown or uncertain camera: focal length, lens distortion, rolling shutter, pixel aspect."""

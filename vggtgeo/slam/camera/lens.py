@@ -22,7 +22,7 @@ from jaxtyping import Float
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.geometry.camera import Camera, Undistorter
-from vggtgeo.geometry.camera_models import RadialTangential, SquarePinhole, SquareRadialTangential
+from vggtgeo.geometry.camera_models import RadialTangential, with_shared_focal
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.camera.camera_gain import gain
@@ -63,16 +63,16 @@ class FoundLens:
 def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solve) -> FoundLens | None:
     """Estimate the lens of a map that was adjusted without distortion; return None if the result is invalid.
 
-    problem, state: that adjustment, its camera a `SquarePinhole` or a `Pinhole`. size: height and width of the images.
+    problem, state: that adjustment, its camera a `Pinhole`. size: height and width of the images.
     solve: adjusts any problem.
     """
-    with_lens, square = _with_lens(problem), problem.camera is SquarePinhole
+    with_lens, shared = _with_lens(problem), problem.shared_focal
     pinhole = len(problem.camera.names)
     none = jnp.zeros(len(with_lens.camera.names) - pinhole)
     start = eqx.tree_at(lambda s: s.intrinsics, state, jnp.concatenate([state.intrinsics, none]))
     found = solve(with_lens, start)
     parameters = [float(value) for value in found.intrinsics]
-    fx, fy, cx, cy, *distortion = [parameters[0], *parameters] if square else parameters
+    fx, fy, cx, cy, *distortion = [parameters[0], *parameters] if shared else parameters
     if not (min(fx, fy) > 0 and np.isfinite(parameters).all()):
         return None
     height, width = size
@@ -87,7 +87,7 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
 def _with_lens(problem: Problem) -> Problem:
     """Return the problem with a camera whose radial distortion is free."""
     prior = problem.intrinsics_prior
-    kind = SquareRadialTangential if problem.camera is SquarePinhole else RadialTangential
+    kind = with_shared_focal(RadialTangential) if problem.shared_focal else RadialTangential
     names, more = kind.names, len(kind.names) - len(problem.camera.names)
     wider = IntrinsicsPrior(
         index=jnp.arange(len(names)),

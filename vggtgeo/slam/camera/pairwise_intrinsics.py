@@ -35,7 +35,7 @@ POSE_ITERATIONS = 4
 BATCH = 200
 """Pairs per batch, of some hundred points each: 20 MB."""
 HUBER = 1.0
-FARTHEST = 30.0
+MAX_RESIDUAL = 30.0
 """Pixels: larger residuals are outliers and have no weight."""
 PRIOR = np.array([0.5, 300.0, 300.0, 1.0])
 """Standard deviations: so weak that they only keep the problem solvable."""
@@ -227,7 +227,7 @@ def _costs(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np
     for _ in range(POSE_ITERATIONS):
         poses = rigid.moved(poses, _reduce(points, poses, value, intrinsics).pose_steps(np.zeros(4)))
     off = np.linalg.norm(points.residuals(poses, value, intrinsics), axis=1)
-    off = np.where(np.isfinite(off), np.minimum(off, FARTHEST), FARTHEST)
+    off = np.where(np.isfinite(off), np.minimum(off, MAX_RESIDUAL), MAX_RESIDUAL)
     cost = np.where(off < HUBER, off**2 / 2, HUBER * (off - HUBER / 2))
     return np.bincount(points.pair, cost, len(poses))
 
@@ -260,7 +260,7 @@ def _reduce(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: n
 def _reduce_part(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Reduced:
     rows = points.linearized(poses, value, intrinsics)
     size = np.linalg.norm(rows[:, :, 10], axis=1)
-    good = np.isfinite(rows).all((1, 2)) & (size < FARTHEST)
+    good = np.isfinite(rows).all((1, 2)) & (size < MAX_RESIDUAL)
     weight = np.where(good, np.minimum(HUBER / np.maximum(size, 1e-9), 1.0), 0.0)
     rows = np.where(good[:, None, None], rows, 0.0) * np.sqrt(weight)[:, None, None]
     ends = np.searchsorted(points.pair, np.arange(len(poses) + 1))

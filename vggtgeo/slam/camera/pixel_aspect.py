@@ -55,7 +55,7 @@ def are_square(intrinsics: np.ndarray) -> bool:
 def find_aspect(problem: Problem, state: State, solve: Solve) -> FoundAspect | None:
     """Estimate both focal lengths of a map that was adjusted with one; return None if the result is invalid.
 
-    problem, state: that adjustment, its camera a `SquarePinhole`. solve: adjusts any problem.
+    problem, state: that adjustment, with `shared_focal`. solve: adjusts any problem.
     """
     free = _with_both(problem)
     found = solve(free, eqx.tree_at(lambda s: s.intrinsics, state, _twice(state.intrinsics)))

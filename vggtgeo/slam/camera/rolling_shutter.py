@@ -26,7 +26,6 @@ from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.camera_models import SquarePinhole
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.camera_gain import MIN_HOSTS, gain, match_energies
 from vggtgeo.slam.threads import map_in_threads
@@ -120,7 +119,7 @@ def _rays(pixels: np.ndarray, camera: np.ndarray) -> np.ndarray:
 def _pinhole(problem: Problem, state: State) -> np.ndarray:
     """Return fx, fy, cx, cy."""
     parameters = np.asarray(state.intrinsics, np.float64)
-    return np.array([parameters[0], *parameters]) if problem.camera is SquarePinhole else parameters[:4]
+    return np.array([parameters[0], *parameters])[:4] if problem.shared_focal else parameters[:4]
 
 
 def image_shift(

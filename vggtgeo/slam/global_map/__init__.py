@@ -1,1 +1,1 @@
-"""The whole map: loops, the last adjustment, how well poses are known after it."""
+"""The global map: loop closure, global adjustment, and pose uncertainty."""

@@ -1,4 +1,4 @@
-"""Poses of all frames, moved with the keyframes that they were tracked against."""
+"""Poses of all frames, moved with their reference keyframes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ outlier: its correction is then not distributed over the frames before it."""
 def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     """Return times [n], s, and poses [n, 4, 4], world -> camera, of all frames; for a lost frame the last known pose.
 
-    A frame hangs on the keyframe it was tracked against. What the adjustment then changed between that keyframe and the
-    next is shared out over the frames in between, in proportion to time, so that the path has no steps, unless it is
-    the gross error of one (`GROSS`). What a second keyframe says of a frame is averaged with that
-    (`frame_refinement.py`). The frame that a keyframe was made of has the keyframe's pose, whether it was tracked there
-    (`arrival`) or began a piece of map.
+    A frame is stored relative to its reference keyframe. The correction of the next keyframe relative to that reference
+    is distributed over the frames between them in proportion to time, so that the path has no steps, unless the tracked
+    pose of that keyframe was an outlier (`GROSS`). Motions from a second keyframe are averaged in
+    (`frame_refinement.py`). The frame of a keyframe has the keyframe's pose, whether it was tracked (`arrival`) or
+    started a submap.
     """
     poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
     times = np.array([record.timestamp for record in slam.frames])
@@ -42,17 +42,21 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             between = [] if gross else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
             span = max(times[row] - times[last], 1e-9)
             for k in between:
+                # Along the screw motion of the change, in proportion to time.
                 poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
         last = row
     return times, by_both(slam.map, slam.frames, poses)
 
 
 def _is_gross(arrived: np.ndarray, adjusted: np.ndarray, tie: MeasuredRelativePose) -> bool:
-    """Whether an adjustment moved a keyframe [4, 4] by more than its tracking left open."""
+    """Return whether an adjustment moved a keyframe [4, 4] beyond the uncertainty of its tracking."""
     off = lie.steps(arrived[None], adjusted[None])[0]
     return bool(off @ tie.information @ off > GROSS)
 
 
 def _made_its_keyframe(record: FramePose) -> bool:
-    """By its pose, exactly: keyframes of a known map may have the same number of a frame."""
+    """Return whether the frame became its reference keyframe.
+
+    Decided by its relative pose: keyframes of a known map may have the same frame number.
+    """
     return record.tracked and np.array_equal(record.relative, np.eye(4))

@@ -1,4 +1,4 @@
-"""Compiling the last adjustment while the run goes on, so that nobody waits for it at the end."""
+"""Compilation of the global adjustment during the run, so that it does not delay the end."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.global_map.global_adjustment import camera_of
-from vggtgeo.slam.global_map.global_shape import LARGEST_DENSE, GlobalShape, global_solver, padded_count, shape_for
+from vggtgeo.slam.global_map.global_adjustment import shares_focal
+from vggtgeo.slam.global_map.global_shape import MAX_DENSE, GlobalShape, global_solver, padded_count, shape_for
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -19,14 +18,15 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit
 
 CHECKED = (0.3, 0.6, 0.85)
-"""Shares of the frames at which the number of keyframes is foreseen: early, to have time, and again, to be right."""
-LEAST_KEYFRAMES = 8
-"""Where nobody knows how many frames will come: before the map has so many, it may stay small."""
+"""Shares of the frames at which the number of keyframes is predicted: early for time, and again for accuracy."""
+MIN_KEYFRAMES = 8
+"""For an unknown number of frames: smaller maps may stay small."""
 
 
 class CompileAhead(Callback):
-    """Compiles for as many keyframes as the map will have if it goes on as it began. The result of the run is the same
-    whatever it compiles, and what it did not foresee is compiled at the end.
+    """Compile for the predicted number of keyframes.
+
+    The result of the run does not depend on it: other shapes are compiled at the end.
     """
 
     def __init__(self, settings: SlamSettings) -> None:
@@ -43,32 +43,34 @@ class CompileAhead(Callback):
         if count is None or not slam.metric or not self._settings.refinement.global_adjustment:
             return
         padded = padded_count(count)
-        if padded <= LARGEST_DENSE and padded not in self._asked:
+        if padded <= MAX_DENSE and padded not in self._asked:
             shape = shape_for(padded, self._settings)
-            self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, camera_of(slam))
+            self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, shares_focal(slam))
 
     def on_adjust(self, slam: Slam) -> None:
-        """Waits for what is needed now."""
+        """Wait for the program that is needed now."""
         future = self._asked.get(padded_count(len(slam.keyframes)))
         if future is not None:
             wait([future])
 
 
 def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | None:
-    """How many keyframes a map will have that has `keyframes` after so many of `total` frames; None at most frames: it
-    is foreseen a few times only.
+    """Return the predicted number of keyframes, given `keyframes` after `frames` of `total` frames.
+
+    None at most frames: it is predicted a few times only.
     """
     if total is None:
-        return keyframes if keyframes >= LEAST_KEYFRAMES else None
+        return keyframes if keyframes >= MIN_KEYFRAMES else None
     if frames not in {int(share * total) for share in CHECKED}:
         return None
     return keyframes * total // max(frames, 1)
 
 
 @in_double_precision
-def compile_global(shape: GlobalShape, settings: SlamSettings, camera: type[Pinhole | SquarePinhole] = Pinhole) -> None:
-    """Compile the adjustment of maps of a shape and their uncertainties, on a problem that holds one observation: both
-    programs at once, on two cores.
+def compile_global(shape: GlobalShape, settings: SlamSettings, shared_focal: bool = False) -> None:
+    """Compile the adjustment of maps of a shape and their uncertainties on a problem with one observation.
+
+    Both programs are compiled at once, on two cores.
     """
     nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
     surfaces = surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing)
@@ -76,7 +78,7 @@ def compile_global(shape: GlobalShape, settings: SlamSettings, camera: type[Pinh
         *factor_terms((), {}, shape.room, metric=True),
         *([surfaces] if settings.depth_terms.surface_points > 0 else []),
     )
-    problem, initial = smallest_problem(shape.size, settings, terms, camera)
+    problem, initial = smallest_problem(shape.size, settings, terms, shared_focal)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)
         solve_jit(problem, initial, global_solver(problem, settings)).energy.block_until_ready()

@@ -1,8 +1,9 @@
-"""Dense depth between keyframes: projective point-to-plane alignment as a quadratic on relative poses, so that surfaces
-without texture speak in the adjustment too (Chen & Medioni 1991; Newcombe et al., KinectFusion, 2011).
+"""Alignment of dense depth between keyframes: point-to-plane as a quadratic on relative poses.
+
+So surfaces without texture constrain the adjustment (Chen & Medioni 1991; Newcombe et al., KinectFusion, 2011).
 
 At the current poses every pair (i, j) gives residuals `n . (T_ji p - q)` in standard deviations of both depths, where
-`q, n` is the surface of j at the pixel that `p` of i falls on. Their normal equations `H, g` over the left tangent
+`q, n` is the surface of j at the pixel to which `p` of i projects. Their normal equations `H, g` over the left tangent
 `eta` of `T_ji` enter the adjustment as a term on the pair. Relinearising after each adjustment makes it Gauss-Newton on
 the sum of both.
 """
@@ -17,21 +18,22 @@ import numpy as np
 
 from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.slam.perception.rgbd_view import surface_normals
 from vggtgeo.slam.sparse_map.factors import surface_term
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 CELL = 4
 """Pixels a side of the blocks whose median depth makes one surface point."""
-FARTHEST = 0.10
-"""Metres between surfaces that can be one."""
-LEAST_COSINE = 0.8
-LEAST_POINTS = 150
-"""Of the source's samples, that a surface of the target is near."""
+MAX_DISTANCE = 0.10
+"""Largest distance of points on one surface, metres."""
+MIN_COSINE = 0.8
+MIN_POINTS = 150
+"""Minimum number of the source's samples near a surface of the target."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceRows:
-    """Cells in a row: points and unit normals float32 [3, m], camera frame, standard deviations of the depth [m]."""
+    """Cells as rows: points and unit normals float32 [3, m], camera frame, standard deviations of the depth [m]."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -40,7 +42,7 @@ class SurfaceRows:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A keyframe's depth as points float32 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = none.
+    """A keyframe's depth as points float32 [h, w, 3] and unit normals [h, w, 3], camera frame, NaN = unknown.
 
     sigma: standard deviation of the depth, metres, [h, w].
     """
@@ -52,13 +54,15 @@ class Surface:
 
     @classmethod
     def of(cls, keyframe: Keyframe, intrinsics: np.ndarray) -> Surface:
-        """Block medians of the depth, and normals from central differences that do not cross a depth jump."""
+        """Compute block medians of the depth, and normals by central differences that do not cross a depth edge."""
         middle = _block_medians(keyframe.depth)
         coarse = pinhole.coarser(intrinsics, CELL)
         points = pinhole.grid_rays(middle.shape, coarse) * middle[..., None]
         sigma = _block_medians(keyframe.depth_sigma) * middle
         # Those of all keyframes are in memory together: half a megabyte each in single precision.
-        return cls(points.astype(np.float32), _normals(points).astype(np.float32), sigma.astype(np.float32), coarse)
+        return cls(
+            points.astype(np.float32), surface_normals(points).astype(np.float32), sigma.astype(np.float32), coarse
+        )
 
     @cached_property
     def rows(self) -> SurfaceRows:
@@ -68,7 +72,7 @@ class Surface:
 
     @cached_property
     def samples(self) -> SurfaceRows:
-        """Every other cell, as on a chessboard, of those that have a normal: neighbours share their errors."""
+        """Every other cell with a normal, as on a chessboard: neighbours share their errors."""
         rows, columns = np.indices(self.sigma.shape)
         good = np.flatnonzero(np.isfinite(self.rows.normals[0]) & ((rows + columns) % 2 == 0).ravel())
         return SurfaceRows(self.rows.points[:, good], self.rows.normals[:, good], self.rows.sigma[good])
@@ -88,9 +92,9 @@ class Alignment:
 def align(
     first: int, second: int, surfaces: Sequence[Surface], relative: np.ndarray, effective: float
 ) -> Alignment | None:
-    """Linearise surface i = `first` against j = `second`; None where too little overlaps.
+    """Linearise surface i = `first` against j = `second`; None if the overlap is too small.
 
-    Neighbouring depths share their errors: however many points there are, they count as `effective` ones.
+    effective: largest number of independent points, since neighbouring depths share their errors.
     """
     source, target = surfaces[first].samples, surfaces[second]
     turn = relative[:3, :3]
@@ -101,8 +105,8 @@ def align(
     facing = (n * (turn @ source.normals.take(seen, 1))).sum(0)
     # A comparison with NaN, where the target has no surface, is false.
     with np.errstate(invalid="ignore"):
-        one = np.flatnonzero(((away * away).sum(0) < FARTHEST**2) & (facing > LEAST_COSINE))
-    if len(one) < LEAST_POINTS:
+        one = np.flatnonzero(((away * away).sum(0) < MAX_DISTANCE**2) & (facing > MIN_COSINE))
+    if len(one) < MIN_POINTS:
         return None
     seen, cell, away, n = seen.take(one), cell.take(one), away.take(one, 1), n.take(one, 1)
     sigma = np.hypot(source.sigma.take(seen), target.rows.sigma.take(cell))
@@ -110,8 +114,10 @@ def align(
     # Tukey's biweight, wide enough for a pose that is off by a few standard deviations.
     scale = max(float(np.median(np.abs(residual / sigma))) * 4.7, 3.0)
     weight = np.maximum(1 - (residual / sigma / scale) ** 2, 0.0) ** 2 / sigma**2
+    # Neighbouring depths share their errors, so the information of a surface does not grow with its number of pixels.
     weight *= min(effective / len(one), 1.0)
     (x, y, z), (a, b, c) = points.take(seen, 1), n
+    # Row of `n . (T p - q)` over the left tangent: `[n, p x n]`.
     jacobian = np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
     weighted = jacobian * weight
     return Alignment(first, second, weighted @ jacobian.T, weighted @ residual, len(one))
@@ -124,7 +130,7 @@ def align_pairs(
     effective: float,
     room: int | None = None,
 ) -> SurfaceAlignment:
-    """All pairs' alignments at the current poses, as one term; pairs that do not overlap have no weight.
+    """Return the alignments of all pairs at the current poses as one term; pairs without overlap have weight 0.
 
     room: observations of the term, by default one a pair.
     """
@@ -142,24 +148,10 @@ def align_pairs(
 
 
 def _block_medians(values: np.ndarray) -> np.ndarray:
-    """Medians of blocks of `CELL` x `CELL`, float32 [h, w]; NaN where fewer than half of a block is known."""
+    """Return medians of blocks of `CELL` x `CELL`, float32 [h, w]; NaN if fewer than half of a block is known."""
     height, width = values.shape[0] // CELL, values.shape[1] // CELL
     blocks = values[: height * CELL, : width * CELL].astype(np.float32).reshape(height, CELL, width, CELL)
     ordered = np.sort(blocks.transpose(0, 2, 1, 3).reshape(height, width, -1), axis=2)
     count = np.isfinite(ordered).sum(2)
     middle = np.take_along_axis(ordered, (count // 2)[..., None].clip(0, CELL**2 - 1), 2)[..., 0]
     return np.where(count >= CELL**2 // 2, middle, np.nan)
-
-
-def _normals(points: np.ndarray) -> np.ndarray:
-    """Unit normals towards the camera, NaN at borders, holes and depth jumps."""
-    normals = np.full_like(points, np.nan)
-    right = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    normal = rigid.cross(down, right)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        z = points[1:-1, 1:-1, 2]
-        smooth = (np.abs(right[..., 2]) < 0.1 * z) & (np.abs(down[..., 2]) < 0.1 * z)
-        normal = normal / np.linalg.norm(normal, axis=2, keepdims=True)
-    normals[1:-1, 1:-1] = np.where(smooth[..., None], normal, np.nan)
-    return normals

@@ -24,18 +24,18 @@ from vggtgeo.slam.tracking.tracker import FramePose
 
 MIN_POINTS = 20
 """With fewer points the pose stays as tracked."""
-WIDTH, WIDEST = 1.0, 8.0
+WIDTH, MAX_WIDTH = 1.0, 8.0
 """Width of the Geman-McClure kernel, pixels: final and initial, halved in each step. A redescending kernel, because
 matches may be off by as much as the gate of tracking, some pixels (`benchmarks/between_keyframes.py`)."""
-STEPS, SETTLED = 15, 1e-5
-NEAREST, FARTHEST = 0.1, 1e6
+STEPS, CONVERGED = 15, 1e-5
+MIN_DEPTH, MAX_DEPTH = 0.1, 1e6
 """Range of the depths that are used, in map units."""
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     """Return times [n], s, and poses [n, 4, 4], world -> camera, of all frames; for a lost frame the last known pose.
 
-    While the run goes on, before the last adjustment, all are carried along: it moves the map once more.
+    Resection is done only after the last adjustment, since that moves the map once more.
     """
     times, poses = carried_poses(slam)
     if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
@@ -44,6 +44,7 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     if not rows:
         return times, poses
     motions = _motions(slam)
+    # With metric depth the errors that frames share are in the tracked information already.
     as_one = 1.0 if slam.metric else SHARED_ERRORS
 
     def placed(row: int) -> np.ndarray:
@@ -57,9 +58,11 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
 
 
 def off_landmarks(slam: Slam, poses: np.ndarray) -> dict[int, np.ndarray]:
-    """How far the finished map is from where frames that points alone placed show it, by row of `slam.frames`: pixels
-    [m], infinite of a landmark behind the camera. Frames that keep too few are left out, and all before the end. poses:
-    of `frame_poses`.
+    """Return the reprojection errors of the final map in frames tracked by points alone, pixels [m], by row of the
+    frames.
+
+    Infinite for a landmark behind the camera. Frames with few matches are left out; empty before the last adjustment.
+    poses: of `frame_poses`.
     """
     if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
         return {}
@@ -68,7 +71,7 @@ def off_landmarks(slam: Slam, poses: np.ndarray) -> dict[int, np.ndarray]:
         points, pixels = _sight(slam, row, poses[row], motions)
         if len(points) >= MIN_POINTS:
             off = np.linalg.norm(rigid.project(points, poses[row], slam.intrinsics) - pixels, axis=1)
-            found[row] = np.where(points @ poses[row][2, :3] + poses[row][2, 3] > NEAREST, off, np.inf)
+            found[row] = np.where(points @ poses[row][2, :3] + poses[row][2, 3] > MIN_DEPTH, off, np.inf)
     return found
 
 
@@ -77,16 +80,14 @@ def _placed_by_points(slam: Slam) -> list[int]:
 
 
 def _motions(slam: Slam) -> tuple[np.ndarray, np.ndarray] | None:
-    """Of all keyframes and of all frames, where a readout is known."""
+    """Return the velocities at all keyframes and at all frames if a readout time is known."""
     return None if slam.camera.readout is None else (camera_motions(slam, len(slam.keyframes)), frame_motions(slam))
 
 
 def _sight(
     slam: Slam, row: int, pose: np.ndarray, motions: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """World points [m, 3] of what a frame at about this pose has kept, and the pixels [m, 2] where it shows them, as if
-    all were read at once.
-    """
+    """Return world points [m, 3] of the matches of a frame near this pose, and their global-shutter pixels [m, 2]."""
     record = slam.frames[row]
     points, pixels = _landmarks(slam, record, None if motions is None else motions[0][record.reference])
     if slam.camera.readout is not None and motions is not None:
@@ -97,15 +98,15 @@ def _sight(
 
 
 def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """World points float64 [m, 3] of what a frame has kept, as far as they have a depth in the end, and where it shows
-    them, [m, 2].
+    """Return world points float64 [m, 3] of the matches of a frame with a final depth, and their pixels, float64 [m,
+    2].
 
-    motion: of its keyframe, where a readout is known.
+    motion: velocity at its keyframe if a readout time is known.
     """
     assert record.seen is not None
     keyframe, slots = slam.keyframes[record.reference], record.seen.slots
     inverse = keyframe.points.inverse_depth[slots]
-    known = np.isfinite(inverse) & (inverse > 1 / FARTHEST)
+    known = np.isfinite(inverse) & (inverse > 1 / MAX_DEPTH)
     inverse, pixels = inverse[known], keyframe.points.pixels[slots[known]]
     if motion is not None and slam.camera.readout is not None:
         pixels = to_global_shutter(pixels, inverse, motion, slam.intrinsics, keyframe.size, slam.camera.readout)
@@ -116,16 +117,18 @@ def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tupl
 def _resected(
     points: np.ndarray, pixels: np.ndarray, pose: np.ndarray, known: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
-    """The pose [4, 4] near `pose`, known to `known` [6, 6], at which points [m, 3] are seen at pixels [m, 2], robustly;
-    `pose` where they are few, or explained no better.
+    """Return the pose [4, 4] near `pose`, with prior information `known` [6, 6], of points [m, 3] at pixels [m, 2].
+
+    Robust; `pose` itself if there are few points, or the energy does not fall.
     """
     if len(points) < MIN_POINTS:
         return pose
     current, before = pose, _energy(points, pixels, pose, intrinsics)
     for number in range(STEPS):
-        width = max(WIDEST / 2**number, WIDTH)
+        # Graduated non-convexity: from a pose that is off, right matches look like outliers to the final width.
+        width = max(MAX_WIDTH / 2**number, WIDTH)
         local = points @ current[:3, :3].T + current[:3, 3]
-        front = local[:, 2] > NEAREST
+        front = local[:, 2] > MIN_DEPTH
         if np.count_nonzero(front) < MIN_POINTS:
             return pose
         off = pinhole.project(local[front], intrinsics) - pixels[front]
@@ -136,12 +139,13 @@ def _resected(
         gradient = weighted @ off.T.ravel() + known @ tangent(current @ rigid.invert(pose))
         step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
         current = rigid.moved(current[None], step[None])[0]
-        if width == WIDTH and np.abs(step).max() < SETTLED:
+        if width == WIDTH and np.abs(step).max() < CONVERGED:
             break
+    # A redescending kernel has other minima: a step away from the tracked pose must lower the energy.
     return rigid.orthonormal(current) if _energy(points, pixels, current, intrinsics) < before else pose
 
 
 def _energy(points: np.ndarray, pixels: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> float:
-    """The robust energy, a point behind the camera as one that is far off."""
+    """Return the robust energy; a point behind the camera counts as an outlier."""
     square = ((rigid.project(points, pose, intrinsics) - pixels) ** 2).sum(1) / WIDTH**2
     return float(np.where(np.isfinite(square), square / (1.0 + square), 1.0).sum())

@@ -1,4 +1,4 @@
-"""The last look at the whole map: one adjustment of all keyframes."""
+"""Global bundle adjustment of all keyframes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
@@ -30,17 +29,17 @@ from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.window.sliding_window import solve_jit
 
-MUCH = 0.01
-"""Relative change of the camera beyond which the user is told."""
-SURE, MOST_WARP = 5.0, 3.0
-"""Standard deviations, and pixels in the corners of the image, beyond which a distortion is told."""
+REPORTED_CHANGE = 0.01
+"""Relative change of the camera above which the user is informed."""
+DISTORTION_SIGMAS, MAX_WARP = 5.0, 3.0
+"""Standard deviations, and pixels in the corners of the image, above which a distortion is reported."""
 
 
 def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
-    """Bundle-adjust every keyframe: features and, where there is metric depth, surfaces, in a few rounds.
+    """Bundle-adjust every keyframe, with surfaces if there is metric depth, in a few rounds.
 
-    The first round also asks for a rolling shutter, and for another camera than the given or guessed one; those after
-    it take both as they are.
+    The first round also estimates the readout time of a rolling shutter, and corrections of the camera; later rounds
+    keep both.
     """
     if len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA or not slam.map.pairs:
         return slam
@@ -63,9 +62,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
 
 @dataclass(frozen=True, eq=False)
 class _Whole:
-    """What the rounds share: edges between keyframes, surfaces of those with metric depth, the camera's prior, and
-    the size that all problems are padded to.
-    """
+    """Data shared by all rounds: edges between keyframes, surfaces, the camera's prior, and the padded size."""
 
     edges: list[Directed]
     surfaces: list[Surface]
@@ -77,12 +74,13 @@ class _Whole:
         edges = _edges(slam)
         degrees = np.bincount([edge.host for edge in edges])
         shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.map.factors, len(slam.map.pairs), settings)
-        camera = CameraPrior(slam.camera.given, slam.camera.sigma, camera_of(slam))
+        camera = CameraPrior(slam.camera.given, slam.camera.sigma, shares_focal(slam))
         return cls(edges, _surfaces(slam), camera, shape)
 
     def adjustment(self, slam: Slam, settings: SlamSettings, finds_camera: bool) -> tuple[Adjustment, tuple[str, ...]]:
-        """A round's adjustment, and what its gauge is worth a word of. finds_camera: without what was measured with the
-        camera of that moment, the tracked motions and the surfaces.
+        """Return a round's adjustment and warnings about its gauge.
+
+        finds_camera: without measurements that depend on the current camera: tracked motions and surfaces.
         """
         factors = _of_any_camera(slam) if finds_camera else slam.map.factors
         adjustment = build(
@@ -95,6 +93,7 @@ class _Whole:
             fixed_pose=np.isin(np.arange(len(slam.keyframes)), slam.map.roots),
             terms=_terms(slam, factors, self.surfaces, self.shape, settings),
         )
+        # Surfaces were unprojected with the current intrinsics and would hold them.
         problem = without_surfaces(adjustment.problem) if finds_camera else adjustment.problem
         problem, gauge = with_one_gauge(problem, adjustment.initial, len(slam.keyframes), slam.metric)
         notes = gauge_notes(gauge, adjustment.keyframes, "global adjustment")
@@ -103,8 +102,9 @@ class _Whole:
     def with_its_camera(
         self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
     ) -> tuple[Slam, _Whole]:
-        """The state after a trial of its camera, and what the rounds that follow share: a guessed camera, once
-        estimated, is held (see `_of_any_camera`).
+        """Return the state after trying to refine its camera, and the data for the following rounds.
+
+        A guessed camera is fixed after its estimation (see `_of_any_camera`).
         """
         before = slam.intrinsics
         if settings.camera.refine_intrinsics != "never":
@@ -113,18 +113,20 @@ class _Whole:
             return slam, self
         camera = replace(self.camera, mean=slam.intrinsics)
         if not slam.camera.calibrated:
+            # Once estimated with all its matches, the camera must not be pulled back by motions tracked with the old
+            # one.
             held = KNOWN_SIGMA * slam.intrinsics[0]
-            camera = replace(camera, sigma=np.full(4, held), kind=_of_pixels(slam.intrinsics))
+            camera = replace(camera, sigma=np.full(4, held), shared_focal=are_square(slam.intrinsics))
         return slam, replace(self, edges=_edges(slam), surfaces=_surfaces(slam), camera=camera)
 
 
 def _solves(settings: SlamSettings) -> Solve:
-    """Adjusts any problem of the shape of a global adjustment."""
+    """Return a function that adjusts any problem of the shape of a global adjustment."""
     return lambda problem, state: solve_jit(problem, state, global_solver(problem, settings)).state
 
 
 def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:
-    """The adjustment with its matches where they would be if images were read at once, where a readout is known."""
+    """Return the adjustment with matches corrected to global shutter if a readout time is known."""
     if slam.camera.readout is None:
         return adjustment
     problem, initial = adjustment.problem, adjustment.initial
@@ -137,7 +139,7 @@ def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:
 def _with_its_readout(
     slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
 ) -> tuple[Slam, Adjustment, State]:
-    """The state after a search for a rolling shutter; with what was adjusted last, and its solution."""
+    """Return the state after a search for a rolling shutter, the last adjustment and its solution."""
     if slam.camera.readout is not None or not settings.refinement.rolling_shutter:
         return slam, adjustment, state
     motions = camera_motions(slam, adjustment.problem.num_keyframes)
@@ -153,7 +155,7 @@ def _with_its_readout(
 def _with_its_camera(
     slam: Slam, adjustment: Adjustment, state: State, edges: list[Directed], settings: SlamSettings
 ) -> Slam:
-    """The state after a trial whether a given camera is to be refined, or the lens of a guessed one taken out."""
+    """Return the state after trying to refine a given camera, or to undistort a guessed one."""
     again = _solves(settings)
     if slam.camera.calibrated:
         found = try_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, again)
@@ -170,10 +172,8 @@ def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
 
 
 def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
-    """The state after a trial whether the pixels of a guessed camera are square; with what was adjusted last, and its
-    solution.
-    """
-    if adjustment.problem.camera is not SquarePinhole:
+    """Return the state after trying non-square pixels for a guessed camera, the last adjustment and its solution."""
+    if not adjustment.problem.shared_focal:
         return slam, adjustment, state
     found = find_aspect(adjustment.problem, state, solve)
     if found is None or not found.pays:
@@ -185,15 +185,12 @@ def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: So
     return replace(slam, notes=(*slam.notes, note)), adjustment, found.state
 
 
-def camera_of(slam: Slam) -> type[Pinhole | SquarePinhole]:
-    """The model that the last adjustment has of the camera: a guessed one has square pixels, unless a first pass found
-    that they are not.
+def shares_focal(slam: Slam) -> bool:
+    """Return whether the global adjustment has one focal length, `fx = fy`.
+
+    For a guessed camera, unless self-calibration found pixels that are not square.
     """
-    return Pinhole if slam.camera.calibrated else _of_pixels(slam.camera.given)
-
-
-def _of_pixels(intrinsics: np.ndarray) -> type[Pinhole | SquarePinhole]:
-    return SquarePinhole if are_square(intrinsics) else Pinhole
+    return not slam.camera.calibrated and are_square(slam.camera.given)
 
 
 def _edges(slam: Slam) -> list[Directed]:
@@ -208,7 +205,7 @@ def _surfaces(slam: Slam) -> list[Surface]:
 
 
 def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
-    """The state of the run with what an adjustment found."""
+    """Return the state with the result of an adjustment."""
     keyframes, intrinsics = write_back(slam.keyframes, adjustment, state)
     return replace(
         slam,
@@ -219,14 +216,14 @@ def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
 
 
 def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, settings: SlamSettings) -> Slam:
-    """The state of the run with a refined camera, if it pays or is asked for, and what the user should know of it."""
+    """Return the state with a refined camera if it improves the fit or is required, and notes for the user."""
     if found is None:
         return slam
     notes = [*slam.notes, *_lens_note(found, slam.keyframes[0].size)]
     always = settings.camera.refine_intrinsics == "always"
     if found.state is not None and (found.pays or always):
         slam = _taken(slam, adjustment, found.state)
-        if found.change > MUCH:
+        if found.change > REPORTED_CHANGE:
             cameras = [", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted)]
             change = 100 * found.change
             notes.append(f"the camera was refined by {change:.1f} %: fx, fy, cx, cy = {cameras[0]} -> {cameras[1]} px")
@@ -234,7 +231,7 @@ def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, 
 
 
 def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
-    """The state of the run with its lens taken out, if that pays, and a note on it."""
+    """Return the state with its distortion removed if that improves the fit, and a note."""
     if found is None or np.isinf(found.warp) or not found.pays:
         return slam
     adjusted = undistorted(_taken(slam, adjustment, found.state), found.camera)
@@ -247,7 +244,7 @@ def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> 
 
 
 def undistorted(slam: Slam, lens: Camera) -> Slam:
-    """The state as the ideal pinhole of `lens` sees it; poses and depths stay."""
+    """Return the state for the ideal pinhole of `lens`; poses and depths are unchanged."""
     frames = tuple(
         record
         if record.seen is None
@@ -264,10 +261,11 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
 
 
 def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
-    """A word on distortion that is sure and moves corners of the image by more than the noise of matches."""
+    """Return a note on a significant distortion that moves the corners of the image beyond the noise of matches."""
     (k1, sigma), focal = found.distortion, float(found.given[0])
+    # Displacement of a corner at normalised radius `r`: `f k1 r^3`.
     warp = abs(k1) * (float(np.hypot(shape[0], shape[1])) / 2 / focal) ** 3 * focal
-    if abs(k1) < SURE * sigma or warp < MOST_WARP:
+    if abs(k1) < DISTORTION_SIGMAS * sigma or warp < MAX_WARP:
         return []
     return [f"the lens distorts, and the calibration does not say so: k1 about {k1:.3f}, {warp:.0f} px in the corners"]
 
@@ -275,7 +273,7 @@ def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
 def _terms(
     slam: Slam, factors: Sequence[Factor], surfaces: list[Surface], shape: GlobalShape, settings: SlamSettings
 ) -> tuple[AbstractTerm, ...]:
-    """What is known about poses beyond matches: factors of the run, and aligned surfaces."""
+    """Return the terms on poses besides matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
     terms = factor_terms(factors, places, shape.room, metric=slam.metric)
     if not surfaces or settings.depth_terms.surface_points <= 0:
@@ -296,7 +294,7 @@ def _of_any_camera(slam: Slam) -> tuple[Factor, ...]:
 
 
 def _thin(edges: list[Directed], keyframes: int) -> list[Directed]:
-    """At most `MAX_NEIGHBOURS` edges a host: those with the most matches."""
+    """Return at most `MAX_NEIGHBOURS` edges a host: those with the most matches."""
     kept = []
     for host in range(keyframes):
         own = sorted((edge for edge in edges if edge.host == host), key=lambda edge: -len(edge.slots))

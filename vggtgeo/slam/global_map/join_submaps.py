@@ -1,4 +1,4 @@
-"""Pieces of map: a camera that was lost and not found begins one of its own, which joins the rest when they meet."""
+"""Joining of submaps: one starts after tracking loss, and is joined to the others when a place is recognized."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import relocalise
 from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput
 from vggtgeo.slam.tracking.tracker import scaled_record
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import WindowPrior
 
 TRIED = 2
-"""Keyframes of the other pieces that are verified for each new keyframe."""
+"""Keyframes of other submaps that are verified for each new keyframe."""
 
 
 def join_pieces(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Slam:
-    """Where the newest keyframe, seen as `data`, shows a place of an earlier piece, move its piece there.
+    """Join the newest submap to an earlier one if the newest keyframe, with frame data `data`, shows a place of it.
 
-    By a rigid motion where lengths are metres, else by a similarity: each piece of free scale has a unit of its own.
+    By a rigid motion if lengths are metres, else by a similarity: each submap without metric depth has its own scale.
     """
     if len(slam.map.roots) < 2:
         return slam
@@ -47,21 +47,22 @@ def join_pieces(slam: Slam, data: FrameData, roles: Roles, settings: SlamSetting
 
 
 def unit_ratio(slam: Slam, place: Track, roles: Roles) -> float | None:
-    """By what the last piece must be multiplied to have the unit of the keyframe that its newest one was found by."""
+    """Return the scale ratio of the newest submap to the keyframe by which it was recognized; None if unknown."""
     old, new = place.keyframe, slam.keyframes[-1]
     matches = roles.points.match(old.features, new.features)
     return ratio_of_units(old, new, matches.select(matches.index_j >= 0), place.relative, slam.intrinsics)
 
 
 def scaled_piece(slam: Slam, ratio: float, inside: Callable[[int], bool]) -> Slam:
-    """The state with all lengths of a piece multiplied by `ratio`; its own unit, the baseline, is given up.
+    """Return the state with all lengths of a submap multiplied by `ratio`, without its own scale anchor (the baseline).
 
-    inside: whether a keyframe, by its number, belongs to the piece.
+    inside: whether a keyframe, by its number, belongs to the submap.
     """
     keyframes = tuple(scaled_keyframe(k, ratio) if inside(k.number) else k for k in slam.keyframes)
     frames = tuple(scaled_record(record, ratio) if inside(record.reference) else record for record in slam.frames)
     own = lambda factor: all(inside(number) for number in factor.keyframes)
     factors = tuple(scaled_factor(factor, ratio) if own(factor) else factor for factor in slam.map.factors)
+    # The baseline fixed the old scale; the rest of the map fixes the new one.
     kept = tuple(f for f in factors if not (isinstance(f, MeasuredBaseline) and own(f)))
     velocity = longer(slam.tracker.velocity, ratio) if inside(len(keyframes) - 1) else slam.tracker.velocity
     return replace(
@@ -73,17 +74,18 @@ def scaled_piece(slam: Slam, ratio: float, inside: Callable[[int], bool]) -> Sla
 
 
 def newest_piece(slam: Slam) -> Callable[[int], bool]:
-    """Whether a keyframe, by its number, hangs together with the newest one."""
+    """Return a function that tells whether a keyframe, by its number, belongs to the newest submap."""
     label = piece_of(slam.map)
     return lambda number: bool(label[number] == label[-1])
 
 
 def _joined(slam: Slam, place: Track, held: tuple[int, ...]) -> Slam:
-    """The last piece carried by one rigid motion of the world, so that the newest keyframe is where it was found.
+    """Return the state with the newest submap moved rigidly, so that the newest keyframe is where it was recognized.
 
-    held: members of the window that stay where they are; of free scale two, which hold the unit.
+    held: members of the window that are fixed; two for a map without metric depth, which fix the scale.
     """
     inside, newest = newest_piece(slam), slam.keyframes[-1]
+    # World -> camera poses change their world from the right.
     carried = rigid.invert(newest.pose) @ place.pose
     keyframes = tuple(
         replace(keyframe, pose=rigid.orthonormal(keyframe.pose @ carried)) if inside(keyframe.number) else keyframe
@@ -111,7 +113,9 @@ def _joined(slam: Slam, place: Track, held: tuple[int, ...]) -> Slam:
 
 
 def _carried_prior(known: WindowPrior, carried: np.ndarray) -> WindowPrior:
-    """The window's prior after a rigid motion of the world: left tangents do not see it, linearisation points do."""
+    """Return the window's prior after a rigid motion of the world: it changes linearisation points, but no left
+    tangents.
+    """
     poses = rigid.to_matrix(np.asarray(known.prior.poses.wxyz_xyz, np.float64)) @ carried
     moved = eqx.tree_at(lambda p: p.poses.wxyz_xyz, known.prior, jnp.asarray(rigid.to_quaternion(poses)))
     return WindowPrior(known.keyframes, moved)

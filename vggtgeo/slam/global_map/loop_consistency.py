@@ -1,16 +1,16 @@
-"""Loop consistency: which loop closures may be taken, given odometry and the other loops.
+"""Loop consistency: selection of loop closures by odometry and by each other.
 
-In a building of equal parts every false loop agrees with the next one: agreement among loops alone proves nothing. They
-have to agree with odometry. Three tests of the squared Mahalanobis distance, all at one significance level:
+In a building with repeated parts false loops are consistent with each other, so that consistency among loops is not
+enough. They must also be consistent with odometry. Three tests of the squared Mahalanobis distance, all at one
+significance level:
 
 1. Each loop against odometry on the way between its ends, whose covariance is a bound for any correlation of the errors
-   (`slam/tracking/odometry.py`). It grows with the way, so that a true loop after a long drift passes.
-2. Each loop against loops between keyframes near by, over the short ways between them (pairwise consistency: Mangelson
-   et al., ICRA 2018). Loops that agree are one cluster, a place that was seen again; a loop alone is not taken, as a
-   large drift leaves room for it.
-3. Each cluster against the loops that were taken before, the most plausible cluster first: in the median, its loops
-   must agree with the nearest of those. What those measured of odometry's drift limits how far it can be off elsewhere:
-   its variance is at most the upper confidence limit by their distances, in place of the bound for any correlation.
+(`slam/tracking/odometry.py`). It grows with the way, so that a true loop after a long drift passes. 2. Each loop
+against loops between keyframes near by, over the short ways between them (pairwise consistency: Mangelson et al., ICRA
+2018). Consistent loops form one cluster, a revisited place; a single loop is not used, since a large drift allows it by
+chance. 3. Each cluster against the loops selected before, the most plausible cluster first: in the median, its loops
+must be consistent with the nearest of those. The drift that those measured limits the drift elsewhere: its variance is
+at most the upper confidence limit by their distances, instead of the bound for any correlation.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.tracking.odometry import Odometry, squared_distance
 
 NEAR = 8
-"""Keyframes, within which two loops must begin and end to be one place: the ways between are short, so that their drift
-is small beside the error of a false loop."""
+"""Largest distance of the ends of two loops of one place, keyframes: the ways between are short, so that their drift is
+small compared with the error of a false loop."""
 
 
 def consistent_loops(
@@ -38,10 +38,10 @@ def consistent_loops(
     gate: float,
     alone: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Select the loops that odometry allows, together with all others that are selected, bool [m].
+    """Select the loops that are consistent with odometry and with all other selected ones, bool [m].
 
     motions: of odometry, a forest, the later keyframe second. gate: of the squared Mahalanobis distance, 6 degrees of
-    freedom. alone: which loops need no other one near by that agrees, bool [m]; by default none.
+    freedom. alone: loops that need no other consistent one near by, bool [m]; by default none.
     """
     taken = np.zeros(len(loops), bool)
     if not loops:
@@ -68,9 +68,12 @@ def consistent_loops(
 
 
 def _largest_growth(drifts: Sequence[float], gate: float) -> float:
-    """Upper confidence limit of the variance of odometry over that of independent motions, at least 1, at the
-    significance level of the gate. drifts: squared Mahalanobis distances that clusters measured, growth 1.
+    """Return the upper confidence limit of the variance of odometry over that of independent motions, at least 1.
+
+    At the significance level of the gate. drifts: squared Mahalanobis distances that clusters measured, growth 1.
     """
+    # The sum of the distances over the variance is chi-square: its lower quantile gives the upper limit of the
+    # variance.
     level = chi_square.sf(gate, 6)
     return float(max(np.sum(drifts) / chi_square.ppf(level, 6 * len(drifts)), 1.0))
 
@@ -87,7 +90,9 @@ class _Tests:
     odometry: Odometry
 
     def between(self, first: np.ndarray, second: np.ndarray, growth: float = np.inf) -> np.ndarray:
-        """Of loops `second` from what loops `first` and the ways between their ends say; infinite without a way."""
+        """Return the distances of loops `second` from their prediction by loops `first` and odometry; infinite without
+        a way.
+        """
         before = self.odometry.way(self.ends[second, 0], self.ends[first, 0])
         after = self.odometry.way(self.ends[first, 1], self.ends[second, 1])
         # The second loop's motion by the first: second.start -> first.start -> first.end -> second.end.
@@ -101,9 +106,12 @@ class _Tests:
         return np.where(before.connected & after.connected, distance, np.inf)
 
     def against_nearest(self, loops: np.ndarray, taken: np.ndarray, growth: float) -> np.ndarray:
-        """Of each loop from that of the `taken` ones whose ends are nearest; left out where no way leads to any."""
+        """Return the distance of each loop from the nearest of the `taken` ones; loops without a way to any are left
+        out.
+        """
         if not len(taken):
             return np.zeros(0)
+        # Number of keyframes stands for the length of the way, and so for the drift on it.
         apart = np.abs(self.ends[loops, None] - self.ends[taken]).sum(2)
         roots = self.odometry.root[self.ends]
         comparable = (roots[loops, None] == roots[taken]).all(2)
@@ -113,7 +121,7 @@ class _Tests:
 
 
 def _clusters(tests: _Tests, among: np.ndarray, gate: float) -> list[np.ndarray]:
-    """The loops of `among`, those together that agree with one near by."""
+    """Return the loops of `among` grouped by consistency with one near by."""
     first: list[int] = []
     second: list[int] = []
     for row, number in enumerate(among):
@@ -128,7 +136,7 @@ def _clusters(tests: _Tests, among: np.ndarray, gate: float) -> list[np.ndarray]
 
 
 def _in_order(clusters: list[np.ndarray], distances: np.ndarray) -> list[np.ndarray]:
-    """The most plausible first; then those that no way of odometry leads around (they join submaps), the largest first.
+    """Return the clusters in order of plausibility; then those without odometry between their ends, the largest first.
 
     distances: of all loops from odometry, NaN = no way.
     """

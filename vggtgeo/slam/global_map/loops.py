@@ -1,5 +1,6 @@
-"""Loops: keyframes that saw one place at different times. Proposed by where the current estimate says that they look,
-and, whatever the drift, by what they look like; verified by geometry.
+"""Loop closure: keyframes that observed one place at different times.
+
+Proposed by the estimated poses and, whatever the drift, by appearance; verified by geometry.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import inverse_information
 from vggtgeo.models.classical import can_search, pose_information
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
 from vggtgeo.slam.global_map.straightening import Loop, straightened
@@ -22,20 +24,21 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.track import PIXEL_SIGMA
 
-LEAST_VISIBLE, MOST_TURNED = 0.4, np.deg2rad(40)
-"""Share of one keyframe's points that another should see, and angle between them, for a pair to be proposed."""
+MIN_VISIBLE, MAX_TURN = 0.4, np.deg2rad(40)
+"""Share of one keyframe's points inside the other's image, and angle between them, for a pair to be proposed."""
 MIN_INLIERS = 50
-"""A loop needs more inliers of PnP than this: keyframes far apart in time have no predicted pose to check them by."""
+"""Minimum number of PnP inliers of a loop (exclusive): keyframes far apart in time have no predicted pose for a check.
+"""
 FLOOR = (0.02, np.deg2rad(0.5))
-"""Standard deviation of a verified pose that no number of matches removes, metres and radians: the depths that it
-rests on are those of one keyframe, and share its error."""
+"""Systematic error of a verified pose, metres and radians: all its depths are those of one keyframe and share its
+error."""
 
 
 def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
-    """Match keyframes that should see the same place, or look as if they did, but have not been matched yet.
+    """Match keyframes that are expected to show one place by their poses or by appearance.
 
-    Where what is found contradicts the map by more than its adjustment can mend, the map is straightened first, and
-    searched once more.
+    If the loops contradict the map by more than its adjustment can correct, a pose graph corrects it first, and it is
+    searched again.
     """
     label, known = piece_of(slam.map), {pair.key for pair in slam.map.pairs}
     proposed = list(dict.fromkeys([*_by_estimate(slam, settings, known), *_by_appearance(slam, settings, known)]))
@@ -52,7 +55,10 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
 
 
 def _verified(slam: Slam, proposed: list[tuple[int, int]], label: np.ndarray, roles: Roles) -> list[Loop]:
-    """Those of the proposed pairs that geometry confirms. Pieces of free scale have units of their own."""
+    """Return the verified ones of the proposed pairs.
+
+    Submaps without metric depth have different scales and are not compared.
+    """
     comparable = [(first, second) for first, second in proposed if slam.metric or label[first] == label[second]]
 
     def verified(pair: tuple[int, int]) -> Loop | None:
@@ -64,7 +70,7 @@ def _verified(slam: Slam, proposed: list[tuple[int, int]], label: np.ndarray, ro
 
 
 def _by_estimate(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Unmatched pairs by how much of one should be visible in the other, the best few of each keyframe."""
+    """Propose unmatched pairs by the predicted overlap, the best few of each keyframe."""
     chosen = []
     samples = [some_points(keyframe, slam.intrinsics) for keyframe in slam.keyframes]
     for second in slam.keyframes:
@@ -73,10 +79,11 @@ def _by_estimate(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]
             if (first.number, second.number) in known:
                 continue
             turned = rigid.angle_between(first.pose, second.pose)
-            if turned >= MOST_TURNED:
+            if turned >= MAX_TURN:
                 continue
             share = overlap(samples[first.number], second, slam.intrinsics)
-            if share > LEAST_VISIBLE:
+            if share > MIN_VISIBLE:
+                # Matching fails with the angle between views: a radian costs as much as the whole overlap.
                 scored.append((share - turned, first.number))
         chosen += [
             (number, second.number) for _, number in sorted(scored, reverse=True)[: settings.refinement.loop_candidates]
@@ -85,9 +92,9 @@ def _by_estimate(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]
 
 
 def _by_appearance(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """For each keyframe the earlier one that looks most like it, if it does so as much as those that it is matched to.
+    """Propose for each keyframe the most similar earlier one, if it is as similar as those that it is matched to.
 
-    A threshold that is the image's own: a wall looks like any wall, a shelf like no other.
+    This threshold adapts to the image: a wall resembles any wall, a shelf no other.
     """
     seen = [keyframe for keyframe in slam.keyframes if keyframe.place is not None]
     if settings.refinement.loop_candidates < 1 or not seen:
@@ -112,7 +119,7 @@ def _by_appearance(slam: Slam, settings: SlamSettings, known: set[tuple[int, int
 
 
 def verify(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarray) -> Loop | None:
-    """Matches that agree on one pose of the second keyframe in the first one's points, whatever the drift."""
+    """Return the matches that agree on one pose of the second keyframe relative to the first one's points."""
     matches = roles.points.match(first.features, second.features)
     inverse = first.points.inverse_depth[matches.index_i]
     known = np.isfinite(inverse)
@@ -125,7 +132,8 @@ def verify(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarr
     pair = Pair(first.number, second.number, agreed, LineMatches(empty, empty, np.zeros(0)))
     relative = rigid.orthonormal(guess.pose @ rigid.invert(first.pose))
     information = pose_information(guess.pose, points[guess.inliers], intrinsics, PIXEL_SIGMA)
+    # Covariances add: matching noise, and what all matches share.
     floor = np.diag(np.repeat(FLOOR, 3) ** 2)
-    information = np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + floor)
+    information = np.linalg.inv(inverse_information(information) + floor)
     ratio = ratio_of_units(first, second, agreed.select(agreed.index_j >= 0), relative, intrinsics)
     return Loop(pair, MeasuredRelativePose(*pair.key, relative, information), ratio)

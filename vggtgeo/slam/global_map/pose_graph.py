@@ -1,12 +1,13 @@
-"""A pose graph: keyframes as poses alone, between tracked motions and verified loops. For drift that is too large for
-the full adjustment, whose matches pull only within a few pixels.
+"""Pose graph of odometry factors and verified loops, for drift too large for bundle adjustment.
 
-Tracked motions are a tree: nothing but loops contradicts them, so they have no robust kernel. What they are off by more
-than they state is estimated from the loops: the median over loops of the squared Mahalanobis distance between what a
-loop measured and what the motions on the way add up to, over the median of chi-square (a variance component, robust
-against up to half of the loops being false). So drift is spread over the way; a single motion that is wrong (a slip) is
-spread, too, and not left where it happened. Loops have a Cauchy kernel, widened at first
-(`vggtgeo/bundle/graduation.py`): from metres of drift true loops look as false as the false ones do.
+The matches of bundle adjustment converge only within a few pixels.
+
+Odometry factors are a tree: only loops contradict them, so they have no robust kernel. The factor on their covariance
+is estimated from the loops: the median over loops of the squared Mahalanobis distance between the loop and the odometry
+between its ends, over the median of chi-square (a variance component, robust against up to half of the loops being
+false). So drift is distributed over the way; a single wrong motion (a slip) is distributed too. Loops have a Cauchy
+kernel, widened at first (`vggtgeo/bundle/graduation.py`): after metres of drift true loops have residuals as large as
+false ones.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.relative_pose import RelativePose
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import POSE_GATE
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.global_map.global_shape import padded_count
 from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, relative_pose_rows
@@ -34,16 +36,16 @@ from vggtgeo.solvers.kernels import Cauchy
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
 
-BELIEF = float(chi_square.ppf(0.9999, 6))
-"""Squared Mahalanobis distance beyond which a loop is false: one true loop in 10,000 is lost."""
+BELIEF = POSE_GATE
+"""Squared Mahalanobis distance above which a loop is false: one true loop in 10,000 is lost."""
 GRADUATION = Graduation(factors=(256.0, 64.0, 16.0, 4.0), iterations=6)
-"""A loop of 2 cm that 10 m of drift contradict is 500 standard deviations off, half of the first width."""
+"""A loop of 2 cm against 10 m of drift has a residual of 500 standard deviations, half of the first width."""
 ITERATIONS = 50
 ROOM = 32
 """Loops are padded to a multiple of this, and poses to `padded_count`: a graph of about the same size compiles
 nothing."""
 DENSE_POSES = 200
-"""Poses up to which the factor is dense, whatever the loops are; it takes some 20 ms."""
+"""Poses up to which the factor is dense, for any loops; about 20 ms."""
 
 
 def _solve_graph(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:
@@ -61,8 +63,8 @@ class LoopClosure(RelativePose):
 
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """Poses float64 [n, 4, 4], world -> camera, by keyframe; motions: a tree, the later keyframe second; loops: what
-    was measured beside; held: bool [n], one of each piece.
+    """Poses float64 [n, 4, 4], world -> camera, by keyframe; motions: a tree, the later keyframe second; loops: all
+    other relative poses; held: bool [n], one of each component.
     """
 
     poses: np.ndarray
@@ -73,19 +75,20 @@ class PoseGraph:
 
 @dataclass(frozen=True, eq=False)
 class Untangled:
-    """Poses after the graph was solved, and which of its loops agree with them, bool [loops]."""
+    """Poses after the optimisation, and which loops agree with them, bool [loops]."""
 
     poses: np.ndarray
     believed: np.ndarray
 
 
 def solve_pose_graph(graph: PoseGraph) -> Untangled:
-    """The poses that motions and loops agree on; the graph's own, and no loop believed, where the solve fails."""
+    """Return the optimised poses; if the solve fails, the initial ones without loops."""
     spread = drift_variance(graph)
     loosened = [replace(motion, information=motion.information / spread) for motion in graph.motions]
     count = len(graph.poses)
     padding = padded_count(count) - count
     motions = RelativePose(**relative_pose_rows(loosened, count + padding))
+    # Rounded up to a multiple, so that graphs of about the same size share a compiled program.
     room = -(-max(len(graph.loops), 1) // ROOM) * ROOM
     loops = LoopClosure(**relative_pose_rows(graph.loops, room), kernel=Cauchy(jnp.asarray(TIE_WIDTH)))
     problem, initial, _ = pack(
@@ -93,6 +96,7 @@ def solve_pose_graph(graph: PoseGraph) -> Untangled:
         rigid.to_quaternion(np.concatenate([graph.poses, np.tile(np.eye(4), (padding, 1, 1))])),
         np.array([1.0, 1.0, 0.0, 0.0]),
         np.zeros(0),
+        # Padding poses are fixed: without factors they would make the system singular.
         fixed_pose=np.concatenate([graph.held, np.ones(padding, bool)]),
         fixed_intrinsics=True,
         terms=(motions, loops),
@@ -108,14 +112,14 @@ def solve_pose_graph(graph: PoseGraph) -> Untangled:
 
 
 def distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float:
-    """Squared Mahalanobis distance of the poses from a measured motion, 6 degrees of freedom."""
+    """Return the squared Mahalanobis distance of the poses from a measured relative pose, 6 degrees of freedom."""
     found = poses[measured.second] @ rigid.invert(poses[measured.first])
     off = tangent(found @ rigid.invert(measured.pose))
     return float(off @ measured.information @ off)
 
 
 def drift_variance(graph: PoseGraph) -> float:
-    """By what the variance of the motions must be multiplied for the loops to be likely; at least 1."""
+    """Return the factor on the covariance of the motions that makes the loops likely; at least 1."""
     parent = np.full(len(graph.poses), -1)
     # Errors of a motion as right perturbations of the pose: seen from the world they add up along the way.
     summed, spread = graph.poses.copy(), np.zeros((len(graph.poses), 6, 6))
@@ -135,11 +139,12 @@ def drift_variance(graph: PoseGraph) -> float:
         distances.append(off @ np.linalg.solve(drift + np.linalg.inv(loop.information), off))
     if not distances:
         return 1.0
+    # At least 1: few loops that agree by chance do not make odometry better than it states.
     return float(max(np.median(distances) / chi_square.ppf(0.5, 6), 1.0))
 
 
 def _meeting(parent: np.ndarray, first: int, second: int) -> int:
-    """Where the ways of two keyframes to the root of their tree meet; -1 where they have different roots."""
+    """Return the node at which the ways of two keyframes to the root meet; -1 for different roots."""
     while first != second and first >= 0 and second >= 0:
         if first > second:
             first = int(parent[first])
@@ -149,7 +154,7 @@ def _meeting(parent: np.ndarray, first: int, second: int) -> int:
 
 
 def _no_observations() -> Observations:
-    """No landmark: a graph of poses alone."""
+    """Return empty observations: a graph of poses alone."""
     none, nowhere = np.zeros(0, int), np.zeros((0, 2))
     return Observations(
         edges=np.zeros((0, 2), int),

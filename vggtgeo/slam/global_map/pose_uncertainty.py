@@ -1,6 +1,6 @@
-"""How far the poses of a run can be off: the covariances of the last adjustment, carried to every frame.
+"""Uncertainty of the poses of a run: covariances of the last adjustment, propagated to every frame.
 
-How true they are is measured: see docs/concepts/uncertainty.md.
+For its calibration see docs/concepts/uncertainty.md.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ FLOOR = 1e-12
 
 
 class PoseUncertainty(NamedTuple):
-    """Standard deviations of the poses of a piece of the map in their worst direction, relative to its first keyframe.
+    """Standard deviations of the poses of a submap in their worst direction, relative to its first keyframe.
 
-    timestamps: s. translation: of the camera's place, in the unit of the map (metres where metric). rotation: rad.
-    NaN where tracking said nothing of a frame.
+    timestamps: s. translation: of the camera centre, in the unit of the map (metres if metric). rotation: rad. NaN if
+    tracking did not measure a frame.
     """
 
     timestamps: Float[np.ndarray, " n"]
@@ -71,7 +71,7 @@ class PoseUncertainty(NamedTuple):
 
 
 def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
-    """Of every frame of `frame_trajectory(slam, piece)`; None before the last adjustment, or where there was none."""
+    """Return the uncertainty of the frames of `frame_trajectory(slam, piece)`; None without a last adjustment."""
     if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
         return None
     own = set(pieces_by_size(slam)[piece])
@@ -88,6 +88,7 @@ def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
     if not slam.metric:
         moved, turned = np.sqrt(SHARED_ERRORS) * moved, np.sqrt(SHARED_ERRORS) * turned
     turn = _unmeasured_turn(slam)
+    # Both move a place in proportion to its distance from the first pose.
     scale = np.hypot(DEPTH_SCALE if slam.metric else FREE_SCALE, turn)
     moved = np.hypot(moved, scale * np.linalg.norm(places - places[:1], axis=1))
     speed, rate = _speeds(times, poses, places)
@@ -95,14 +96,16 @@ def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
     sheared = rate * median_depths(slam)[[record.reference for record in records]]
     moved = np.sqrt(moved**2 + MOMENT**2 * (speed**2 + sheared**2))
     angles = _angles(poses)
+    # A rotation by `a` turned by a small `q` differs from itself by `2 q sin(a / 2)`.
     shared = np.hypot(CALIBRATION * angles, turn * 2 * np.sin(angles / 2))
     turned = np.sqrt(turned**2 + MOMENT**2 * rate**2 + shared**2)
     return PoseUncertainty(times, moved, turned)
 
 
 def _unmeasured_turn(slam: Slam) -> float:
-    """Radians, standard deviation of a turn `Q` of all cameras alike, as a principal point makes it that nobody has
-    measured: a motion `T` since the first pose is seen as `Q T Q^-1`, which moves places by `Q` times their distance.
+    """Return the standard deviation of a rotation `Q` of all cameras, radians, from an unmeasured principal point.
+
+    A motion `T` since the first pose is observed as `Q T Q^-1`, which moves camera centres by `Q` times their distance.
     """
     height, width = slam.keyframes[0].size
     # A given camera that was refined has moved by what its prior allows, which is no measurement of its middle either.
@@ -112,19 +115,19 @@ def _unmeasured_turn(slam: Slam) -> float:
 
 
 def median_depths(slam: Slam) -> np.ndarray:
-    """Of each keyframe's points, float64 [n]; that of all where it has none."""
+    """Return the median depth of each keyframe's points, float64 [n]; that of all if it has none."""
     each = [keyframe.points.inverse_depth[keyframe.points.determined] for keyframe in slam.keyframes]
     every = float(np.median(np.concatenate(each))) if any(map(len, each)) else 1.0
     return 1 / np.array([float(np.median(values)) if len(values) else every for values in each])
 
 
 def _angles(poses: np.ndarray) -> np.ndarray:
-    """By which each of [n, 4, 4] is turned against the first, rad."""
+    """Return the rotation of each of [n, 4, 4] relative to the first, rad."""
     return Rotation.from_matrix(poses[:, :3, :3] @ poses[:1, :3, :3].mT).magnitude() if len(poses) else np.zeros(0)
 
 
 def _speeds(times: np.ndarray, poses: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the camera at each pose: units of the map a second, and rad a second; from the poses before and after."""
+    """Return the speeds of the camera at each pose, units of the map and radians a second, from its neighbours."""
     before, after = np.maximum(np.arange(len(times)) - 1, 0), np.minimum(np.arange(len(times)) + 1, len(times) - 1)
     seconds = times[after] - times[before]
     steps = poses[after] @ rigid.invert(poses[before])
@@ -135,10 +138,10 @@ def _speeds(times: np.ndarray, poses: np.ndarray, places: np.ndarray) -> tuple[n
 
 
 def keyframe_sigma(problem: Problem, state: State, keyframes: int) -> np.ndarray | None:
-    """Of the first `keyframes` poses at a solution, float64 [n, 2]: translation, rotation in rad, in the worst
-    direction; None where nothing finite comes of it. Where residuals are larger than they should be, so are these.
+    """Return the standard deviations of translation and rotation (rad) of the first poses, float64 [keyframes, 2].
 
-    On a large graph without a band those of `SPREAD`, evenly spread, stand for the others.
+    In the worst direction, at a solution; None if not finite. They are scaled by the variance factor if that is above
+    1. On a large graph without a band `SPREAD` keyframes, evenly spaced, represent the others.
     """
     solver = DenseCholesky() if problem.num_keyframes <= DENSE_KEYFRAMES else choose_reduced_solver(problem)
     if isinstance(solver, ConjugateGradients):
@@ -149,15 +152,17 @@ def keyframe_sigma(problem: Problem, state: State, keyframes: int) -> np.ndarray
         every = jnp.arange(problem.num_keyframes)
         variances, found = sigma_jit(problem, state, solver, every)
         worst, factor = np.asarray(variances, np.float64), float(found)
+    # The variance factor only enlarges: few residuals, or residuals of a good fit, do not prove a smaller noise.
     sigma = np.sqrt(np.maximum(worst[:keyframes] * max(factor, 1.0), 0.0))
     return sigma if np.isfinite(sigma).all() else None
 
 
 def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.ndarray, float]:
-    """Largest variance of translation and of rotation of the keyframes asked for, float64 [h, 2], and the variance
-    factor, by one sparse factor of the information; outside `jit`.
+    """Return the largest variances of translation and rotation of some keyframes, float64 [h, 2], and the variance
+    factor.
 
-    Conjugate gradients would solve a system for each column, which had not ended for 957 keyframes after ten minutes.
+    By one sparse factor of the information; outside `jit`. Conjugate gradients would solve a system for each column,
+    which took more than ten minutes for 957 keyframes.
     """
     system, landmarks = _linearised_jit(problem, state)
     layout = sparse_layout(system)
@@ -166,6 +171,7 @@ def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.
         return np.full((len(asked), 2), np.nan), 1.0
     free = np.flatnonzero(np.asarray(system.free))
     diagonal = information.diagonal()[free]
+    # Balanced to a unit diagonal, so that `FLOOR` is relative to each coordinate.
     unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scale = sp.diags_array(unit)
     # What nothing determines comes out as very uncertain, where the factor of a singular matrix would be an error.
@@ -185,7 +191,7 @@ def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.
 
 @eqx.filter_jit
 def _linearised_jit(problem: Problem, state: State) -> tuple[ArrowSystem, Array]:
-    """The system, and how many landmarks it determines."""
+    """Return the system, and the number of determined landmarks."""
     system = linearise(prepared(problem), state)
     return system, jnp.sum(moving_landmarks(system))
 
@@ -201,7 +207,7 @@ _reduced_jit = eqx.filter_jit(reduced_blocks)
 def _sigma(
     problem: Problem, state: State, solver: AbstractReducedSolver, asked: Int[Array, " h"]
 ) -> tuple[Array, Array]:
-    """Largest variance of translation and of rotation of the keyframes asked for [h, 2], and the variance factor."""
+    """Return the largest variances of translation and of rotation of some keyframes [h, 2], and the variance factor."""
     found = covariances(problem, state, reduced_solver=solver, keyframes=asked)
     worst = [jnp.linalg.eigvalsh(found.poses[:, part, part])[:, -1] for part in (slice(0, 3), slice(3, 6))]
     return jnp.stack(worst, axis=1), found.variance_factor

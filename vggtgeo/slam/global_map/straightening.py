@@ -1,5 +1,6 @@
-"""Large drift, taken out of a map by its loops before the adjustment: a pose graph, and a graph of units before it
-where lengths are no metres.
+"""Pose-graph correction: removal of large drift by loops before the adjustment.
+
+In maps without metric depth a scale graph comes first.
 """
 
 from __future__ import annotations
@@ -23,23 +24,23 @@ from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.tracker import scaled_record
 
 MENDABLE = 20.0
-"""Pixels of the median match beyond which the map is straightened before it is adjusted. An adjustment alone brings
-back 5 cm and 2 degrees, 16 pixels (`tests/slam/test_pipeline.py`)."""
+"""Median reprojection error of a loop's matches above which a pose graph corrects the map before its adjustment,
+pixels. An adjustment alone corrects 5 cm and 2 degrees, 16 pixels (`tests/slam/test_pipeline.py`)."""
 UNTRACKED = (0.02, np.deg2rad(1.0))
-"""Standard deviation of a motion between keyframes that no tracking has measured, metres and radians: that of two
-views that start a map of free scale."""
+"""Standard deviation of a motion between keyframes without an odometry factor, metres and radians: that of two views
+that initialise a map without metric depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A verified pair, the relative pose by its matches, and the ratio of the units of both (None = not known)."""
+    """A verified pair, its relative pose, and the scale ratio of both (None = unknown)."""
 
     pair: Pair
     motion: MeasuredRelativePose
     ratio: float | None
 
     def agrees(self, slam: Slam) -> bool:
-        """Whether the map's adjustment can take the matches: half of them reproject within `MENDABLE`."""
+        """Return whether the adjustment can use the matches: half of them reproject within `MENDABLE`."""
         first, second = (slam.keyframes[number] for number in self.pair.key)
         matches = self.pair.points
         inverse = first.points.inverse_depth[matches.index_i]
@@ -49,8 +50,9 @@ class Loop:
 
 
 def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
-    """The map after a pose graph, if any loop contradicts it by more than its adjustment can mend, and the loops that
-    are believed.
+    """Return the map corrected by a pose graph, and the accepted loops.
+
+    It is unchanged unless loops contradict it by more than its adjustment can correct.
     """
     motions, closing = odometry(slam)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
@@ -61,6 +63,7 @@ def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     measured = (*closing, *(loop.motion for loop in loops))
     graph = _graph(slam, motions, measured, _units(slam, motions, loops))
     tracked = graph.motions if slam.metric else [motion.of_free_length() for motion in graph.motions]
+    # Before the solve: with several wrong loops even a robust kernel may settle on their consensus.
     sure = consistent_loops(graph.loops, tracked, BELIEF, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
@@ -78,9 +81,9 @@ def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
 
 
 def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelativePose]]:
-    """The motions that make the map a tree, each keyframe after an earlier one, and all other tracked motions.
+    """Return motions that make the map a tree, each keyframe after an earlier one, and all other tracked motions.
 
-    A motion is what the adjusted poses say where they agree with what was tracked, else what was tracked.
+    A motion is that of the adjusted poses if they agree with the tracked one, else the tracked one.
     """
     tree: dict[int, MeasuredRelativePose] = {}
     others = []
@@ -99,6 +102,7 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
     for number in range(1, len(slam.keyframes)):
         if number in tree:
             tie = tree[number]
+            # Adjusted poses are more accurate than the tracked motion, unless an adjustment went wrong.
             agrees = distance(tie, poses) < BELIEF
             motions.append(replace(tie, pose=between(tie.first, tie.second)) if agrees else tie)
         elif (number - 1, number) in matched:
@@ -107,7 +111,7 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
 
 
 def _pixels(tie: MeasuredRelativePose, slam: Slam) -> float:
-    """How far points at a usual distance are from where a motion would have them, pixels."""
+    """Return the image error of points at a usual distance for the error of a relative pose, pixels."""
     first, second = (slam.keyframes[number].pose for number in tie.keyframes)
     off = tangent(second @ rigid.invert(first) @ rigid.invert(tie.pose))
     return float(slam.intrinsics[0] * (np.linalg.norm(off[:3]) / NOMINAL_DEPTH + np.linalg.norm(off[3:])))
@@ -116,7 +120,7 @@ def _pixels(tie: MeasuredRelativePose, slam: Slam) -> float:
 def _graph(
     slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[MeasuredRelativePose], units: np.ndarray
 ) -> PoseGraph:
-    """The graph in the unit of the first keyframe, one keyframe held of each piece that the loops leave."""
+    """Return the graph in the scale of the first keyframe, with one fixed keyframe in each connected component."""
     inside = lambda measured: scaled_motion(measured, float(units[measured.first]))
     scaled_motions, scaled_loops = tuple(map(inside, motions)), tuple(map(inside, loops))
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
@@ -129,7 +133,7 @@ def _graph(
 
 
 def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
-    """By what the lengths of each keyframe must be multiplied, float64 [n]; by 1 where they are metres."""
+    """Return the factor on the lengths of each keyframe, float64 [n]; 1 if they are metres."""
     if slam.metric:
         return np.ones(len(slam.keyframes))
     ratios = [UnitRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
@@ -137,7 +141,7 @@ def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[
 
 
 def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
-    """The map without some of its tracked motions."""
+    """Return the map without some of its tracked motions."""
     gone = {id(tie) for tie in ties}
     return replace(
         slam, map=replace(slam.map, factors=tuple(factor for factor in slam.map.factors if id(factor) not in gone))
@@ -145,7 +149,7 @@ def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
 
 
 def _taken(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
-    """The map at other poses, its lengths multiplied keyframe by keyframe."""
+    """Return the map at other poses, lengths scaled keyframe by keyframe."""
     unit = lambda number: float(units[number])
     factors = tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors)
     return replace(
@@ -166,7 +170,7 @@ def _taken(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
 
 
 def _noted(slam: Slam, refused: int, before: Slam | None = None) -> Slam:
-    """What the user should know."""
+    """Return the state with notes for the user."""
     notes = []
     if before is not None:
         moved = max(

@@ -1,8 +1,8 @@
-"""The unit of each keyframe of a map without metric depth: scale drifts along the way, and loops measure by how much.
+"""Scale graph: the scale of each keyframe of a map without metric depth, from scale ratios measured by loops.
 
 Scale is a homomorphism of the similarities, so the scale part of a Sim(3) pose graph is a linear graph of its own over
-the logarithms of the units. It is solved first, and the pose graph over SE(3) after it (`straightening.py`); what this
-leaves out is what the lengths of motions would say about scale, which on the way around a loop is little.
+the logarithms of the scales. It is solved first, then the pose graph over SE(3) (`straightening.py`). This neglects the
+information of motion lengths about scale, which is small around a loop.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from vggtgeo.slam.tracking.evidence import STEP_GROWTH
 DRIFT = 0.01
 """Standard deviation of the change of scale from one keyframe to the next."""
 GUESSED = STEP_GROWTH
-"""The same where the length of the motion between them was taken from the motion so far."""
+"""The same if the length of the motion between them was taken from the motion so far."""
 RATIO = 0.03
 """Standard deviation of the logarithm of a measured ratio."""
 WIDTHS = (1024.0, 256.0, 64.0, 16.0, 4.0, 2.5, 2.5, 2.5)
-"""Widths of the Cauchy kernel on ratios, one reweighting each, in standard deviations: graduated, as from a large drift
-true ratios look as false as the false ones do."""
+"""Widths of the Cauchy kernel on ratios, one reweighting each, in standard deviations: graduated, since after a large
+drift true ratios have residuals as large as false ones."""
 
 
 @dataclass(frozen=True)
 class UnitRatio:
-    """Lengths of keyframe `second` must be multiplied by `ratio` to have the unit of keyframe `first`."""
+    """Factor `ratio` that converts lengths of keyframe `second` to the scale of keyframe `first`."""
 
     first: int
     second: int
@@ -38,7 +38,7 @@ class UnitRatio:
 
 
 def solve_units(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios: Sequence[UnitRatio]) -> np.ndarray:
-    """By what the lengths of each keyframe must be multiplied, float64 [n]; by 1 those of the first."""
+    """Return the factor on the lengths of each keyframe, float64 [n]; that of the first is 1."""
     if not ratios:
         return np.ones(keyframes)
     ends = [*(motion.keyframes for motion in motions), *((r.first, r.second) for r in ratios)]
@@ -58,5 +58,6 @@ def solve_units(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios:
         logs = np.asarray(spsolve(normal, design.T @ target))
         logs -= logs[0]
         residual = (logs[second] - logs[first] - measured) / sigma
+        # Cauchy's weight, for the measured ratios only: nothing but them contradicts the drift model.
         weight[len(motions) :] = 1.0 / (1.0 + (residual[len(motions) :] / width) ** 2)
     return np.exp(logs)

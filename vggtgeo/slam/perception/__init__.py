@@ -1,1 +1,1 @@
-"""What is seen in one image, or by comparing two, before anything is known of a map."""
+"""Perception: measurements in one image or between two, without a map."""

@@ -1,4 +1,4 @@
-"""What is made of a frame before it is tracked, or when somebody asks: most frames are followed without key points."""
+"""Description of a frame, computed on demand or ahead: most frames are tracked by optical flow, without key points."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 
 SAME_CAMERA = 1e-3
-"""Pixels: intrinsics that differ by less make the same view. Those of a known camera, held, move by a part of it."""
+"""Pixels: intrinsics that differ by less give the same view. Those of a known camera, weakly free, change by less."""
 
 
 class Description:
-    """The key points and descriptors of one frame, found when they are first asked for; and, where it was made while
-    earlier frames were tracked, its view for the alignment.
+    """Key points and descriptors of one frame, computed on first access, and its view for the alignment if it was
+    computed ahead.
     """
 
     def __init__(
@@ -32,21 +32,21 @@ class Description:
 
     @classmethod
     def of(cls, features: Features, view: RgbdView | None = None, intrinsics: np.ndarray | None = None) -> Self:
-        """Of key points that are there already."""
+        """Return a description with known key points."""
         return cls(lambda: features, view, intrinsics)
 
     @cached_property
     def features(self) -> Features:
-        """The key points; takes as long as the matcher's `describe` when it is first asked."""
+        """The key points; the first access takes as long as the matcher's `describe`."""
         return self._describe()
 
     @property
     def described(self) -> bool:
-        """Whether somebody has asked for the key points."""
+        """Whether the key points were computed."""
         return "features" in self.__dict__
 
     def view_by(self, intrinsics: np.ndarray) -> RgbdView | None:
-        """The view, if there is one that was made with these intrinsics, float64 [4]."""
+        """Return the view if it was computed with these intrinsics, float64 [4], else None."""
         if self._intrinsics is None or np.abs(self._intrinsics - intrinsics).max() > SAME_CAMERA:
             return None
         return self._view

@@ -1,15 +1,14 @@
 """Direct alignment of two RGB-D views: brightness and point-to-plane distance together, coarse to fine.
 
-Steinbruecker, Sturm, Cremers 2011 (brightness), Chen and Medioni 1991 (planes), joined as by Kerl et al. 2013. With `T`
-the motion source camera -> target camera, `x = T p` of a source point `p`:
+Steinbruecker, Sturm, Cremers 2011 (brightness), Chen and Medioni 1991 (planes), combined as by Kerl et al. 2013. With
+`T` the motion source camera -> target camera, `x = T p` of a source point `p`:
 
     r_I = I_target(pi(x)) - a I_source     brightness without its local mean, `a` the ratio of the exposures
-    r_D = n . (x - q)                      `q, n` the target's surface at the pixel that x falls on
+    r_D = n . (x - q)                      `q, n` the target's surface at the pixel of x
 
 Each iteration solves the 6 x 6 normal equations of both over the left tangent (`T <- exp(xi) T`, translation first),
-weighted by Tukey's biweight. One compiled function does all iterations, on the processor, while other threads run: 3 ms
-for 5,600 samples. Coordinates stand in rows [3, n], in single precision, whose rounding moves a pose by
-micrometres.
+weighted by Tukey's biweight. One compiled function does all iterations on the CPU while other threads run: 3 ms for
+5,600 samples. Coordinates are rows [3, n] in single precision, whose rounding moves a pose by micrometres.
 """
 
 from __future__ import annotations
@@ -25,24 +24,23 @@ from jax import lax
 
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.perception.rgbd_view import LEVELS, Points, RgbdView
 from vggtgeo.slam.precision import in_double_precision
 
-FARTHEST = 0.15
+MAX_DISTANCE = 0.15
 """Largest distance of a point from its surface, metres."""
-NEAREST = 0.1
+MIN_DEPTH = 0.1
 """Smallest depth, metres: where depth sensors begin."""
 MIN_COSINE = 0.7
 MIN_SAMPLES = 60
-SETTLED = 1e-4
+CONVERGED = 1e-4
 """Convergence: step in metres and radians that ends the finest level; ten times that for coarser levels. A pose is
 known to a millimetre at best; a tenth of this takes twice the iterations (`benchmarks/alignment.py`)."""
 COARSE_SPREAD = 2.0
 """Factor on the spread of surface residuals on coarse levels, so that brightness leads where a surface slides along
 itself (`benchmarks/alignment.py`)."""
-TUKEY = 4.685
-"""Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
 BITS = 20
 """Binary digits of a median, including sign and exponent: precise to 0.05 %."""
 
@@ -70,8 +68,10 @@ class Aligned:
 
 @dataclass(frozen=True)
 class RgbdAlignment:
-    """iterations: of each level, finest first. brightness_noise: grey levels, least standard deviation of a brightness.
-    edge_spread, surface_spread: how many neighbouring samples count as one independent.
+    """Settings of the alignment.
+
+    iterations: of each level, finest first. brightness_noise: minimum standard deviation of a brightness, grey levels.
+    edge_spread, surface_spread: number of neighbouring samples that count as one independent.
     """
 
     iterations: tuple[int, ...] = (6, 8, 10)
@@ -81,7 +81,7 @@ class RgbdAlignment:
 
     @in_double_precision
     def align(self, source: RgbdView, target: RgbdView, start: np.ndarray) -> Aligned | None:
-        """The motion source -> target from `start` float64 [4, 4]; None where they share too little."""
+        """Return the motion source -> target from `start` float64 [4, 4]; None if the overlap is too small."""
         first = max((level for level in range(LEVELS) if self.iterations[level]), default=0)
         noise = tuple(map(np.float32, (self.brightness_noise, self.edge_spread, self.surface_spread)))
         with jax.default_device(_processor()):
@@ -121,7 +121,7 @@ class _Term(NamedTuple):
 
 
 class _Agreement(NamedTuple):
-    """How many samples of a term are in view, whether they are enough, and the share of them that agrees."""
+    """Number of samples of a term in view, whether they are enough, and the share that agrees."""
 
     number: jax.Array
     enough: jax.Array
@@ -146,12 +146,12 @@ class _Samples(NamedTuple):
         return cls(points.points, points.values, np.int32(points.count))
 
     def present(self) -> jax.Array:
-        """Which of them are there, bool [n]."""
+        """Return which rows are samples and not padding, bool [n]."""
         return jnp.arange(self.points.shape[1]) < self.number
 
 
 class _Target(NamedTuple):
-    """Of a view, see there; arrays as in `_Samples`."""
+    """Data of a view, see `RgbdView`; arrays as in `_Samples`."""
 
     picture: Any
     cells: Any
@@ -160,7 +160,7 @@ class _Target(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    """Between two iterations. stage: the level, `JUDGED` or `DONE`. number: of its iterations so far."""
+    """State between two iterations. stage: the level, `JUDGED` or `DONE`. number: of its iterations so far."""
 
     stage: jax.Array
     number: jax.Array
@@ -170,11 +170,11 @@ class _Carry(NamedTuple):
 
 
 JUDGED, DONE = -1, -2
-"""After the finest level: both terms are looked at once more."""
+"""After the finest level both terms are evaluated once more."""
 
 
 def compile_alignment(camera: Camera) -> None:
-    """Compile what every alignment of images of this camera needs."""
+    """Compile the alignment for images of this camera."""
     black, wall = np.zeros((camera.height, camera.width, 3), np.uint8), np.ones((camera.height, camera.width))
     view = RgbdView.of(black, (wall, 0.01 * wall), np.array(camera.intrinsics, np.float64))
     RgbdAlignment().align(view, view, np.eye(4))
@@ -182,7 +182,7 @@ def compile_alignment(camera: Camera) -> None:
 
 @cache
 def _processor() -> jax.Device | None:
-    """Where a millisecond's work is not sent to a GPU and back."""
+    """Return the CPU device: a millisecond of work is not worth a transfer to a GPU."""
     try:
         return jax.devices("cpu")[0]
     except RuntimeError:  # `JAX_PLATFORMS` leaves it out
@@ -197,7 +197,7 @@ def _aligned(
     first: jax.Array,
     noise: tuple[jax.Array, jax.Array, jax.Array],
 ) -> tuple[jax.Array, jax.Array, _Terms]:
-    """The motion, the information there, and how far both terms agree with it.
+    """Return the motion, its information, and the agreement of both terms.
 
     source: points of the surface and of edges. first: the coarsest level. noise: of brightness, and both spreads.
     """
@@ -217,10 +217,11 @@ def _aligned(
         level = jnp.maximum(carry.stage, 0)
         hessian, gradient, terms = at(carry.motion, level)
         diagonal = jnp.diag(hessian)
+        # Light Levenberg-Marquardt damping: the information that is returned is that of the undamped system.
         damped = hessian + jnp.diag(1e-3 * diagonal + 1e-9 * diagonal.sum() + 1e-9)
         change = -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(damped), True), gradient)
         count = carry.number + 1
-        settled = jnp.abs(change).max() < jnp.where(level == 0, SETTLED, 10 * SETTLED)
+        settled = jnp.abs(change).max() < jnp.where(level == 0, CONVERGED, 10 * CONVERGED)
         ends = settled | (count >= iterations[level]) | (carry.stage == JUDGED)
         lost = ~(terms.edges.enough | terms.surface.enough)
         return _Carry(
@@ -237,7 +238,7 @@ def _aligned(
 
 
 def _nothing() -> _Terms:
-    """Of no samples."""
+    """Return the agreement of no samples."""
     nothing = _Agreement(jnp.int32(0), jnp.array(False), jnp.float32(0))
     return _Terms(nothing, nothing, jnp.float32(0))
 
@@ -248,7 +249,7 @@ _align: KeptProgram[tuple[jax.Array, jax.Array, _Terms]] = KeptProgram(
 
 
 def _brightness(edges: _Samples, target: _Target, level: jax.Array, motion: jax.Array) -> tuple[_Term, jax.Array]:
-    """`r_I` in grey levels, and the correlation of what is in view."""
+    """Return `r_I` in grey levels, and the correlation of the samples in view."""
     (fx, fy, *_), (width, height, offset) = target.intrinsics[level], target.sizes[level]
     x = _moved(edges.points, motion)
     u, v, ahead = _projected(x, target.intrinsics[level])
@@ -258,6 +259,7 @@ def _brightness(edges: _Samples, target: _Target, level: jax.Array, motion: jax.
     value, reference = jnp.where(seen, value, 0), jnp.where(seen, edges.values[level], 0)
     both, square = value @ reference, reference @ reference
     correlation = both / (jnp.sqrt((value @ value) * square) + 1e-9)
+    # Ratio of the exposures by least squares, in closed form.
     exposure = jnp.clip(both / (square + 1e-9), 0.6, 1.7)
     along_x, along_y = fx * dx / z, fy * dy / z
     by_point = jnp.stack([along_x, along_y, -(along_x * x[0] + along_y * x[1]) / z])
@@ -265,9 +267,9 @@ def _brightness(edges: _Samples, target: _Target, level: jax.Array, motion: jax.
 
 
 def _planes(surface: _Samples, target: _Target, motion: jax.Array) -> _Term:
-    """`r_D` in standard deviations of the two depths.
+    """Return `r_D` in standard deviations of the two depths.
 
-    Along the normal the error is at most that of the depth: a standard deviation on the safe side.
+    The error along the normal is at most that of the depth, so the standard deviation is conservative.
     """
     width, height, _ = target.sizes[LEVELS]
     x = _moved(surface.points, motion)
@@ -279,14 +281,16 @@ def _planes(surface: _Samples, target: _Target, motion: jax.Array) -> _Term:
     residual = jnp.sum((x - cell[:3]) * cell[3:6], 0)
     cosine = jnp.sum(cell[3:6] * (motion[:3, :3].astype(jnp.float32) @ normals), 0)
     # A cell without a surface has no normal: the cosine of zero is below any level.
-    seen = inside & (jnp.abs(residual) < FARTHEST) & (cosine > MIN_COSINE)
+    seen = inside & (jnp.abs(residual) < MAX_DISTANCE) & (cosine > MIN_COSINE)
+    # Unseen samples divide by 1, not by zero.
     noise = jnp.where(seen, jnp.hypot(sigma, cell[6]), 1)
     return _Term(_by_motion(x, cell[3:6] / noise), residual / noise, seen)
 
 
 def _by_motion(points: jax.Array, by_point: jax.Array) -> jax.Array:
-    """The derivative by the motion, given that by the point it moves, both [3, m]: rotation turns it, `x cross row`."""
+    """Return the derivative by the motion, given that by the point, both [3, m]: `x cross row` for the rotation."""
     (x, y, z), (a, b, c) = points, by_point
+    # Row of the left tangent, translation first: `[g, x cross g]`.
     return jnp.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
 
 
@@ -298,20 +302,23 @@ def _judged(term: _Term, gate: jax.Array) -> _Agreement:
 
 
 def _weighted(term: _Term, of: _Agreement, least: jax.Array, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Derivatives and residual [7, m] of a term, with their weights and without; zero where nothing is in view."""
+    """Return derivatives and residual [7, m] of a term, with weights and without; zero for samples out of view."""
     used = term.seen & of.enough
     rows = jnp.where(used, jnp.concatenate([term.jacobian, term.residual[None]]), 0)
-    usual = 1.4826 * _median(jnp.abs(term.residual), used, of.number)
+    usual = MAD_SIGMA * _median(jnp.abs(term.residual), used, of.number)
     scale = jnp.where(of.enough, jnp.maximum(usual, least), 1)
     share = rows[6] / (TUKEY * scale)
+    # `spread` neighbouring samples share one error, so each has that part of its information.
     weight = jnp.maximum(1 - share * share, 0) ** 2 / (scale**2 * spread)
     return rows * weight, rows
 
 
 def _median(values: jax.Array, used: jax.Array, number: jax.Array) -> jax.Array:
-    """The middle one of non-negative values [m], the upper one of an even number; digit by digit, as sorting takes
-    25 times as long.
+    """Return the median of non-negative values [m], the upper one of an even number.
+
+    Bit by bit, since sorting takes 25 times as long.
     """
+    # Non-negative floats are ordered as their bit patterns, so the median is found by bisection of the bits.
     digits = jnp.where(used, lax.bitcast_convert_type(values, jnp.int32), jnp.iinfo(jnp.int32).max)
 
     def longer(place: jax.Array, found: jax.Array) -> jax.Array:
@@ -322,7 +329,7 @@ def _median(values: jax.Array, used: jax.Array, number: jax.Array) -> jax.Array:
 
 
 def _between_pixels(picture: jax.Array, u: jax.Array, v: jax.Array, width: jax.Array, offset: jax.Array) -> jax.Array:
-    """Values [3, m] of a level of a picture at pixels that are inside it, bilinear."""
+    """Return bilinear values [3, m] of a level of a picture at pixels inside it."""
     left, top = jnp.floor(u), jnp.floor(v)
     right, below = u - left, v - top
     first = offset + top.astype(jnp.int32) * width + left.astype(jnp.int32)
@@ -332,7 +339,7 @@ def _between_pixels(picture: jax.Array, u: jax.Array, v: jax.Array, width: jax.A
 
 
 def _rows(table: jax.Array, numbers: jax.Array) -> jax.Array:
-    """Rows of a table, all of which exist, in the last axis."""
+    """Return rows of a table, all in range, in the last axis."""
     return table.at[numbers].get(mode="promise_in_bounds").T
 
 
@@ -342,8 +349,8 @@ def _moved(points: jax.Array, motion: jax.Array) -> jax.Array:
 
 
 def _projected(points: jax.Array, intrinsics: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Pixels u, v [n], and whether a point is in front of the camera."""
-    ahead = points[2] > NEAREST
+    """Return pixels u, v [n], and whether a point is in front of the camera."""
+    ahead = points[2] > MIN_DEPTH
     z = jnp.where(ahead, points[2], 1)
     fx, fy, cx, cy = intrinsics
     return points[0] / z * fx + cx, points[1] / z * fy + cy, ahead

@@ -24,7 +24,7 @@ from vggtgeo.models.classical import (
 from vggtgeo.models.roles import DenseConfidence, InitialGeometry, LineDetector, LineMatcher, MetricDepth, PointMatcher
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment
-from vggtgeo.slam.perception.still_parts import StillParts
+from vggtgeo.slam.perception.static_overlay import StaticOverlay
 from vggtgeo.slam.settings.groups import (
     SEGMENT_SAMPLES,
     CameraSettings,
@@ -83,7 +83,7 @@ class Roles:
     alignment: RgbdAlignment | None = field(default_factory=RgbdAlignment)
     flow: PatchFlow | None = field(default_factory=PatchFlow)
 
-    static_overlay: StillParts | None = None
+    static_overlay: StaticOverlay | None = None
     recorded: RecordedPoses | None = None
 
     def __post_init__(self) -> None:
@@ -97,7 +97,7 @@ class Roles:
                 )
         for role, kind in (
             *(("alignment", RgbdAlignment), ("flow", PatchFlow)),
-            *(("static_overlay", StillParts), ("recorded", RecordedPoses)),
+            *(("static_overlay", StaticOverlay), ("recorded", RecordedPoses)),
         ):
             check_kind(role, getattr(self, role), kind | None, f"a `{kind.__name__}`, or None")
 

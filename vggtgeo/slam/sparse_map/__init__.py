@@ -1,1 +1,1 @@
-"""The map of keyframes: what each saw, which see the same, what ties their poses, its pieces."""
+"""The sparse map: keyframes, their covisibility, factors on their poses, and connected components."""

@@ -1,4 +1,4 @@
-"""Which keyframes hang together: the pieces of a map, by its matches and tracked motions."""
+"""Connected components of a map, by matches and odometry factors."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from vggtgeo.slam.sparse_map.map import Map
 
 
 def piece_of(known: Map) -> np.ndarray:
-    """Piece of each keyframe, int [n]; 0 is that of the first keyframe, and so on in their order.
+    """Return the connected component of each keyframe, int [n], numbered by their first keyframes.
 
-    A pair joins with enough matches of points or lines, a factor always: a tracked motion, the unit of a new map.
+    A pair with matches of points or lines connects its keyframes, and so does any factor between two.
     """
     count = len(known.keyframes)
     ends = [factor.keyframes for factor in known.factors if not isinstance(factor, MeasuredRotation)]
@@ -22,12 +22,14 @@ def piece_of(known: Map) -> np.ndarray:
     graph = coo_array((np.ones(len(first)), (first, second)), (count, count))
     _, label = connected_components(graph, directed=False)
     _, start, inverse = np.unique(label, return_index=True, return_inverse=True)
+    # Rank of each piece by its first keyframe: scipy's labels have no documented order.
     return np.asarray(np.argsort(np.argsort(start))[inverse])
 
 
 def loop_edges(known: Map, apart: int) -> tuple[tuple[int, int], ...]:
-    """Pairs of keyframes, by their numbers, that saw one place at different times: joined by matches or by a measured
-    motion, and at least `apart` keyframes (those of a window) apart.
+    """Return pairs of keyframes, by their numbers, that observed one place at different times.
+
+    They have matches or a measured relative pose, and are at least `apart` keyframes (those of a window) apart.
     """
     ends = [tie.keyframes for tie in known.odometry_factors] + [
         pair.key for pair in known.pairs if len(pair.points) + len(pair.lines)

@@ -1,4 +1,4 @@
-"""Which keyframes saw the same things, and where: the edges of the adjustment."""
+"""Covisibility: matches between keyframes, the edges of the adjustment."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from vggtgeo.slam.settings.slam_settings import Roles, check_answer
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 MIN_MATCHES, MIN_LINE_MATCHES = 12, 4
-"""Matches that agree with the tracked poses and join two keyframes; fewer may do so by chance."""
+"""Matches consistent with the tracked poses that connect two keyframes; fewer may be consistent by chance."""
 REPROJECTION_GATE = 8.0
 """Largest reprojection error of a match by the tracked poses, pixels. Wide against the noise of a match: the poses
 are not adjusted yet. Outliers within it are left to the robust kernel."""
 EPIPOLAR_GATE = 4.0
-"""The same for the epipolar distance, where depth is not known; narrower, because it checks one direction only."""
+"""The same for the epipolar distance, where depth is unknown; narrower, because it checks one direction only."""
 MIN_OVERLAP = 0.25
-"""Share of a keyframe's points that must fall into another's image before the two are matched."""
+"""Share of a keyframe's points inside another's image required for matching."""
 GATE_SIGMA = 4.0
-"""Standard deviations that a gate of matches stands for."""
+"""Standard deviations within the gate of matches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Directed:
 
 
 def some_points(keyframe: Keyframe, intrinsics: np.ndarray, most: int = 64) -> np.ndarray:
-    """World points of a few slots whose depth is known, spread over the image, float64 `[m, 3]`."""
+    """Return world points of a few slots of known depth, spread over the image, float64 `[m, 3]`."""
     inverse = keyframe.points.inverse_depth
     known = np.nonzero(np.isfinite(inverse))[0]
     some = known[:: max(len(known) // most, 1)]
@@ -65,7 +65,7 @@ def some_points(keyframe: Keyframe, intrinsics: np.ndarray, most: int = 64) -> n
 
 
 def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> float:
-    """Share of world points that fall into the image of `keyframe`."""
+    """Return the share of world points inside the image of `keyframe`."""
     if not len(points):
         return 0.0
     height, width = keyframe.size
@@ -76,9 +76,10 @@ def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> f
 
 
 def match_keyframes(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarray) -> Pair | None:
-    """Match two keyframes whose poses are known well enough to predict; None if they share too little.
+    """Match two keyframes with predicted poses; None if they share too little.
 
-    Where no depth is known in the first, that of the second tells what they share; without any, the matches do.
+    The overlap is predicted from the points of the first, or of the second if the first has no depth; without any depth
+    it is not checked.
     """
     for one, other in ((first, second), (second, first)):
         seen = some_points(one, intrinsics)
@@ -102,13 +103,13 @@ _NO_LINES = LineMatches(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
 
 def without_matches(first: int, second: int) -> Pair:
-    """A pair of keyframes that is known to overlap though nothing was matched."""
+    """Return a pair of keyframes that is known to overlap although nothing was matched."""
     none, nowhere = np.zeros(0, int), np.zeros((0, 2))
     return Pair(first, second, PointMatches(none, none, nowhere, nowhere, np.zeros(0)), _NO_LINES)
 
 
 def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Directed]:
-    """Both directed edges of a pair. A target that was refined beyond a key point shifts its mirror image too."""
+    """Return both directed edges of a pair. The sub-pixel refinement of a target is applied to its mirror image too."""
     points, lines = pair.points, pair.lines
     forward = Directed(
         *(pair.first, pair.second, points.index_i, points.pixels_j, points.confidence),
@@ -116,6 +117,8 @@ def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Di
     )
     known = points.index_j >= 0
     slots = points.index_j[known]
+    # To first order both images move alike around a match, so the sub-pixel shift in one is that in the other,
+    # reversed.
     refined = points.pixels_j[known] - keyframes[pair.second].features.pixels[slots]
     backward = Directed(
         *(pair.second, pair.first, slots, points.pixels_i[known] - refined, points.confidence[known]),
@@ -125,13 +128,14 @@ def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Di
 
 
 def _consistent(points: PointMatches, first: Keyframe, relative: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Matches that agree with the predicted motion: by reprojection where depth is known, else by epipolar distance.
+    """Return which matches are consistent with the predicted motion, bool [m].
 
-    What passes wrongly is left to the robust kernel.
+    By reprojection where depth is known, else by epipolar distance. Remaining outliers are left to the robust kernel.
     """
     inverse = first.points.inverse_depth[points.index_i]
     ray = pinhole.rays(points.pixels_i, intrinsics)
     length, focal = float(np.linalg.norm(relative[:3, 3])), float(intrinsics[0])
+    # A depth too uncertain to predict the pixel within the gate would reject right matches.
     known = first.points.known_for(length, focal, REPROJECTION_GATE / GATE_SIGMA)[points.index_i]
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
     off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)

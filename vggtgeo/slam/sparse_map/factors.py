@@ -1,4 +1,4 @@
-"""What is known about the poses of keyframes beyond matches: kept by the keyframes' numbers, packed as terms."""
+"""Factors on keyframe poses besides matches: keyed by keyframe number, packed as terms."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class MeasuredRotation:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredBaseline:
-    """The distance between two keyframes' centres, and its relative standard deviation."""
+    """The distance between the centres of two keyframes, and its relative standard deviation."""
 
     first: int
     second: int
@@ -51,9 +51,9 @@ class MeasuredBaseline:
 class MeasuredRelativePose:
     """Camera `first` -> camera `second`, float64 [4, 4], and its information float64 [6, 6], translation first.
 
-    by_rays: whether no known depth took part, so that the length is little more than a guess, and with it the scale of
-    what comes after, see `tracking/two_view_motion.py`. recorded: whether no image took part: the motion is one of
-    recorded poses (`tracking/recorded_motion.py`).
+    by_rays: whether no known depth was used, so that the length, and the scale after it, is weakly constrained, see
+    `tracking/two_view_motion.py`. recorded: whether no image was used: a motion from recorded poses
+    (`tracking/recorded_motion.py`).
     """
 
     first: int
@@ -68,26 +68,30 @@ class MeasuredRelativePose:
         return self.first, self.second
 
     def of_free_length(self) -> Self:
-        """The same without measured depth: how far the camera went is known in the unit of the map that it was tracked
-        against, and that unit is itself an estimate. The length of a recorded motion is known.
+        """Return the factor for a map without measured depth.
+
+        Its length is known in the local scale of the map only, which is itself an estimate. The length of a recorded
+        motion is known.
         """
         if self.recorded:
             return self
         length = np.append(FREE_LENGTH * self.pose[:3, 3], np.zeros(3))
+        # A rank-one addition along the translation: its length becomes uncertain, its direction and the rotation stay
+        # known.
         noise = np.linalg.inv(self.information) + np.outer(length, length)
         return replace(self, information=np.linalg.inv(noise))
 
 
 FREE_LENGTH = 0.1
 """Relative standard deviation of the length of a tracked motion without measured depth: that of the scale drift from
-one keyframe to the next, 0.01 to 0.09 on real clips. A smaller one would count the current scale as measured again and
-again and keep its drift; a much larger one leaves the scale unconstrained where the camera turns on the spot."""
+one keyframe to the next, 0.01 to 0.09 on real clips. A smaller one would count the current scale as measured repeatedly
+and preserve its drift; a much larger one leaves the scale unconstrained in pure rotation."""
 TIE_WIDTH = 12.6**0.5
-"""Mahalanobis distance at which a measured motion counts half, so that one that all else contradicts (a false loop)
-gives way: the 95 % level of 6 degrees of freedom."""
+"""Mahalanobis distance at which a relative-pose factor has half its weight, so that a false loop is rejected: the 95 %
+level of 6 degrees of freedom."""
 
 _quadratic_jit = jax.jit(quadratic)
-"""Compiled at once: one by one its operations take four times as long to compile."""
+"""Compiled as one function: its operations one by one take four times as long to compile."""
 
 Factor = MeasuredRotation | MeasuredBaseline | MeasuredRelativePose
 
@@ -95,10 +99,11 @@ Factor = MeasuredRotation | MeasuredBaseline | MeasuredRelativePose
 def factor_terms(
     factors: Sequence[Factor], places: Mapping[int, int], capacity: Mapping[type, int], *, metric: bool
 ) -> tuple[AbstractTerm, ...]:
-    """One term a kind of `capacity`, padded to that many observations: those between keyframes that have a place.
+    """Return one term for each kind in `capacity`, padded to that many observations.
 
-    places: row of each keyframe in the problem, by its number. Of more factors than there is room for, the last stay.
-    metric: whether depth was measured; see `MeasuredRelativePose.of_free_length`.
+    places: row of each keyframe in the problem, by its number; factors of other keyframes are left out. If there are
+    more factors than room, the last are kept. metric: whether depth was measured; see
+    `MeasuredRelativePose.of_free_length`.
     """
     makers: dict[type, Callable[..., AbstractTerm]] = {
         MeasuredRotation: _rotations,
@@ -111,6 +116,7 @@ def factor_terms(
     terms = []
     for kind, room in capacity.items():
         own = [factor for factor in inside if isinstance(factor, kind)]
+        # The newest factors are those between the newest keyframes, which need them most.
         terms.append(makers[kind](own[max(len(own) - room, 0) :], places, room))
     return tuple(terms)
 
@@ -118,12 +124,15 @@ def factor_terms(
 def surface_term(
     pairs: Sequence[tuple[int, int]], relative: np.ndarray, hessians: np.ndarray, gradients: np.ndarray
 ) -> SurfaceAlignment:
-    """Alignments of surfaces as a term: their normal equations `[m, 6, 6]`, `[m, 6]` over the left tangent of the
-    relative poses `[m, 4, 4]`, for pairs of rows of the problem. A zero Hessian is a pair that was not aligned.
+    """Return alignments of surfaces as a term.
+
+    Their normal equations `[m, 6, 6]`, `[m, 6]` are over the left tangent of the relative poses `[m, 4, 4]`, for pairs
+    of rows of the problem. A zero Hessian is a pair that was not aligned.
     """
     at = jnp.asarray(rigid.to_quaternion(relative))
     measured, root = _quadratic_jit(at, jnp.asarray(hessians), jnp.asarray(gradients))
     first, second = np.asarray(pairs, int).reshape(-1, 2).T
+    # A zero Hessian has no minimum: its `measured` pose is a placeholder.
     aligned = np.any(hessians != 0, (1, 2)).astype(np.float64)
     return SurfaceAlignment(
         first=jnp.asarray(first, jnp.int32),
@@ -163,7 +172,7 @@ def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, in
 
 
 def relative_pose_rows(own: Sequence[MeasuredRelativePose], room: int | None = None) -> dict[str, Any]:
-    """Fields of a `RelativePose` term, padded to `room` observations; the motions name rows of the problem."""
+    """Return the fields of a `RelativePose` term, padded to `room` observations; keyframes are rows of the problem."""
     room = len(own) if room is None else room
     poses = np.tile(np.eye(4), (room, 1, 1))
     for row, factor in enumerate(own):
@@ -186,9 +195,10 @@ def _present(own: Sequence[Factor], room: int) -> Array:
 
 
 def _roots(information: Sequence[np.ndarray], size: int, room: int) -> Array:
-    """Square roots `R' R` of information matrices, which may be singular."""
+    """Return square roots `R' R` of information matrices, which may be singular."""
     whole = np.zeros((room, size, size))
     if len(information):
+        # Not Cholesky: the information of a motion may be singular.
         values, vectors = np.linalg.eigh(np.asarray(information))
         whole[: len(information)] = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
     return jnp.asarray(whole)

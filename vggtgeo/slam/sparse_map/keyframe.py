@@ -1,4 +1,4 @@
-"""A keyframe: an image with everything that was measured in it, and the estimates that hang on it."""
+"""A keyframe: an image with its measurements and estimates."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answe
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages, array_of
 
 LINE_SPACING = 10.0
-"""Pixels between the samples of a segment: closer ones would measure the same piece of an edge again."""
-LARGEST_ERROR = 0.2
-"""Relative standard deviation of a depth that is still of use as a depth."""
+"""Pixels between the samples of a segment: closer ones would observe the same part of an edge again."""
+MAX_DEPTH_ERROR = 0.2
+"""Largest relative standard deviation of a depth that is used as a depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Pixels of one keyframe that carry an inverse depth: key points, or samples of its segments.
+    """Pixels of one keyframe with an inverse depth: key points, or samples of its segments.
 
-    pixels: float [m, 2]. inverse_depth: float [m], 1/m, NaN = not known yet. prior, sigma: float [m], metric inverse
-    depth and its standard deviation, 1/m, NaN = none. prior_confidence: float [m] in [0, 1].
-    confidence: float [m] in [0, 1], how far the image can be trusted there. deviation: float [m], 1/m, standard
-    deviation of `inverse_depth` where views of other keyframes gave it, NaN elsewhere. That of a point far away is as
-    large as its inverse depth; such a point still fixes the rotation of a frame, see `determined`.
+    pixels: float [m, 2]. inverse_depth: float [m], 1/m, NaN = unknown. prior, sigma: float [m], metric inverse depth
+    and its standard deviation, 1/m, NaN = unknown. prior_confidence: float [m] in [0, 1]. confidence: float [m] in [0,
+    1], reliability of the image there. deviation: float [m], 1/m, standard deviation of `inverse_depth` from views of
+    other keyframes, NaN elsewhere. For a distant point it is as large as its inverse depth; such a point still
+    constrains the rotation of a frame, see `determined`.
     """
 
     pixels: np.ndarray
@@ -41,24 +41,28 @@ class Slots:
 
     @property
     def determined(self) -> np.ndarray:
-        """Whether the depth itself is known, bool [m]: no more than `LARGEST_ERROR` of it is its standard deviation."""
-        return np.isfinite(self.inverse_depth) & ~(self.deviation > LARGEST_ERROR * self.inverse_depth)
+        """Whether the depth itself is known, bool [m]: its relative standard deviation is at most `MAX_DEPTH_ERROR`."""
+        return np.isfinite(self.inverse_depth) & ~(self.deviation > MAX_DEPTH_ERROR * self.inverse_depth)
 
     def known_for(self, length: float, focal: float, pixels: float) -> np.ndarray:
-        """Whether the depth tells the projection after a motion of `length` to within `pixels`, or is determined, bool
-        [m].
+        """Return whether the depth predicts the projection within `pixels` after a motion of `length`, bool [m].
+
+        Determined depths always count.
         """
         return self.determined | (self.deviation * length * focal < pixels)
 
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; its images;
-    what the roles measured; the slots of its points and line samples (`sample_segment` int [m]: segment of each
-    sample); and place, what it looks like as a whole, float32 [n] of unit length, None = not known.
-    recorded: of a keyframe of a known map its time stamp in the run that made it, s, by the clock of that run.
+    """A keyframe.
 
-    A map lives as long as the run, so what it holds is small: see `KeyframeImages`.
+    Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; its images;
+    the results of the perception roles; the slots of its points and line samples (`sample_segment` int [m]: segment of
+    each sample); place, its global descriptor, float32 [n] of unit length, None = unknown; recorded: of a keyframe of a
+    known map its time stamp in the run that made it, s, by the clock of that run.
+
+    All keyframes stay in memory during the run, so images are compressed: see `KeyframeImages`.
+
     """
 
     number: int
@@ -102,11 +106,11 @@ class Keyframe:
         return height, width
 
     def compressed(self) -> Keyframe:
-        """The keyframe with its images compressed."""
+        """Return the keyframe with compressed images."""
         return self if self.images.small else replace(self, images=self.images.compressed())
 
     def expanded(self) -> Keyframe:
-        """The keyframe with its images as arrays, to be looked at often."""
+        """Return the keyframe with images as arrays, for repeated access."""
         return replace(self, images=self.images.expanded()) if self.images.small else self
 
 
@@ -161,7 +165,7 @@ def make_keyframe(
 
 
 def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineFeatures:
-    """The described segments of an image; none where the settings leave lines out."""
+    """Return the described segments of an image; none if the settings disable lines."""
     if not settings.line.use_lines:
         return roles.line_matches.describe(image, Segments(np.zeros((0, 2, 2)), np.zeros(0)))
     found = roles.lines.detect(image)
@@ -180,20 +184,23 @@ def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) 
 
 
 def read_at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """The nearest pixel's value, [m] or [m, 3]; beyond the border, where a lens may have moved it, the border's."""
+    """Return the value of the nearest pixel, [m] or [m, 3]; outside the image that of the border.
+
+    Undistortion may move key points outside.
+    """
     height, width = image.shape[:2]
     columns, rows = np.rint(pixels).astype(int).T
     return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
 
 
 def _along_segments(line_depths: np.ndarray, segment: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Inverse depth of each sample from its segment's ends: affine along the image of a straight line."""
+    """Return the inverse depth of each sample from its segment's ends: affine along the image of a straight line."""
     inverse = 1.0 / line_depths[segment]
     return inverse[:, 0] + fraction * (inverse[:, 1] - inverse[:, 0])
 
 
 def _with_line_depth(samples: Slots, on_line: np.ndarray) -> Slots:
-    """An edge of an object lies on a jump of depth, where a single pixel's depth is a coin toss: trust the line fit."""
+    """Return the samples with depths of the line fit: at a depth edge a single pixel may be on either surface."""
     known = np.isfinite(on_line)
     floor = 0.02 * on_line
     return Slots(

@@ -1,8 +1,8 @@
-"""The images of a keyframe, small: compressed in memory once the keyframe has left the window.
+"""The images of a keyframe, compressed in memory after it has left the window.
 
-At 640 x 480 the colour image and the three images of depth take 2.4 MB, and compressed 0.3: on four clips, colours as
-JPEG of quality 95 took 59 to 75 kB (1 ms to read; what it changes is less than a camera's noise, and an old keyframe's
-colours serve a coarse alignment and the map), depth and its deviation as PNG, without loss, 70 to 177 kB each.
+At 640 x 480 the colour image and the three images of depth take 2.4 MB, compressed 0.3 MB: colours as JPEG of quality
+95 59 to 75 kB (1 ms to read; the loss is below the noise of a camera, and colours of an old keyframe are used for
+coarse alignment and the map only), depth and its deviation as PNG, without loss, 70 to 177 kB each.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from vggtgeo.io.errors import InputError
 
 JPEG = (".jpg", (cv2.IMWRITE_JPEG_QUALITY, 95))
 PNG = (".png", (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP))
-"""One filter for all rows: its choice row by row takes a third of the time and makes these files no smaller."""
+"""One filter for all rows: choosing it row by row takes a third of the time and makes these files no smaller."""
 
 
 @dataclass(frozen=True, eq=False)
 class CompressedImage:
-    """An image as a file in memory. shape, dtype: those of the array."""
+    """An encoded image. shape, dtype: those of the array."""
 
     data: bytes
     shape: tuple[int, ...]
@@ -33,7 +33,7 @@ class CompressedImage:
 
     @classmethod
     def of(cls, image: np.ndarray) -> Self:
-        """uint8 [H, W, 3] as JPEG, else uint8 or float16 [H, W] as PNG, bit by bit."""
+        """Encode uint8 [H, W, 3] as JPEG, else uint8 or float16 [H, W] as PNG, bit by bit."""
         kind, options = JPEG if image.ndim == 3 else PNG
         bits = image.view(np.uint16) if image.dtype == np.float16 else image
         encoded, data = cv2.imencode(kind, np.ascontiguousarray(bits), options)
@@ -42,13 +42,13 @@ class CompressedImage:
         return cls(data.tobytes(), image.shape, image.dtype)
 
     def array(self) -> np.ndarray:
-        """The image again."""
+        """Return the decoded image."""
         # Colours are as they were given: encoded and decoded without a change of their order.
         image = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_UNCHANGED)
         return image.view(self.dtype).reshape(self.shape)
 
     def check(self, name: str) -> None:
-        """ValueError where what was read from a file is no such image. name: for that."""
+        """Raise ValueError if data from a file are not such an image. name: used in the message."""
         try:
             image = decoded(self.data, Path(name), cv2.IMREAD_UNCHANGED)
         except InputError as error:
@@ -59,8 +59,10 @@ class CompressedImage:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeImages:
-    """colour: uint8 [H, W, 3] RGB. depth: float16 [H, W] metres, NaN = none (its rounding, 0.5 mm at 1 m, is below any
-    sensor's noise). depth_sigma: float16 [H, W], its relative standard deviation as the role states it.
+    """Images of a keyframe.
+
+    colour: uint8 [H, W, 3] RGB. depth: float16 [H, W] metres, NaN = unknown (its rounding, 0.5 mm at 1 m, is below the
+    noise of any sensor). depth_sigma: float16 [H, W], its relative standard deviation as stated by the role.
     depth_confidence: uint8 [H, W], 255 is 1.
     """
 
@@ -76,15 +78,15 @@ class KeyframeImages:
 
     @cached_property
     def has_depth(self) -> bool:
-        """Whether any pixel has one; decoded for that once."""
+        """Whether any pixel has a depth; decoded once for that."""
         return bool(np.isfinite(array_of(self.depth)).any())
 
     def compressed(self) -> KeyframeImages:
-        """The same in little memory; each look at an image decodes it."""
+        """Return the images compressed; each access decodes one."""
         return KeyframeImages(*(CompressedImage.of(array_of(image)) for image in self._every()))
 
     def expanded(self) -> KeyframeImages:
-        """The same as arrays."""
+        """Return the images as arrays."""
         return KeyframeImages(*(array_of(image) for image in self._every()))
 
     def _every(self) -> tuple[np.ndarray | CompressedImage, ...]:
@@ -92,5 +94,5 @@ class KeyframeImages:
 
 
 def array_of(image: np.ndarray | CompressedImage) -> np.ndarray:
-    """The image as an array."""
+    """Return the image as an array."""
     return image if isinstance(image, np.ndarray) else image.array()

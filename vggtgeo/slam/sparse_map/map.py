@@ -1,4 +1,4 @@
-"""The sparse map: keyframes, the matches between them, and what else is known of their poses."""
+"""The sparse map: keyframes, the matches between them, and factors on their poses."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """Keyframes and what joins them.
+    """Keyframes and the constraints between them.
 
     Fields:
         metric: Whether lengths are metres.
         keyframes: All, by number.
         pairs: All matches between them.
-        factors: What is known of poses beyond matches: odometry factors, measured rotations, and the baseline that
+        factors: Constraints on poses besides matches: odometry factors, measured rotations, and the baseline that
             fixes the scale of a map without metric depth.
-        roots: Numbers of the first keyframe of each submap. Submaps are joined by nothing.
-        axes: The perpendicular directions of the world's lines, float64 [3, 3] (axes -> world), as the first keyframes
-            saw them.
+        roots: Number of the first keyframe of each submap. Submaps have no constraint between each other.
+        axes: The perpendicular directions of the world's lines, float64 [3, 3] (axes -> world), estimated from the
+            first keyframes.
         pose_sigma: Standard deviations of each keyframe's pose after the last adjustment, see
             `pose_uncertainty.keyframe_sigma`.
 
@@ -39,12 +39,12 @@ class Map:
 
     @property
     def odometry_factors(self) -> tuple[MeasuredRelativePose, ...]:
-        """The tracked motions between keyframes."""
+        """Tracked motions between keyframes."""
         return tuple(factor for factor in self._motions if not factor.recorded)
 
     @property
     def recorded_factors(self) -> tuple[MeasuredRelativePose, ...]:
-        """The recorded motions between keyframes, which no image has measured."""
+        """Recorded motions between keyframes, not measured by images."""
         return tuple(factor for factor in self._motions if factor.recorded)
 
     @property
@@ -53,5 +53,5 @@ class Map:
 
     @property
     def finished(self) -> bool:
-        """Whether the last adjustment has been over all keyframes."""
+        """Whether the last adjustment included all keyframes."""
         return self.pose_sigma is not None and len(self.pose_sigma) == len(self.keyframes)

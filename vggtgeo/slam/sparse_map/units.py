@@ -1,4 +1,4 @@
-"""Units of maps without metric depth: how those of two keyframes compare, and a map in another unit."""
+"""Scale of maps without metric depth: the scale ratio of two keyframes, and scaling of a map."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 NOMINAL_DEPTH = 2.5
 """Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
 MIN_SHARED = 20
-"""Key points with a depth in both keyframes that tell the ratio of their units."""
+"""Minimum number of key points with a depth in both keyframes for their scale ratio."""
 MAX_SCALE_ERROR = 0.03
-"""Largest standard error of that ratio; at 3 m it moves what is joined by 9 cm, which the adjustment then mends."""
+"""Largest standard error of that ratio; at 3 m it moves the joined part by 9 cm, which the adjustment corrects."""
 
 
 def ratio_of_units(
     old: Keyframe, new: Keyframe, matches: PointMatches, relative: np.ndarray, intrinsics: np.ndarray
 ) -> float | None:
-    """By what lengths of `new` must be multiplied to have the unit of `old`; both ends of the matches are key points.
+    """Return the factor that converts lengths of `new` to the scale of `old`; both ends of the matches are key points.
 
-    The median, over key points that both keyframes know the depth of, of depth as the old one has it over depth as the
-    new one has it, in the new camera, which `relative` leads to. None where they are too few, or disagree.
+    The median over key points of known depth in both keyframes of the old depth, transformed to the new camera by
+    `relative`, over the new depth. None if they are too few or inconsistent.
     """
     before, after = old.points.inverse_depth[matches.index_i], new.points.inverse_depth[matches.index_j]
     known = old.points.determined[matches.index_i] & new.points.determined[matches.index_j]
@@ -35,6 +35,7 @@ def ratio_of_units(
     ahead = depth > 0
     if np.count_nonzero(ahead) < MIN_SHARED:
         return None
+    # Ratios are symmetric in the logarithm: exchanging the keyframes changes the sign only.
     logs = np.log(depth[ahead] * after[ahead])
     middle = float(np.median(logs))
     # Standard error of a median: 1.25 sigma / sqrt(n), sigma from the median absolute deviation.
@@ -43,14 +44,14 @@ def ratio_of_units(
 
 
 def longer(motion: np.ndarray, ratio: float) -> np.ndarray:
-    """A rigid motion, float64 [4, 4], whose translation is `ratio` times as long."""
+    """Return a rigid motion, float64 [4, 4], with its translation multiplied by `ratio`."""
     changed = motion.copy()
     changed[:3, 3] *= ratio
     return changed
 
 
 def scaled_keyframe(keyframe: Keyframe, ratio: float) -> Keyframe:
-    """The keyframe in a world whose lengths are `ratio` times as long."""
+    """Return the keyframe with all lengths multiplied by `ratio`."""
     nearer = lambda slots: replace(slots, inverse_depth=slots.inverse_depth / ratio, deviation=slots.deviation / ratio)
     points: Slots = nearer(keyframe.points)
     samples: Slots = nearer(keyframe.samples)
@@ -59,16 +60,17 @@ def scaled_keyframe(keyframe: Keyframe, ratio: float) -> Keyframe:
 
 
 def scaled_factor(factor: Factor, ratio: float) -> Factor:
-    """What is known of such keyframes; a baseline stays what it is."""
+    """Return a factor between scaled keyframes; a baseline is unchanged."""
     return scaled_motion(factor, ratio) if isinstance(factor, MeasuredRelativePose) else factor
 
 
 def scaled_motion(motion: MeasuredRelativePose, ratio: float) -> MeasuredRelativePose:
-    """A measured motion whose translation is `ratio` times as long, and its information."""
+    """Return a relative pose with its translation multiplied by `ratio`, and its information."""
     return replace(motion, pose=longer(motion.pose, ratio), information=scaled_information(motion.information, ratio))
 
 
 def scaled_information(information: np.ndarray, ratio: float) -> np.ndarray:
-    """The information [6, 6], translation first, of a motion that is `ratio` times as long."""
+    """Return the information [6, 6], translation first, of a motion with its translation multiplied by `ratio`."""
+    # Information is 1 / unit^2 in the translation, and without unit in the rotation.
     by = np.repeat([1.0 / ratio, 1.0], 3)
     return np.asarray(information * np.outer(by, by))

@@ -1,1 +1,1 @@
-"""Where a frame is: placed against a keyframe and the map, judged by evidence, placed again when the map is done."""
+"""Tracking: the pose of a frame from keyframes and map, its acceptance by evidence, and relocalization."""

@@ -1,9 +1,9 @@
-"""A frame's pose by key points of a keyframe that are followed into it by their patches, without descriptors.
+"""Pose of a frame from key points that optical flow follows from a keyframe, without descriptors.
 
-Between two keyframes the picture changes little, and the motion so far says where each point must be. That is quick,
-and it fails where the motion jumps, the picture darkens, or something comes between. So it has to show that it did not:
-enough points arrive (`MIN_FOLLOWED`), they agree on one pose (`MIN_INLIER_SHARE`), and they are more than the number
-below which a frame becomes a keyframe (`MIN_INLIERS`). Else the frame is described and matched.
+Between two keyframes the image changes little, and the motion prior predicts each point. Flow is fast, but fails with
+sudden motion, changes of exposure and occlusion. The result is therefore used only if enough points are followed
+(`MIN_FOLLOWED`), they agree on one pose (`MIN_INLIER_SHARE`), and they are more than the number below which a frame
+becomes a keyframe (`MIN_INLIERS`). Otherwise the frame is described and matched.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ keyframe, which are the same in all following frames."""
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """A pose by key points, the number of matches that it was sought by, and their points in the world, float64 [m, 3].
+    """A pose from key points, the number of matches, and their world points, float64 [m, 3].
 
-    sigma: standard deviation of a match, pixels. slots: int [m] in the points of the keyframe, and pixels: float64
-    [m, 2] in the frame, of these matches; none where they are of several keyframes.
+    sigma: standard deviation of a match, pixels. slots: int [m], slots of these matches in the keyframe, and pixels:
+    float64 [m, 2], in the frame; None for matches with several keyframes.
     """
 
     guess: PoseGuess
@@ -53,7 +53,7 @@ class Located:
 
     @property
     def seen(self) -> SeenPoints | None:
-        """Some of the matches that agree with the pose, in even steps."""
+        """Some of the inliers, in even steps."""
         if self.slots is None or self.pixels is None:
             return None
         agree = np.flatnonzero(self.guess.inliers)
@@ -69,8 +69,8 @@ def located_by_flow(
     flow: PatchFlow,
     geometry: InitialGeometry,
 ) -> Located | None:
-    """The pose of the frame with `image` uint8 [H, W, 3] near `predicted` float64 [4, 4], world -> camera; None where
-    that is not beyond doubt.
+    """Return the pose of `image`, uint8 [H, W, 3], near `predicted`, float64 [4, 4], world -> camera; None if
+    uncertain.
     """
     inverse = keyframe.points.inverse_depth
     known = np.flatnonzero(np.isfinite(inverse))
@@ -90,7 +90,9 @@ def located_by_flow(
     arrived = np.flatnonzero(np.isfinite(alike))
     if len(arrived) < max(MIN_FOLLOWED * len(seen), MIN_INLIERS):
         return None
+    # Followed points are not key points of the frame.
     nowhere = np.full(len(arrived), -1)
+    # A point is as good as the worse known of its two ends: the match in the image, and the depth in the keyframe.
     trust = np.clip(alike[arrived], 0.0, 1.0) * np.maximum(keyframe.points.prior_confidence[asked[arrived]], MIN_TRUST)
     matches = PointMatches(asked[arrived], nowhere, pixels[arrived], moved[arrived], trust)
     points = points[arrived]

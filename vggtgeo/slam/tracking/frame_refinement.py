@@ -1,10 +1,10 @@
-"""Frames between keyframes: each against two of them, the one that it was tracked against and the one that comes next.
+"""Frames between keyframes: aligned to two of them, the reference and the next keyframe.
 
-A frame that hangs on one keyframe has the error of one alignment, and its path jumps where the next takes over. So the
-last frames before that moment are aligned to the next keyframe as well, while their pictures are at hand. Both motions
-stay as they were measured; the pose of the frame is their mean by information, each with the error that no sample
-removes, which grows with the way from its keyframe (`fusion.with_systematic`), so that the path passes smoothly from
-one keyframe to the next, wherever adjustments move them. Keyframes stay.
+A frame that is tracked against one keyframe has the error of one alignment, and the path has a step where the reference
+changes. So the last frames before that are also aligned to the next keyframe while their images are in memory. Both
+relative motions are kept as measured. The pose of the frame is their mean by information, each with its systematic
+error, which grows with the distance from its keyframe (`fusion.with_systematic`). So the path changes smoothly from one
+keyframe to the next, wherever adjustments move them. Keyframes are not changed.
 """
 
 from __future__ import annotations
@@ -16,46 +16,46 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import inverse_information
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.slam.perception.rgbd_alignment import Aligned, RgbdAlignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.evidence import LEAST_CORRELATION, LEAST_OVERLAP, LEAST_SURFACE, Evidence
+from vggtgeo.slam.tracking.evidence import MIN_CORRELATION, MIN_OVERLAP, MIN_SURFACE, Evidence
 from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE, with_systematic
 from vggtgeo.slam.tracking.map_points import in_view
 from vggtgeo.slam.tracking.relocalisation import view_of
 from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, Tracker, frame_pose
 
 FINEST = (4, 0, 0)
-"""Iterations by level, the finest first: a frame begins within millimetres of where it ends."""
-MOST = 16
-"""Frames whose pictures wait for the next keyframe, 2 MB each. Where one keyframe serves for longer, an earlier one
-takes its part."""
-NOTHING = 1e-9
-"""Information, 1/m^2 and 1/rad^2, that is none: an inverse exists with it."""
+"""Iterations by level, the finest first: a frame starts within millimetres of its optimum."""
+MAX_WAITING = 16
+"""Frames whose images wait for the next keyframe, 2 MB each. If the reference stays longer, the nearest earlier
+keyframe is used."""
 
 
 def with_view(known: Map, tracker: Tracker, view: RgbdView | None, intrinsics: np.ndarray, roles: Roles) -> Tracker:
-    """The tracker with the view of its last frame, which waits for the next keyframe; not for long."""
+    """Return the tracker with the view of its last frame, kept for the next keyframe, at most `MAX_WAITING` frames."""
     measured = isinstance(roles.depth, SensorDepth) and roles.alignment is not None
     if view is None or not (measured and known.metric):
         return tracker
     tracker = replace(tracker, between=(*tracker.between, (len(tracker.frames) - 1, view)))
-    return against_nearest(known, tracker, intrinsics, roles) if len(tracker.between) == MOST else tracker
+    return against_nearest(known, tracker, intrinsics, roles) if len(tracker.between) == MAX_WAITING else tracker
 
 
 def against_reference(known: Map, tracker: Tracker) -> Tracker:
-    """The tracker after its reference keyframe has changed: frames that waited for it are aligned to it."""
+    """Return the tracker after a change of the reference keyframe: waiting frames are aligned to the new one."""
     if tracker.reference is None:
         return replace(tracker, between=())
     return _against(known, tracker, *tracker.reference)
 
 
 def against_nearest(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> Tracker:
-    """The tracker after no other keyframe has come for long, or will: frames that wait are aligned to the nearest one
-    that they were not tracked against.
+    """Return the tracker with the waiting frames aligned to the nearest keyframe that they were not tracked against.
+
+    For runs without a new keyframe for long, and for the end of a run.
     """
     if not tracker.between:
         return tracker
@@ -67,7 +67,7 @@ def against_nearest(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles:
 
 
 def _against(known: Map, tracker: Tracker, number: int, source: RgbdView | None) -> Tracker:
-    """The tracker with the frames that waited placed by one keyframe, as far as they were tracked against another."""
+    """Return the tracker with the waiting frames aligned to one keyframe, unless they were tracked against it."""
     keyframe = known.keyframes[number]
 
     def second(item: tuple[int, RgbdView]) -> SecondMotion | None:
@@ -86,8 +86,9 @@ def _against(known: Map, tracker: Tracker, number: int, source: RgbdView | None)
 
 
 def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.ndarray:
-    """World -> camera of all frames [n, 4, 4], given what each is by the keyframe that it was tracked against: the mean
-    with what the second motion says, where they agree.
+    """Return world -> camera of all frames [n, 4, 4]: the mean of the poses by both keyframes, where they agree.
+
+    poses: by the keyframe that each was tracked against.
     """
     rows = [row for row, record in enumerate(frames) if record.second is not None]
     if not rows:
@@ -99,6 +100,7 @@ def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.nd
     other = np.array([second.information for second in seconds])
     apart = placed @ rigid.invert(poses[rows])
     off = np.concatenate([apart[:, :3, 3], Rotation.from_matrix(apart[:, :3, :3]).as_rotvec()], 1)
+    # Mean of two Gaussians in the tangent space at the tracked pose: `(I1 + I2)^-1 I2 off`.
     share = np.linalg.solve(own + other, np.einsum("nij,nj->ni", other, off)[..., None])[..., 0]
     agreeing = squared_distance(off, own, other) < AGREEMENT_GATE
     found = poses.copy()
@@ -107,21 +109,21 @@ def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.nd
 
 
 def squared_distance(off: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Mahalanobis distances [n], squared, of poses `off` [n, 6] apart, in the noise of both, given their information
-    [n, 6, 6]. A contradiction is left to the tracking, which had more witnesses.
+    """Return squared Mahalanobis distances [n] of poses `off` [n, 6] apart, in the noise of both.
+
+    first, second: information of each, [n, 6, 6].
     """
-    none = NOTHING * np.eye(6)
-    noise = np.linalg.inv(first + none) + np.linalg.inv(second + none)
+    noise = inverse_information(first) + inverse_information(second)
     return np.asarray(np.einsum("ni,ni->n", off, np.linalg.solve(noise, off[..., None])[..., 0]))
 
 
 def _shows(found: Aligned) -> bool:
-    """As `Evidence.dense_fair`: comparisons with NaN, where there is nothing to compare, are false."""
-    surface = not found.surface < LEAST_SURFACE
-    return bool(found.correlation >= LEAST_CORRELATION and found.overlap >= LEAST_OVERLAP and surface)
+    """Return whether image and surface agree, as `Evidence.dense_fair`; comparisons with NaN are false."""
+    surface = not found.surface < MIN_SURFACE
+    return bool(found.correlation >= MIN_CORRELATION and found.overlap >= MIN_OVERLAP and surface)
 
 
 def tracked_information(evidence: Evidence) -> np.ndarray:
-    """Of a tracked pose [6, 6], by what it was known to in its worst directions; none where that is not known."""
+    """Return the information [6, 6] of a tracked pose by its worst directions; zero if they are unknown."""
     sigma = np.array([evidence.sigma_translation, evidence.sigma_rotation])
     return np.diag(1 / np.repeat(np.maximum(sigma, 1e-6), 3) ** 2) if np.isfinite(sigma).all() else np.zeros((6, 6))

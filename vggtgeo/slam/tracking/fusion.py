@@ -1,5 +1,6 @@
-"""One motion from a keyframe to a frame out of what points, picture, lines and the motion so far know: means by
-information, in the tangent space of the motion.
+"""Fusion of points, image, lines and motion prior into one motion from keyframe to frame.
+
+Estimates are averaged by information in the tangent space of the motion.
 """
 
 from __future__ import annotations
@@ -7,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import POSE_GATE, REGULARISER, inverse_information
 from vggtgeo.models.roles import LineFeatures, LineMatcher
 from vggtgeo.slam.perception.rgbd_alignment import Aligned
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -22,10 +23,10 @@ SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
 """Standard deviation of errors that samples share (calibration, rolling shutter, clocks): metres, radians, share of the
 motion. Set so that the squared Mahalanobis distance of dense alignments from the ground truth has the median of
 chi-square with 6 degrees of freedom, 5.3 (`benchmarks/alignment.py`)."""
-AGREEMENT_GATE = float(chi_square.ppf(0.9999, 6))
+AGREEMENT_GATE = POSE_GATE
 """Squared Mahalanobis distance between the poses by points and by dense alignment below which they are fused."""
-LARGEST_DISAGREEMENT = 0.15
-"""Distance between them, metres, above which many points are preferred to dense alignment."""
+MAX_DISAGREEMENT = 0.15
+"""Distance between them, metres, above which many inliers are preferred to dense alignment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,51 +38,55 @@ class Motion:
 
 
 def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) -> Motion | None:
-    """The mean of both where they agree to within their noise, else the one with the better evidence."""
+    """Return the mean of both motions if they agree within their noise, else the one with the better evidence."""
     if dense is None:
         return by_points
     by_picture = Motion(dense.motion, dense.information)
     if by_points is None:
         return by_picture
     off = tangent(by_points.motion @ rigid.invert(dense.motion))
+    # With the errors that samples share: by their own noise alone two right poses would contradict each other.
     noise = [np.linalg.inv(with_systematic(one.information, one.motion)) for one in (by_points, by_picture)]
     if off @ np.linalg.solve(noise[0] + noise[1], off) < AGREEMENT_GATE:
         both = by_points.information + dense.information
-        mean = np.linalg.solve(both + 1e-9 * np.eye(6), by_points.information @ off)
+        mean = np.linalg.solve(both + REGULARISER * np.eye(6), by_points.information @ off)
         return Motion(exponential(mean) @ dense.motion, both)
     # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
-    near = np.linalg.norm(off[:3]) < LARGEST_DISAGREEMENT or not evidence.points_strong
+    near = np.linalg.norm(off[:3]) < MAX_DISAGREEMENT or not evidence.points_strong
     return by_picture if evidence.dense_fair and near else by_points
 
 
-def drawn_to(found: Motion, prior: Motion) -> Motion:
-    """The mean of a measured motion and the expected one.
+def fused_with_prior(found: Motion, prior: Motion) -> Motion:
+    """Return the mean of a measured motion and the motion prior.
 
-    A direction that is seen badly goes on as the motion did; the information is that of what was measured alone.
+    The prior continues the motion in weakly constrained directions. The information is that of the measurement alone.
     """
     off = tangent(prior.motion @ rigid.invert(found.motion))
     step = np.linalg.solve(found.information + prior.information, prior.information @ off)
+    # The prior is no measurement: counted as one, it would make directions that nothing measured look measured.
     return Motion(exponential(step) @ found.motion, found.information)
 
 
-def wanting(found: Motion) -> bool:
-    """Whether, in some direction, a motion is known worse than to within what no number of samples removes.
+def weakly_constrained(found: Motion) -> bool:
+    """Return whether the standard deviation in some direction exceeds the systematic error of the motion.
 
-    Elsewhere neither lines nor the points of other keyframes change anything for the better
-    (docs/results/clips.md), and finding lines costs as much as the alignment.
+    Elsewhere neither lines nor points of other keyframes improve the pose (docs/results/clips.md), and line detection
+    costs as much as the alignment.
     """
-    floor = _floor(found.motion)
+    floor = _systematic_sigma(found.motion)
     return bool(np.linalg.eigvalsh(found.information * np.outer(floor, floor))[0] < 1.0)
 
 
 def metre_of(points: np.ndarray, pose: np.ndarray) -> float:
-    """What stands for a metre in a map of free scale, in its unit, where points [m, 3] are seen from a pose [4, 4].
+    """Return the length that stands for a metre in a map of free scale, in its unit, at points [m, 3] seen from a pose
+    [4, 4].
 
-    The mean inverse depth tells how far the image moves for a motion of one unit. In the first views of a map it is
-    about `1 / NOMINAL_DEPTH`, and thresholds are in metres there; where all is far away, places are known worse.
+    The mean inverse depth determines the image motion for a motion of one unit. In the first views of a map it is about
+    `1 / NOMINAL_DEPTH`, and thresholds are in metres there; positions are less accurate where everything is far away.
     """
     if not len(points):
         return 1.0
+    # A mean of inverse depths, since image motion is proportional to it; far points then do not dominate.
     depth = points @ pose[2, :3] + pose[2, 3]
     return float(len(points) / (NOMINAL_DEPTH * np.sum(1.0 / depth)))
 
@@ -95,7 +100,7 @@ def with_lines(
     intrinsics: np.ndarray,
     matcher: LineMatcher,
 ) -> tuple[Motion | None, Evidence]:
-    """What was found (drawn to the prior) with what segments know of it; where nothing was, from the prior by lines."""
+    """Return the motion refined by line segments, with the evidence; without a measured motion, from the prior."""
     measured = np.zeros((6, 6)) if found is None else found.information
     start = prior if found is None else found
     assert start is not None
@@ -108,12 +113,13 @@ def with_lines(
 
 
 def with_systematic(information: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """What is left of an information where the errors that no sample removes are counted in."""
-    return np.linalg.inv(np.linalg.inv(information + 1e-9 * np.eye(6)) + np.diag(_floor(motion) ** 2))
+    """Return the information of a motion after adding its systematic error."""
+    return np.linalg.inv(inverse_information(information) + np.diag(_systematic_sigma(motion) ** 2))
 
 
-def _floor(motion: np.ndarray) -> np.ndarray:
-    """Standard deviations float64 [6] of a motion that no number of samples removes."""
+def _systematic_sigma(motion: np.ndarray) -> np.ndarray:
+    """Return the standard deviations float64 [6] of a motion's systematic error, which samples share."""
     length, angle = (np.linalg.norm(part) for part in np.split(tangent(motion), 2))
     metres, radians, share = SYSTEMATIC
+    # Calibration errors grow with the motion; rolling shutter and clock errors do not vanish without it.
     return np.repeat([metres + share * length, radians + share * angle], 3)

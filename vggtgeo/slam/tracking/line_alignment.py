@@ -1,19 +1,19 @@
-"""A pose by line segments: those of a keyframe, as segments in space, against those that a frame shows.
+"""Pose from line segments: 3D segments of a keyframe against the segments detected in a frame.
 
-With `T` the motion keyframe camera -> frame camera, `X` an end of a segment in the keyframe's camera, and
-`l = (a, b, c)`, `a^2 + b^2 = 1`, the line of the segment that it is matched to:
+With `T` the motion keyframe camera -> frame camera, `X` an end of a segment in the keyframe's camera, and `l = (a, b,
+c)`, `a^2 + b^2 = 1`, the line of the matched segment:
 
     r = l . (pi(T X), 1)      pixels, one for each end
 
-Its variance has three parts: the observed line at the place `u` where the end falls (0 and 1 at the observed ends, each
-of which is off by `s` across the segment), the end in the keyframe, and its inverse depth `d`, which moves the
-projection along the epipolar line:
+Its variance has three parts: the observed line at the position `u` of the projected end (0 and 1 at the observed ends,
+each with standard deviation `s` across the segment), the end in the keyframe, and its inverse depth `d`, which moves
+the projection along the epipolar line:
 
     sigma^2 = s^2 ((1 - u)^2 + u^2) + s^2 + ((a, b) . d pi / d d)^2 sigma_d^2
 
-So an end that is carried far beyond the observed segment says little, and one that slides along it says nothing: what
-lines do not determine is missing in the information. Each iteration solves the 6 x 6 normal equations over the left
-tangent (`T <- exp(xi) T`, translation first), together with what is known of `T` before, weighted by Tukey's biweight.
+So an end far beyond the observed segment has a large variance, and motion along the segment is not constrained. Each
+iteration solves the 6 x 6 normal equations over the left tangent (`T <- exp(xi) T`, translation first), together with
+the prior information of `T`, weighted by Tukey's biweight.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -31,18 +32,16 @@ from vggtgeo.slam.tracking.evidence import tangent, worst_sigma
 
 END_SIGMA = 0.7
 """Standard deviation of a segment's end across it, pixels."""
-TUKEY = 4.685
-"""Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
-LEAST_LINES = 3
+MIN_LINES = 3
 """Three lines in general position determine a pose."""
-NEAREST = 0.1
-"""Metres; what is nearer to the camera is not projected."""
+MIN_DEPTH = 0.1
+"""Smallest depth that is projected, metres."""
 ITERATIONS, ROUNDS = 8, 3
-"""Steps between two matchings, and matchings: the next has the better pose."""
+"""Steps after each matching, and matchings: each starts from the better pose."""
 SMALL = 2e-3
-"""Metres and radians; a matching from a pose that was so near is not done again."""
-WIDEST_MISS = 80.0
-"""Pixels; a pose that may be farther off than this is searched for no farther: there, other segments are as near."""
+"""Metres and radians; below this change of the pose the segments are not matched again."""
+MAX_MISS = 80.0
+"""Largest search radius of matching, pixels: beyond it wrong segments are as near as the right one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,7 @@ class SpaceSegments:
 
     @classmethod
     def of(cls, keyframe: Keyframe, intrinsics: np.ndarray) -> SpaceSegments:
-        """Ends by the current inverse depths of the samples, which the adjustment improves: affine along a segment."""
+        """Return the segments with ends from the current inverse depths of their samples: affine along a segment."""
         count, samples, segment = len(keyframe.lines), keyframe.samples, keyframe.sample_segment
         known = np.isfinite(samples.inverse_depth) & np.isfinite(samples.sigma)
         start, along = _ends_of(keyframe, count)
@@ -71,8 +70,11 @@ class SpaceSegments:
         spread = n * tt - t * t
         index = np.nonzero((n >= 2) & (spread > 1e-9))[0]
         n, t, tt, d, td, spread = (values[index] for values in (n, t, tt, d, td, spread))
+        # Least-squares line through the samples: inverse depth is affine in the pixel along the image of a straight
+        # line.
         offset, slope = (tt * d - t * td) / spread, (n * td - t * d) / spread
         inverse = np.stack([offset, offset + slope], 1)
+        # An end behind the camera, or at infinity, comes from extrapolation.
         good = (inverse > 1e-3).all(1)
         index = index[good]
         rays = pinhole.rays(keyframe.lines.segments.endpoints[index], intrinsics)
@@ -90,8 +92,8 @@ class AlignedLines:
     """The result of an alignment.
 
     motion: float64 [4, 4], keyframe camera -> frame camera. information: float64 [6, 6] of the lines alone over its
-    left tangent. agreed: matched segments whose ends both lie on their lines to within three standard deviations.
-    visible: segments of the keyframe that should be in the frame's image at that pose.
+    left tangent. agreed: matched segments with both ends within three standard deviations of their lines. visible:
+    segments of the keyframe that are expected in the image at that pose.
     """
 
     motion: np.ndarray
@@ -108,12 +110,13 @@ def align_lines(
     known: np.ndarray,
     intrinsics: np.ndarray,
 ) -> AlignedLines | None:
-    """The motion keyframe -> frame by their segments, from `start` float64 [4, 4] with information `known` [6, 6].
+    """Return the motion keyframe -> frame by their segments, from `start` float64 [4, 4] with information `known` [6,
+    6].
 
-    None where fewer than three segments are matched, or none of them lies before the camera in the end.
+    None if fewer than three segments are matched, or all are behind the camera in the end.
     """
     segments = SpaceSegments.of(source, intrinsics)
-    if len(segments.index) < LEAST_LINES or len(seen) < LEAST_LINES:
+    if len(segments.index) < MIN_LINES or len(seen) < MIN_LINES:
         return None
     depths = np.full((len(source.lines), 2), np.nan)
     depths[segments.index] = 1.0 / segments.inverse_depth
@@ -125,7 +128,7 @@ def align_lines(
         error = _miss(believed, segments, intrinsics)
         found = matcher.match(source.lines, seen, RelativeView(motion, intrinsics, depths, error))
         has_depth = place[found.index_i] >= 0
-        if np.count_nonzero(has_depth) < LEAST_LINES:
+        if np.count_nonzero(has_depth) < MIN_LINES:
             return None
         own, theirs = place[found.index_i[has_depth]], seen.segments.endpoints[found.index_j[has_depth]]
         before = motion
@@ -149,16 +152,16 @@ def align_lines(
 
 
 def _miss(known: np.ndarray, segments: SpaceSegments, intrinsics: np.ndarray) -> float:
-    """How far a pose of information `known` may move segments of middling depth in the image, pixels."""
+    """Return the image motion of segments at median depth for a pose error of information `known`, pixels."""
     shift, turn = worst_sigma(known)
-    return min(float(intrinsics[0]) * float(np.hypot(turn, shift * np.median(segments.inverse_depth))), WIDEST_MISS)
+    return min(float(intrinsics[0]) * float(np.hypot(turn, shift * np.median(segments.inverse_depth))), MAX_MISS)
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
     """jacobian: [m, 2, 6] and residual: [m, 2], in standard deviations; a residual behind the camera is infinite.
-    sliding: [m, 2, 6], a standard deviation of the Jacobian: the observed line turns by its noise, and then an end that
-    moves along it seems to leave it.
+    sliding: [m, 2, 6], standard deviation of the Jacobian: noise rotates the observed line, so that motion along it
+    appears to be constrained.
     """
 
     jacobian: np.ndarray
@@ -172,7 +175,8 @@ def _rows(
     turned = segments.rays[own] @ motion[:3, :3].T
     inverse = segments.inverse_depth[own][..., None]
     local = turned / inverse + motion[:3, 3]
-    front = local[..., 2] > NEAREST
+    front = local[..., 2] > MIN_DEPTH
+    # Any point before the camera: the residual of this end is set to infinity below, and its weight is zero.
     safe = np.where(front[..., None], local, [0.0, 0.0, 1.0])
     line = line_coefficients(theirs)
     pixels = pinhole.project(safe, intrinsics)
@@ -184,6 +188,7 @@ def _rows(
     along = theirs[:, 1] - theirs[:, 0]
     squared = (along**2).sum(1)[:, None]
     u = ((pixels - theirs[:, :1]) * along[:, None]).sum(2) / squared
+    # `sigma^2` of the module docstring; the 1 is the end in the keyframe itself.
     variance = END_SIGMA**2 * ((1 - u) ** 2 + u**2 + 1.0) + (by_depth * segments.sigma[own]) ** 2
     sigma = np.sqrt(variance)
     sliding = (along[:, None, :1] * row_x + along[:, None, 1:] * row_y) * (np.sqrt(2.0) * END_SIGMA / squared)[
@@ -193,10 +198,11 @@ def _rows(
 
 
 def _without_chance(hessian: np.ndarray, by_chance: np.ndarray) -> np.ndarray:
-    """The information that is left where that of the noise in the Jacobian, `E[J' J] - J0' J0`, is taken off.
+    """Return the information without that of noise in the Jacobian, `E[J' J] - J0' J0`.
 
-    Parallel lines, each turned a little by noise, would else seem to determine the motion along them.
+    Otherwise parallel lines, each slightly rotated by noise, would appear to constrain the motion along them.
     """
+    # Relative to the information of all lines, so that a direction is judged by its share of chance, whatever its unit.
     root = np.linalg.cholesky(hessian + 1e-12 * np.trace(hessian) * np.eye(6))
     half = np.linalg.solve(root, by_chance)
     share, basis = np.linalg.eigh(np.linalg.solve(root, half.T))
@@ -205,9 +211,9 @@ def _without_chance(hessian: np.ndarray, by_chance: np.ndarray) -> np.ndarray:
 
 
 def _weights(residual: np.ndarray) -> np.ndarray:
-    """Tukey's biweight, wide enough for a start that is off; a residual larger than expected is also known less."""
+    """Return Tukey's weights; larger residuals than expected widen the kernel and lower all weights."""
     finite = np.isfinite(residual)
-    scale = max(1.4826 * float(np.median(np.abs(residual[finite]))), 1.0) if finite.any() else 1.0
+    scale = max(MAD_SIGMA * float(np.median(np.abs(residual[finite]))), 1.0) if finite.any() else 1.0
     inside = np.where(finite, residual / (TUKEY * scale), 1.0)
     return np.maximum(1.0 - inside**2, 0.0) ** 2 / scale**2
 
@@ -217,6 +223,7 @@ def _step(rows: _Rows, motion: np.ndarray, start: np.ndarray, known: np.ndarray)
     safe = np.where(np.isfinite(rows.residual), rows.residual, 0.0)
     hessian = _normal(rows.jacobian, weight) + known
     gradient = np.einsum("mec,me->c", rows.jacobian, weight * safe) + known @ tangent(motion @ rigid.invert(start))
+    # Lines may leave a direction free: the regulariser gives it no step.
     return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
 
 
@@ -226,11 +233,11 @@ def _normal(jacobian: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _visible(segments: SpaceSegments, motion: np.ndarray, intrinsics: np.ndarray, source: Keyframe) -> int:
-    """Segments of which the middle and one end at least fall into an image of the keyframe's size."""
+    """Return the number of segments whose middle and at least one end are inside the image."""
     local = segments.rays / segments.inverse_depth[..., None] @ motion[:3, :3].T + motion[:3, 3]
     points = np.concatenate([local, local.mean(1, keepdims=True)], 1)
     height, width = source.image.shape[:2]
     with np.errstate(invalid="ignore"):
-        x, y = np.moveaxis(pinhole.project(points, intrinsics, NEAREST), -1, 0)
+        x, y = np.moveaxis(pinhole.project(points, intrinsics, MIN_DEPTH), -1, 0)
         inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
     return int(np.count_nonzero(inside[:, 2] & inside[:, :2].any(1)))

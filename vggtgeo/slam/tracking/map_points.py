@@ -1,9 +1,9 @@
-"""A pose by the points of several keyframes: projected to where the pose says they are, searched there, and fused.
+"""Pose from the points of several keyframes: projected, matched near their projection, and fused.
 
 Each keyframe `k` gives normal equations `H_k, g_k` over the left tangent of the frame's pose, weighted by Tukey's
-biweight. What its points say is no better than its own place is known: the information that counts is
-`(H_k^-1 + F_k)^-1`, with `F_k` the covariance of the motion between it and the keyframe the pose hangs on. A keyframe
-that contradicts what is known already (chi-square, 6 degrees of freedom), one that has drifted, is left out.
+biweight. Its points cannot be more accurate than its own pose: the information used is `(H_k^-1 + F_k)^-1`, with `F_k`
+the covariance of the motion between it and the reference keyframe. A keyframe that contradicts the known pose
+(chi-square, 6 degrees of freedom), for example after drift, is not used.
 """
 
 from __future__ import annotations
@@ -13,31 +13,28 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import POSE_GATE, TUKEY, inverse_information
 from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import tangent
 
-MOST_KEYFRAMES = 4
-MOST_POINTS = 300
-"""Of a keyframe, spread over its image: more cost time and share their keyframe's error."""
-WIDEST_TURN = np.deg2rad(45.0)
-"""Between a keyframe and a frame: descriptors of key points change too much beyond."""
-LEAST_POINTS = 8
-GATE = float(chi_square.ppf(0.9999, 6))
-TUKEY = 4.685
-"""Cut of the biweight in standard deviations, 95 % efficient under Gaussian noise."""
+MAX_KEYFRAMES = 4
+MAX_POINTS = 300
+"""Points of a keyframe, spread over its image: more cost time and share the keyframe's error."""
+MAX_TURN = np.deg2rad(45.0)
+"""Largest angle between a keyframe and a frame: descriptors of key points change too much beyond."""
+MIN_POINTS = 8
 STEPS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """pose: float64 [4, 4], world -> camera. information: float64 [6, 6] of the points, over its left tangent.
-    points, keyframes: how many took part.
+    """pose: float64 [4, 4], world -> camera. information: float64 [6, 6] of the points, over its left tangent. points,
+    keyframes: numbers used.
     """
 
     pose: np.ndarray
@@ -47,7 +44,7 @@ class Refined:
 
 
 Bound = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""(information [6, 6], motion [4, 4]) -> the information that is left where the motion's own error is counted in."""
+"""(information [6, 6], motion [4, 4]) -> information after adding the error of the motion."""
 
 
 def refine_by_map(
@@ -62,7 +59,7 @@ def refine_by_map(
     radius: float,
     sigma: float,
 ) -> Refined | None:
-    """The frame's pose with what the points of `keyframes` add to it; None where they add nothing.
+    """Return the frame's pose refined by the points of `keyframes`; None without any.
 
     pose: world -> camera, with information `known` [6, 6] over its left tangent. radius: of the search, pixels; sigma:
     standard deviation of a match, pixels.
@@ -81,6 +78,8 @@ def refine_by_map(
         limited = [bound(own.hessian, own.motion) for own in equations]
         information = np.sum(limited, axis=0)
         gradient = known @ tangent(current @ rigid.invert(pose))
+        # Each keyframe pulls towards the pose that its points prefer, but only with the information that its own place
+        # leaves.
         gradient -= np.sum([known @ own.step() for known, own in zip(limited, equations, strict=True)], axis=0)
         step = -_solve(information + known, gradient)
         current = exponential(step) @ current
@@ -92,10 +91,10 @@ def refine_by_map(
 def joint_matches(
     features: Features, keyframes: Sequence[Keyframe], pose: np.ndarray, intrinsics: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of all keyframes in view, matched within `radius` of where a rough `pose` puts them.
+    """Match points of all keyframes in view within `radius` of their projection by a rough `pose`.
 
-    World points float64 [n, 3], pixels [n, 2], confidence [n]. A key point of the frame may have a point of each
-    keyframe.
+    Returns world points float64 [n, 3], pixels [n, 2], confidence [n]. A key point of the frame may match a point of
+    each keyframe.
     """
     found = [(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))]
     for keyframe in in_view(keyframes, pose) if can_search(features) else []:
@@ -108,14 +107,15 @@ def joint_matches(
 
 
 def in_view(keyframes: Sequence[Keyframe], pose: np.ndarray, but: int = -1) -> list[Keyframe]:
-    """Those that stand nearest to the frame and look the same way, nearest first, without the keyframe `but`."""
+    """Return the nearest keyframes with a similar viewing direction, nearest first, without the keyframe `but`."""
     others = [keyframe for keyframe in keyframes if keyframe.number != but]
     poses = np.array([keyframe.pose for keyframe in others]).reshape(-1, 4, 4)
     away = np.linalg.norm(rigid.invert(poses)[:, :3, 3] - rigid.centre(pose), axis=1)
+    # `trace(R1 R2') = 1 + 2 cos(angle)`.
     cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1) / 2
     turned = np.arccos(np.clip(cosine, -1.0, 1.0))
-    order = [i for i in np.argsort(away + turned, kind="stable") if turned[i] < WIDEST_TURN]
-    return [others[i] for i in order[:MOST_KEYFRAMES]]
+    order = [i for i in np.argsort(away + turned, kind="stable") if turned[i] < MAX_TURN]
+    return [others[i] for i in order[:MAX_KEYFRAMES]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,13 +127,13 @@ class _Equations:
     motion: np.ndarray
 
     def step(self) -> np.ndarray:
-        """Where these points alone would move the pose."""
+        """Return the step that these points alone would take."""
         return -_solve(self.hessian, self.gradient)
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Points of one keyframe in the world, [n, 3], and where the frame shows them, [n, 2]."""
+    """World points of one keyframe, [n, 3], and their pixels in the frame, [n, 2]."""
 
     keyframe: Keyframe
     points: np.ndarray
@@ -141,6 +141,7 @@ class _Part:
 
     def equations(self, pose: np.ndarray, intrinsics: np.ndarray, sigma: float) -> _Equations:
         local = self.points @ pose[:3, :3].T + pose[:3, 3]
+        # Metres; the projection's derivative is unbounded at the camera.
         front = local[:, 2] > 0.1
         local = local[front]
         residual = (pinhole.project(local, intrinsics) - self.pixels[front]) / sigma
@@ -155,14 +156,14 @@ class _Part:
 def _matched(
     keyframe: Keyframe, features: Features, tree: cKDTree, pose: np.ndarray, intrinsics: np.ndarray, radius: float
 ) -> _Part | None:
-    """Some of the keyframe's points with known depth that the image should show, where it shows them."""
+    """Match some of the keyframe's points of known depth that are expected in the image."""
     if not can_search(keyframe.features):
         return None
     index, points, pixels = _should_show(keyframe, pose, intrinsics)
     # Key points come strongest first, spread over the image.
-    index, points, pixels = index[:MOST_POINTS], points[:MOST_POINTS], pixels[:MOST_POINTS]
+    index, points, pixels = index[:MAX_POINTS], points[:MAX_POINTS], pixels[:MAX_POINTS]
     found = search_near(keyframe.features, index, pixels, features, tree, radius=radius)
-    if len(found) < LEAST_POINTS:
+    if len(found) < MIN_POINTS:
         return None
     return _Part(keyframe, points[np.searchsorted(index, found.index_i)], found.pixels_j)
 
@@ -170,7 +171,7 @@ def _matched(
 def _should_show(
     keyframe: Keyframe, pose: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Key points with known depth that fall into the image: their numbers (ascending), world points, pixels."""
+    """Return key points of known depth expected in the image: their numbers (ascending), world points, pixels."""
     known = np.nonzero(np.isfinite(keyframe.points.inverse_depth))[0]
     points = rigid.unproject(
         keyframe.features.pixels[known], keyframe.points.inverse_depth[known], keyframe.pose, intrinsics
@@ -183,11 +184,10 @@ def _should_show(
 
 
 def _agrees(own: _Equations, known: np.ndarray, bound: Bound) -> bool:
-    """Whether these points and what is known already place the frame alike, to within what both know."""
-    tiny = 1e-9 * np.eye(6)
-    noise = np.linalg.inv(bound(own.hessian, own.motion) + tiny) + np.linalg.inv(known + tiny)
+    """Return whether these points agree with the known pose within the noise of both."""
+    noise = inverse_information(bound(own.hessian, own.motion)) + inverse_information(known)
     step = own.step()
-    return float(step @ np.linalg.solve(noise, step)) < GATE
+    return float(step @ np.linalg.solve(noise, step)) < POSE_GATE
 
 
 def _solve(hessian: np.ndarray, right: np.ndarray) -> np.ndarray:

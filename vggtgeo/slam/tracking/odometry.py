@@ -1,10 +1,10 @@
-"""How far odometry can be off between any two keyframes: tracked motions accumulated along the way.
+"""Accumulated odometry between any two keyframes, with a bound of its covariance.
 
-Motion i, `T_i = M_i T_{i-1}`, has a left tangent error of covariance `S_i`: what it states, and the systematic errors
-that no number of samples removes. To first order the errors of the way from keyframe a to b add up in the camera of b:
-`e = sum_i A_i e_i` with `A_i = Ad(T_b T_i^-1)`. The correlation between motions is unknown: calibration, shutter and
-scene are the same for all of them. Whatever it is, `cov(e) <= n sum_i A_i S_i A_i^T` for n motions (Cauchy-Schwarz),
-with equality where all errors are one. So the standard deviation grows with the length of the way, not with its root.
+Motion i, `T_i = M_i T_{i-1}`, has a left tangent error of covariance `S_i`: the stated one plus systematic errors. To
+first order the errors of the way from keyframe a to b add up in the camera of b: `e = sum_i A_i e_i` with `A_i = Ad(T_b
+T_i^-1)`. The correlation between motions is unknown, since calibration, shutter and scene are the same for all. For any
+correlation, `cov(e) <= n sum_i A_i S_i A_i^T` for n motions (Cauchy-Schwarz), with equality if all errors are equal. So
+the standard deviation grows with the length of the way, not with its root.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Way(NamedTuple):
     """Motions camera `start` -> camera `end` by odometry, one row a pair of keyframes.
 
     pose: float64 [m, 4, 4]. spread: sum of the motions' covariances in the camera of `end`, float64 [m, 6, 6]. motions:
-    how many are on the way, int [m]. Multiply `spread` by that of all ways that an error goes over for the bound of its
-    covariance. connected: bool [m]; the other values mean nothing where it is False.
+    number on the way, int [m]; times `spread` it bounds the covariance. connected: bool [m]; where False the other
+    values are invalid.
     """
 
     pose: np.ndarray
@@ -50,7 +50,7 @@ class Odometry:
 
     @classmethod
     def of(cls, motions: Iterable[MeasuredRelativePose], keyframes: int) -> Self:
-        """The first motion to each keyframe from an earlier one; others are ignored."""
+        """Build the forest from the first motion to each keyframe from an earlier one; others are ignored."""
         parent, depth = np.full(keyframes, -1), np.zeros(keyframes, int)
         root = np.arange(keyframes)
         poses, spread = np.tile(np.eye(4), (keyframes, 1, 1)), np.zeros((keyframes, 6, 6))
@@ -60,26 +60,28 @@ class Odometry:
                 continue
             parent[here], root[here], depth[here] = before, root[before], depth[before] + 1
             poses[here] = rigid.orthonormal(motion.pose @ poses[before])
+            # As right tangents of the pose, errors of the motions on the way add up without further transport.
             carry = rigid.adjoint(rigid.invert(poses[here]))
             noise = np.linalg.inv(with_systematic(motion.information, motion.pose))
             spread[here] = spread[before] + carry @ noise @ carry.T
         return cls(parent, poses, spread, root, depth)
 
     def way(self, start: np.ndarray, end: np.ndarray) -> Way:
-        """From each keyframe of `start` to that of `end`, int [m] each."""
+        """Return the ways from each keyframe of `start` to that of `end`, int [m] each."""
         connected = self.root[start] == self.root[end]
         meeting = self._meeting(np.where(connected, start, 0), np.where(connected, end, 0))
         pose = self.poses[end] @ rigid.invert(self.poses[start])
         carry = rigid.adjoint(self.poses[end])
+        # The way between two nodes of a tree leaves out what both share: the way from the root to their meeting point.
         spread = carry @ (self.spread[start] + self.spread[end] - 2 * self.spread[meeting]) @ carry.mT
         motions = self.depth[start] + self.depth[end] - 2 * self.depth[meeting]
         return Way(pose, spread, motions, connected)
 
     def distances(self, measured: Sequence[MeasuredRelativePose], growth: float = np.inf) -> np.ndarray:
-        """Squared Mahalanobis distance of each measured motion from odometry, 6 degrees of freedom, float64 [m]; NaN
-        where no way leads from one end to the other.
+        """Return the squared Mahalanobis distance of each measured motion from odometry, 6 degrees of freedom, float64
+        [m].
 
-        growth: by what the sum of the motions' covariances is multiplied, at most by their count.
+        NaN if the ends are not connected. growth: factor on the sum of the motions' covariances, at most their number.
         """
         start, end = np.array([motion.keyframes for motion in measured], int).reshape(-1, 2).T
         way = self.way(start, end)
@@ -89,7 +91,7 @@ class Odometry:
         return np.where(way.connected, squared_distance(poses, way.pose, covariance), np.nan)
 
     def _meeting(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """The keyframe at which the ways to the root meet; a parent has a smaller number than its children."""
+        """Return the keyframe at which the ways to the root meet; a parent has a smaller number than its children."""
         first, second = first.copy(), second.copy()
         while np.any(apart := first != second):
             later = apart & (first > second)
@@ -100,7 +102,8 @@ class Odometry:
 
 
 def squared_distance(found: np.ndarray, expected: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Squared Mahalanobis distance of motions float64 [m, 4, 4] from others, 6 degrees of freedom, float64 [m].
+    """Return the squared Mahalanobis distance of motions float64 [m, 4, 4] from others, 6 degrees of freedom, float64
+    [m].
 
     covariance: of both together, left tangent, translation first, float64 [m, 6, 6].
     """

@@ -1,4 +1,4 @@
-"""Finding a lost camera again: the map is asked by appearance, and a place is believed on strict evidence only."""
+"""Relocalization: candidates by appearance, verified by geometry; accepted on strict evidence only."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from vggtgeo.slam.tracking.tracker import FramePose, Tracker, Waiting, frame_pos
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
-MOST_DRIFT = 0.05
-"""Share of the way that drift may have moved a place by, to be looked for while the run goes on; RGB-D tracking alone
+MAX_DRIFT = 0.05
+"""Largest drift of a place relative to the way since, for loops that are searched during the run; RGB-D tracking alone
 drifts by 1 to 2 %."""
 
 
 def relocalise(
     given: TrackingInput, candidates: Iterable[Keyframe], tracker: Tracker, most: int = CANDIDATES
 ) -> Track | None:
-    """The frame's pose by the most similar of `candidates`, where one of the first `most` is certain."""
+    """Return the frame's pose by the most similar of `candidates`, if one of the first `most` is certain."""
     for keyframe in most_similar(given.data.features, tuple(candidates))[:most]:
         found = track(given, keyframe, view_of(keyframe, tracker, given.intrinsics, given.roles))
         if found.evidence.certain:
@@ -40,21 +40,20 @@ def relocalise(
 
 
 def revisit(given: TrackingInput, current: Track, known: Map, tracker: Tracker, members: Sequence[int]) -> Track | None:
-    """The frame's pose by an old keyframe that shows the same place, wherever drift has put it: a loop that is closed
-    while the run goes on. The camera goes on from there, and the last adjustment spreads what the loop was off.
+    """Return the frame's pose by an old keyframe of the same place, whatever the drift: a loop closed during the run.
 
-    current: the frame's track by the current estimate. One keyframe is verified at most, as that costs as much as a
-    tracked frame: one that looks as much like the frame as those of the window do, and that drift may have put here. A
-    place that odometry contradicts only looks the same. Without metric depth the unit drifts, too, and loops wait for
-    the end.
+    Tracking continues from there, and the last adjustment distributes the error of the loop. At most one keyframe is
+    verified, since that costs as much as tracking a frame: one as similar to the frame as those of the window, and
+    within the possible drift. A place that contradicts odometry only looks the same. Without metric depth the scale
+    drifts too, and loops are closed at the end.
 
-    members: of the window.
+    current: the frame's track by the current estimate. members: of the window.
     """
     recent = members[0] if members else 0
     centres = np.array([rigid.centre(keyframe.pose) for keyframe in known.keyframes])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     way = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # from each keyframe to the newest
-    within = np.linalg.norm(centres - rigid.centre(current.pose), axis=1) < MOST_DRIFT * way
+    within = np.linalg.norm(centres - rigid.centre(current.pose), axis=1) < MAX_DRIFT * way
     old = [k for k in known.keyframes[:recent] if k.place is not None and within[k.number]]
     place = place_vector(given.data.features) if known.metric and old else None
     if place is None:
@@ -68,12 +67,13 @@ def revisit(given: TrackingInput, current: Track, known: Map, tracker: Tracker, 
     found = track(given, old[best], view_of(old[best], tracker, given.intrinsics, given.roles))
     if not (found.accepted and found.evidence.certain):
         return None
+    # Rooms that look the same pass the check by points; odometry bounds how far drift can have moved the camera.
     odometry = Odometry.of(known.odometry_factors, len(known.keyframes))
     return None if odometry.distances([tie_between(current, found)])[0] >= STEP_GATE else found
 
 
 def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Keyframe, ...]:
-    """The keyframes that look most like the frame, best first; the newest, where descriptors do not tell."""
+    """Return the most similar keyframes, best first; the newest without descriptors."""
     place = place_vector(features)
     known = [keyframe for keyframe in keyframes if keyframe.place is not None]
     if place is None or not known:
@@ -83,7 +83,7 @@ def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Key
 
 
 def view_of(keyframe: Keyframe, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> RgbdView | None:
-    """What the alignment needs of a keyframe; that of the reference is at hand, any other is made again."""
+    """Return a keyframe's view for the alignment: stored for the reference, else computed."""
     if roles.alignment is None:
         return None
     if tracker.reference is not None and tracker.reference[0] == keyframe.number:
@@ -93,12 +93,12 @@ def view_of(keyframe: Keyframe, tracker: Tracker, intrinsics: np.ndarray, roles:
 
 
 def wait(tracker: Tracker, frame: Frame, features: Features, most: int) -> tuple[Waiting, ...]:
-    """The waiting frames with this one, the oldest forgotten beyond `most`."""
+    """Return the waiting frames with this one; the oldest are dropped beyond `most`."""
     return (*tracker.waiting, Waiting(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
 
 
 def place_waiting(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> Tracker:
-    """Give the frames that waited while tracking was lost their poses, from the newest back, each by the next one's."""
+    """Track the frames that waited while tracking was lost, from the newest back, each predicted from the next."""
     placed: dict[int, FramePose] = {}
     last = tracker.frames[-1]
     pose, step = frame_pose(known, last), np.eye(4)
@@ -107,6 +107,7 @@ def place_waiting(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: R
     for number, waiting in enumerate(reversed(tracker.waiting)):
         frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
         data = frame_data(frame, Description.of(waiting.features), intrinsics, roles, known.metric)
+        # Backwards in time the motion of the last step continues as well as forwards.
         prior = MotionPrior(step @ pose, step, waited=min(number, 3))
         found = track(TrackingInput(data, intrinsics, roles, prior), keyframe, source)
         if not found.accepted:
@@ -118,7 +119,7 @@ def place_waiting(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: R
 
 
 def frame_data(frame: Frame, description: Description, intrinsics: np.ndarray, roles: Roles, metric: bool) -> FrameData:
-    """The frame as it is tracked; metric: whether lengths of the map are metres."""
+    """Return the frame's data for tracking. metric: whether lengths of the map are metres."""
     view = None
     if roles.alignment is not None and metric:
         view = description.view_by(intrinsics)
@@ -127,7 +128,7 @@ def frame_data(frame: Frame, description: Description, intrinsics: np.ndarray, r
 
 
 def record_of(frame: Frame, found: Track) -> FramePose:
-    """The record of a tracked frame that hangs on its keyframe."""
+    """Return the record of a tracked frame relative to its keyframe."""
     return FramePose(
         frame.index,
         frame.timestamp,

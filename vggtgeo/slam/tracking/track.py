@@ -1,4 +1,4 @@
-"""Placing a frame in the map: key points with known depths and the picture as a whole, fused into one pose."""
+"""Tracking of one frame: key points of known depth, dense alignment and lines, fused into one pose."""
 
 from __future__ import annotations
 
@@ -27,23 +27,32 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import Evidence, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.tracking.following import Located, located_by_flow
-from vggtgeo.slam.tracking.fusion import Motion, agreed, drawn_to, metre_of, wanting, with_lines, with_systematic
+from vggtgeo.slam.tracking.fusion import (
+    Motion,
+    agreed,
+    fused_with_prior,
+    metre_of,
+    weakly_constrained,
+    with_lines,
+    with_systematic,
+)
 from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
 from vggtgeo.slam.tracking.tracker import SeenPoints
 from vggtgeo.slam.tracking.two_view_motion import two_view_motion
 
 PIXEL_SIGMA = 2.0
-"""Standard deviation of a match, pixels: 0.5 px of the key point, and the depth of the keyframe at that one pixel."""
+"""Standard deviation of a match, pixels: 0.5 px of the key point, the rest from the keyframe's depth at that one pixel.
+"""
 SEARCH_RADIUS = 8.0
-"""Pixels around the place where a point of the map must be: four standard deviations of a match."""
+"""Search radius around a projected map point, pixels: four standard deviations of a match."""
 ROUGH_RADIUS = 60.0
-"""The same where only the motion so far tells the place: its 6 degrees are 52 px at a focal length of 500."""
+"""The same for a pose by the motion prior alone: its 6 degrees are 52 px at a focal length of 500."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameData:
-    """A frame as it is tracked. view: None where its picture as a whole plays no part. find_lines: finds and describes
-    its segments; None where they play no part.
+    """Data of a frame for tracking. view: None without dense alignment. find_lines: detects and describes segments;
+    None if they are not used.
     """
 
     frame: Frame
@@ -53,25 +62,25 @@ class FrameData:
 
     @cached_property
     def lines(self) -> LineFeatures | None:
-        """The segments, found when they are first asked for."""
+        """The segments, detected on first access."""
         return None if self.find_lines is None else self.find_lines()
 
     @property
     def found_lines(self) -> LineFeatures | None:
-        """The segments, where they were asked for."""
+        """The segments if they were detected, else None."""
         found: LineFeatures | None = self.__dict__.get("lines")
         return found
 
     @property
     def features(self) -> Features:
-        """Its key points, found when they are first asked for."""
+        """The key points, detected on first access."""
         return self.description.features
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """Where motion so far leads. pose: float64 [4, 4], world -> camera. step: the last motion, camera -> camera.
-    waited: frames since it was last confirmed.
+    """Prediction from the motion so far. pose: float64 [4, 4], world -> camera. step: the last motion, camera ->
+    camera. waited: frames since it was last confirmed.
     """
 
     pose: np.ndarray
@@ -79,17 +88,16 @@ class MotionPrior:
     waited: int = 0
 
     def motion_from(self, keyframe: Keyframe) -> Motion:
-        """The expected motion from a keyframe, and how well it is known."""
+        """Return the predicted motion from a keyframe, with its information."""
         information = step_information(self.step) / (self.waited + 1)
         return Motion(self.pose @ rigid.invert(keyframe.pose), information)
 
 
 @dataclass(frozen=True, eq=False)
 class TrackingInput:
-    """A frame to be placed, and what is known before.
+    """A frame to be tracked, with prior knowledge.
 
-    prior: None where nothing is known of the motion. window: keyframes that a model which looks at images may place the
-    frame among.
+    prior: None if the motion is unknown. window: keyframes whose images are given to a pose network.
     """
 
     data: FrameData
@@ -99,17 +107,17 @@ class TrackingInput:
     window: tuple[Keyframe, ...] = ()
 
     def views(self, source: RgbdView | None) -> tuple[RgbdView, RgbdView] | None:
-        """The views of a keyframe and of the frame; None unless there are both."""
+        """Return the views of a keyframe and of the frame; None unless both exist."""
         return None if source is None or self.data.view is None else (source, self.data.view)
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A frame's pose against one keyframe.
+    """A frame's pose relative to one keyframe.
 
-    pose: float64 [4, 4], world -> camera. measured: float64 [6, 6], what all samples know of the motion from the
-    keyframe to the frame, over its left tangent, translation first. result: why there is no pose, where there is none.
-    seen: points of the keyframe that it came from, where the picture as a whole took no part.
+    pose: float64 [4, 4], world -> camera. measured: float64 [6, 6], information of the motion keyframe -> frame over
+    its left tangent, translation first, without systematic errors. result: the reason if there is no pose. alone: the
+    track before other keyframes refined it. seen: its matches with the keyframe, if the pose is from points alone.
     """
 
     keyframe: Keyframe
@@ -126,19 +134,19 @@ class Track:
 
     @property
     def relative(self) -> np.ndarray:
-        """Keyframe camera -> frame camera."""
+        """Motion keyframe camera -> frame camera."""
         return self.pose @ rigid.invert(self.keyframe.pose)
 
     @property
     def information(self) -> np.ndarray:
-        """What is left of `measured` where the errors that no sample removes are counted in."""
+        """Information with systematic errors."""
         return with_systematic(self.measured, self.relative)
 
 
 def track(given: TrackingInput, keyframe: Keyframe, source: RgbdView | None) -> Track:
-    """The pose of a frame from one keyframe: by its points, then by its picture and surface from there.
+    """Track a frame against one keyframe: by its points, then by dense alignment from there.
 
-    source: the keyframe's view, where there is one.
+    source: the keyframe's view, or None.
     """
     roles, views = given.roles, given.views(source)
     aligner = roles.alignment if views is not None else None
@@ -155,9 +163,9 @@ def track(given: TrackingInput, keyframe: Keyframe, source: RgbdView | None) -> 
 def track_by_map(
     given: TrackingInput, keyframes: Iterable[Keyframe], reference: Keyframe, source: RgbdView | None
 ) -> Track:
-    """The pose of a frame from the points of all keyframes in view together, where no keyframe alone has enough.
+    """Track a frame by the points of all keyframes in view, if no keyframe alone has enough.
 
-    They are searched around where the motion prior leads. Picture and lines are those of `reference`.
+    Points are searched around the prediction. Dense alignment and lines use `reference`.
     """
     assert given.prior is not None
     data, predicted = given.data, given.prior.pose
@@ -170,9 +178,9 @@ def track_by_map(
 
 
 def track_by_rays(given: TrackingInput, keyframe: Keyframe, length: float) -> Track | None:
-    """The pose of a frame from matches with a keyframe whose depths are not known; None where they do not determine it.
+    """Track a frame by matches with a keyframe of unknown depths; None if they do not determine the motion.
 
-    length: of the motion between both, by the motion so far.
+    length: of the motion between both, from the motion so far.
     """
     matches = given.roles.points.match(keyframe.features, given.data.features)
     found = two_view_motion(matches, length, given.intrinsics, given.roles.geometry, PIXEL_SIGMA)
@@ -182,17 +190,19 @@ def track_by_rays(given: TrackingInput, keyframe: Keyframe, length: float) -> Tr
     metre = metre_of(found.points[found.inliers], np.eye(4))
     evidence = Evidence(matches=len(matches), inliers=agree, metre=metre, by_rays=True)
     motion = Motion(found.motion, found.information)
-    motion = motion if given.prior is None else drawn_to(motion, given.prior.motion_from(keyframe))
+    # Rays say little of the length of the motion, which the prior continues.
+    motion = motion if given.prior is None else fused_with_prior(motion, given.prior.motion_from(keyframe))
     return _judged(rigid.orthonormal(motion.motion @ keyframe.pose), motion.information, evidence, keyframe, None)
 
 
 def _placed(
     given: TrackingInput, keyframe: Keyframe, views: tuple[RgbdView, RgbdView] | None, located: Located
 ) -> Track:
-    """The pose by key points, then by picture, surface and lines from there, or from where the motion prior leads."""
+    """Return the track from key points, refined by image, surface and lines; without points, from the motion prior."""
     guess, lines = located.guess, given.roles.line_matches
     known = guess.result is GeometryResult.SUCCESS
     aligner, dense = given.roles.alignment, None
+    # Dense alignment converges from near poses only: with neither a pose nor a prediction there is no start.
     if aligner is not None and views is not None and (known or given.prior):
         dense = aligner.align(*views, guess.pose @ rigid.invert(keyframe.pose))
     by_points = None
@@ -203,10 +213,12 @@ def _placed(
     if known and not given.roles.metric:
         evidence = replace(evidence, metre=metre_of(located.points[guess.inliers], guess.pose))
     prior = None if given.prior is None else given.prior.motion_from(keyframe)
+    # The prior enters after the measurements were compared: it must not make wrong ones agree.
     found = agreed(by_points, dense, evidence)
     if found is not None and prior is not None:
-        found = drawn_to(found, prior)
-    needed = prior is not None if found is None else wanting(found)
+        found = fused_with_prior(found, prior)
+    # Finding lines costs as much as the alignment, so it is done only where it can help.
+    needed = prior is not None if found is None else weakly_constrained(found)
     if needed and given.data.lines is not None:
         found, evidence = with_lines(found, prior, evidence, keyframe, given.data.lines, given.intrinsics, lines)
     if found is None:
@@ -217,8 +229,8 @@ def _placed(
 
 
 def refined_by_map(found: Track, given: TrackingInput, keyframes: Iterable[Keyframe]) -> Track:
-    """The same with what the points of all other keyframes in view know of the pose, where it is weakly constrained."""
-    if not wanting(Motion(found.relative, found.measured)):
+    """Return the track refined by the points of all other keyframes in view if it is weakly constrained."""
+    if not weakly_constrained(Motion(found.relative, found.measured)):
         return found
     refined = refine_by_map(
         given.data.features,
@@ -241,15 +253,15 @@ def refined_by_map(found: Track, given: TrackingInput, keyframes: Iterable[Keyfr
 
 
 def moved_with(found: Track, keyframe: Keyframe) -> Track:
-    """The same track once its keyframe has been adjusted: what was measured is the motion from there."""
+    """Return the track after its keyframe was adjusted: the measurement is the relative motion."""
     alone = None if found.alone is None else moved_with(found.alone, keyframe)
     return replace(found, keyframe=keyframe, pose=rigid.orthonormal(found.relative @ keyframe.pose), alone=alone)
 
 
 def tie_to(found: Track, number: int) -> MeasuredRelativePose:
-    """What the track of a frame that is now keyframe `number` says of its motion from the one it was tracked against.
+    """Return the odometry factor of a frame that became keyframe `number`.
 
-    What other keyframes know of it enters by their own edges: in the tie it would count twice.
+    Information from other keyframes is left out: it enters by their own edges and would count twice.
     """
     own = found.alone or found
     return MeasuredRelativePose(
@@ -260,7 +272,7 @@ def tie_to(found: Track, number: int) -> MeasuredRelativePose:
 
 
 def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
-    """What two tracks of one frame say of the motion between their keyframes."""
+    """Return the relative-pose factor between the keyframes of two tracks of one frame."""
     first, second = first.alone or first, second.alone or second
     motion = rigid.invert(second.relative) @ first.relative
     # Both errors are tangents at the frame; carried to the second keyframe by the adjoint of its motion.
@@ -272,7 +284,7 @@ def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
 
 
 def _by_descriptors(given: TrackingInput, keyframe: Keyframe, matcher: PointMatcher) -> Located:
-    """The pose by key points that match in their descriptors, as far as their depth is known."""
+    """Return the pose from key points of known depth, matched by descriptors."""
     matches = matcher.match(keyframe.features, given.data.features)
     inverse_depth = keyframe.points.inverse_depth[matches.index_i]
     known = np.isfinite(inverse_depth)
@@ -296,7 +308,7 @@ def _by_descriptors(given: TrackingInput, keyframe: Keyframe, matcher: PointMatc
 def _judged(
     pose: np.ndarray, measured: np.ndarray, evidence: Evidence, keyframe: Keyframe, prior: MotionPrior | None
 ) -> Track:
-    """A pose with how well it is known in its worst direction, and how far it is from what was prior."""
+    """Return a track with its standard deviations in the worst directions and its distance from the prior."""
     track = Track(keyframe, pose, measured, evidence, GeometryResult.SUCCESS)
     sigma_translation, sigma_rotation = worst_sigma(track.information)
     evidence = replace(

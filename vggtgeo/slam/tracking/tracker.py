@@ -1,4 +1,4 @@
-"""What tracking knows: the pose of every frame by a keyframe, and where the camera is going."""
+"""State of tracking: the pose of every frame relative to a keyframe, and the current velocity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vggtgeo.slam.tracking.evidence import Evidence
 
 @dataclass(frozen=True, eq=False)
 class SecondMotion:
-    """From a second keyframe to a frame, see `frame_refinement.py`. relative: float64 [4, 4], camera -> camera.
+    """Motion from a second keyframe to a frame, see `frame_refinement.py`. relative: float64 [4, 4], camera -> camera.
     information: float64 [6, 6] over its left tangent, translation first, systematic errors included.
     """
 
@@ -26,8 +26,8 @@ class SecondMotion:
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """Key points of a keyframe that a frame shows, see `frame_poses.py`. slots: int32 [m], in `Keyframe.points`.
-    pixels: float32 [m, 2], where the frame shows them.
+    """Key points of a keyframe matched in a frame, see `frame_poses.py`. slots: int32 [m], in `Keyframe.points`.
+    pixels: float32 [m, 2], in the frame.
     """
 
     slots: np.ndarray
@@ -59,9 +59,7 @@ class FramePose:
 
 @dataclass(frozen=True, eq=False)
 class Waiting:
-    """A frame without a pose so far: seen before there was a map, or while tracking was lost. It is placed as soon as
-    there is a map that it fits into.
-    """
+    """A frame without a pose, before initialisation or while tracking was lost. It is tracked once a map exists."""
 
     frame: int
     timestamp: float
@@ -93,18 +91,19 @@ class Tracker:
 
 
 def frame_pose(known: Map, record: FramePose) -> np.ndarray:
-    """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
+    """Return world -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
     return record.relative @ known.keyframes[record.reference].pose
 
 
 def scaled_record(record: FramePose, ratio: float) -> FramePose:
-    """The record of a frame whose keyframe was scaled, see `units.scaled_keyframe`."""
+    """Return the record of a frame whose keyframe was scaled, see `units.scaled_keyframe`."""
     arrival = None if record.arrival is None else (record.arrival[0], longer(record.arrival[1], ratio))
     second = None if record.second is None else scaled_second(record.second, ratio)
     return replace(record, relative=longer(record.relative, ratio), arrival=arrival, second=second)
 
 
 def scaled_second(second: SecondMotion, ratio: float) -> SecondMotion:
-    """The motion from a second keyframe that was scaled."""
+    """Return the motion from a second keyframe that was scaled."""
+    # Information of a translation is 1 / length^2, so it is scaled too.
     information = scaled_information(second.information, ratio)
     return replace(second, relative=longer(second.relative, ratio), information=information)

@@ -1,13 +1,13 @@
-"""A frame's motion from a keyframe whose key points have no depth yet: where the camera turns so fast that two frames
-share much, and three share nothing.
+"""Motion of a frame from a keyframe whose key points have no depth yet.
 
-The essential matrix of the matches gives the rotation and the direction of the translation. Its length is that of the
-motion so far: of depths that are known there are too few to place the frame, and what so few say of a length is no
-measurement.
-The information of the motion is that of the matches, the depth of each eliminated: with the rows `J` of a projection
-over the left tangent and its column `c` over the inverse depth of the point, `sum J^T (I - c c^T / c^T c) J / sigma^2`.
-It says nothing of the length, so that of the length is added. Where all points are far away it says little of the
-translation: that goes on as before (`fusion.drawn_to`).
+This happens in turns so fast that points are seen in two frames only. The essential matrix of the matches gives the
+rotation and the direction of the translation. Its length is taken from the motion so far, since too few depths are
+known to measure it.
+
+The information of the motion is that of the matches with depths eliminated: with the rows `J` of a projection over the
+left tangent and its column `c` over the inverse depth of the point, `sum J^T (I - c c^T / c^T c) J / sigma^2`. It has
+no information about the length, so that of the prior is added. If all points are far away the translation is weakly
+constrained and follows the motion prior (`fusion.fused_with_prior`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from vggtgeo.slam.tracking.evidence import STEP_GROWTH
 @dataclass(frozen=True, eq=False)
 class TwoViewMotion:
     """Keyframe camera -> frame camera, float64 [4, 4], its information [6, 6] over the left tangent, translation first,
-    and which of the matches agree, bool [n]. points: float64 [n, 3] in the keyframe, NaN where not known.
+    and which matches are inliers, bool [n]. points: float64 [n, 3] in the keyframe, NaN if unknown.
     """
 
     motion: np.ndarray
@@ -37,9 +37,9 @@ class TwoViewMotion:
 def two_view_motion(
     matches: PointMatches, length: float, intrinsics: np.ndarray, geometry: InitialGeometry, sigma: float
 ) -> TwoViewMotion | None:
-    """The motion from a keyframe to a frame by their matches; None where these do not determine one.
+    """Return the motion from a keyframe to a frame by their matches; None if it is not determined.
 
-    length: of the motion by the motion so far. sigma: standard deviation of a match, pixels.
+    length: of the motion, from the motion so far. sigma: standard deviation of a match, pixels.
     """
     guess = geometry.start(matches.pixels_i, matches.pixels_j, intrinsics)
     if guess.result not in (GeometryResult.SUCCESS, GeometryResult.LOW_PARALLAX):
@@ -47,16 +47,19 @@ def two_view_motion(
     if not (length > 0 and guess.inliers.any()):
         return None
     motion = guess.pose.copy()
+    # The essential matrix gives a unit translation.
     motion[:3, 3] *= length
     points = length * guess.points
     information = _without_length(points[guess.inliers], motion, intrinsics) / sigma**2
     along = np.append(motion[:3, 3], np.zeros(3))
+    # The prior of the length: its gradient by the translation is the unit vector `t / |t|`, and its sigma `STEP_GROWTH
+    # |t|`.
     information += np.outer(along, along) / (STEP_GROWTH * length * length) ** 2
     return TwoViewMotion(motion, information, guess.inliers, points)
 
 
 def usual_step(keyframes: tuple[Keyframe, ...], frame: int) -> float:
-    """Length of the motion from the newest keyframe to a frame, at the speed between the newest two."""
+    """Return the length of the motion from the newest keyframe to a frame, at the speed between the newest two."""
     if len(keyframes) < 2:
         return 0.0
     before, last = keyframes[-2:]
@@ -65,9 +68,10 @@ def usual_step(keyframes: tuple[Keyframe, ...], frame: int) -> float:
 
 
 def _without_length(points: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Information [6, 6] of matches of a pixel's noise about a motion, the depths of their points eliminated."""
+    """Return the information [6, 6] of matches with a noise of one pixel about a motion, depths eliminated."""
     turned = points @ motion[:3, :3].T
     rows = np.stack(pinhole.projection_rows(turned + motion[:3, 3], intrinsics))  # [2, 6, n]
     column = np.einsum("rkn,nk->rn", rows[:, :3], turned)
+    # Schur complement of one scalar: the projection of the rows off the direction in which depth moves the pixel.
     reduced = rows - column[:, None] * (np.einsum("rkn,rn->kn", rows, column) / np.sum(column**2, 0))[None]
     return np.asarray(np.einsum("rkn,rln->kl", reduced, reduced))

@@ -1,1 +1,1 @@
-"""The sliding window: the adjustment of the newest keyframes, and what those that left it said."""
+"""The sliding window: adjustment of the newest keyframes, with a marginal prior from older ones."""

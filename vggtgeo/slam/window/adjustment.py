@@ -13,12 +13,11 @@ from vggtgeo.bundle.padding import PaddedSize, SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.camera_models import Pinhole, SquarePinhole
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
-from vggtgeo.slam.sparse_map.keyframe import LARGEST_ERROR, LINE_SPACING, Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe import LINE_SPACING, MAX_DEPTH_ERROR, Keyframe, Slots
 from vggtgeo.slam.window.line_support import sample_shares, supported
 from vggtgeo.slam.window.selection import Selection
 
@@ -34,17 +33,18 @@ in tracking: that of a match (`PIXEL_SIGMA` in `tracking/track.py`). It excludes
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """Prior of the intrinsics. mean, sigma: float64 [4] of fx, fy, cx, cy, pixels. kind: camera model; a guessed camera
-    has square pixels.
+    """Prior of the intrinsics. mean, sigma: float64 [4] of fx, fy, cx, cy, pixels.
+
+    shared_focal: whether `fx = fy`; a guessed camera has square pixels.
     """
 
     mean: np.ndarray
     sigma: np.ndarray
-    kind: type[Pinhole | SquarePinhole] = Pinhole
+    shared_focal: bool = False
 
     def parameters(self, intrinsics: np.ndarray) -> np.ndarray:
         """Return the parameters of the model from fx, fy, cx, cy (or from their standard deviations)."""
-        return np.array([np.mean(intrinsics[:2]), *intrinsics[2:]]) if self.kind is SquarePinhole else intrinsics
+        return np.array([np.mean(intrinsics[:2]), *intrinsics[2:]]) if self.shared_focal else intrinsics
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def build(
         size=size,
         intrinsics_mean=camera.parameters(camera.mean),
         intrinsics_sigma=camera.parameters(camera.sigma),
-        camera=camera.kind,
+        shared_focal=camera.shared_focal,
         fixed_pose=fixed_pose,
         kernel=settings.window.kernel,
         terms=terms,
@@ -133,6 +133,7 @@ def _observed(
     prior, sigma = read("prior"), read("sigma")
     has_prior = np.isfinite(prior) & np.isfinite(sigma)
     depths = np.concatenate([depths, read("inverse_depth")[len(points.host) :]])
+    # A slot without a prior needs finite placeholders; weight 0 removes its residual.
     weight = np.where(has_prior, _prior_trust(read("prior_confidence"), read("confidence"), settings), 0.0)
     observations = Observations(
         edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),
@@ -159,13 +160,14 @@ def write_back(
     depths = adjustment.index.gather(state.inverse_depth)
     updated = []
     for i, keyframe in enumerate(keyframes):
+        # Landmarks that are not `informed` keep their depth: the adjustment moved them along an unobserved direction.
         here = (adjustment.host == i) & adjustment.informed
         points = _updated(keyframe.points, adjustment, depths, here & ~adjustment.is_line)
         samples = _updated(keyframe.samples, adjustment, depths, here & adjustment.is_line)
         updated.append(replace(keyframe, pose=poses[i], points=points, samples=samples))
     parameters = np.asarray(state.intrinsics, np.float64)
-    square = adjustment.problem.camera is SquarePinhole
-    return tuple(updated), np.array([parameters[0], *parameters]) if square else parameters
+    shared = adjustment.problem.shared_focal
+    return tuple(updated), np.array([parameters[0], *parameters]) if shared else parameters
 
 
 def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.ndarray) -> Slots:
@@ -226,6 +228,7 @@ def _line_rows(
     )
     for number, edge in enumerate(edges):
         host, target = local[edge.host], keyframes[local[edge.target]]
+        # All samples of a segment have the match of the segment.
         matched = np.full(len(keyframes[host].lines), -1)
         matched[edge.line_slots] = np.arange(len(edge.line_slots))
         of_sample = matched[keyframes[host].sample_segment]
@@ -284,9 +287,11 @@ def _initial_depths(
     triangulated, information, longest = _triangulated(keyframes, edges, local, points, intrinsics)
     seen = information > 0
     deviation = np.where(seen, 1.0 / np.sqrt(np.maximum(information, 1e-12)), np.nan)
-    determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (deviation < LARGEST_ERROR * triangulated)
+    determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (deviation < MAX_DEPTH_ERROR * triangulated)
     # Where a depth camera measures nothing there may be glass or a mirror: do not triangulate there.
     free = seen & ~np.array([np.isfinite(own.prior).any() for own in slots])[points.host]
+    # Far points whose depth is not determined still fix rotations, as long as their projection does not depend on
+    # depth.
     steady = free & (deviation * longest * intrinsics[0] < STEP_PIXELS) & ~(deviation > before)
     known = np.isfinite(current)
     some = current[known] if known.any() else triangulated[determined]
@@ -315,4 +320,5 @@ def _triangulated(
         np.add.at(weighted, landmark[chosen], weight * value)
         np.add.at(information, landmark[chosen], weight)
         np.maximum.at(longest, landmark[chosen], float(np.linalg.norm(relative[:3, 3])))
+    # Mean by information in inverse depth, where the error of a triangulation is nearly Gaussian.
     return weighted / np.maximum(information, 1e-12), information, longest

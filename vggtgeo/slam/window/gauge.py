@@ -59,11 +59,13 @@ def with_one_gauge(problem: Problem, state: State, keyframes: int, metric: bool)
         rows = tuple(int(row) for row in piece)
         pieces.append(rows)
         if metric:
+            # With a known scale a second fixed pose would keep the error between both.
             fixed[held[1:]] = False
         if not len(held) and not known.placed[piece].any():
             fixed[piece[0]] = True
             free.append(rows)
         if len(piece) > 1 and not sized[label[piece[0]]] and np.count_nonzero(fixed[piece]) < 2:
+            # The longest baseline: its relative error, which becomes that of the scale, is the smallest.
             fixed[_farthest(state, piece, fixed)] = True
             loose.append(rows)
     held_problem = replace(problem, fixed_pose=jnp.asarray(fixed))
@@ -145,6 +147,7 @@ def _links(problem: Problem, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
         rows += (2 if isinstance(term, PointTerm) else 1) * present.sum(1)
         seen[:, term.first_slot : term.first_slot + present.shape[1]] |= present
     ends = [np.stack([source, target], 1)]
+    # A landmark of unknown depth uses up one equation for itself.
     equations = [rows - (seen & ~known[source]).sum(1)]
     for pair in problem.node_terms:
         if isinstance(pair, PairTerm):
@@ -160,13 +163,14 @@ def _rank(pair: PairTerm) -> np.ndarray:
     root = getattr(pair, "root", None)
     if root is None:
         return np.ones(len(np.asarray(pair.weight)))
+    # Columns of unit length, for the same reason as in `_PriorKnowledge.of`.
     scaled = np.asarray(root) / np.maximum(np.linalg.norm(root, axis=1, keepdims=True), 1e-30)
     return np.asarray(np.linalg.matrix_rank(scaled, tol=NULL**0.5))
 
 
 @dataclass(frozen=True, eq=False)
 class _PriorKnowledge:
-    """What a marginal prior constrains. tied: bool [n, n], relative poses. placed: bool [n], absolute poses."""
+    """Constraints of a marginal prior. tied: bool [n, n], relative poses. placed: bool [n], absolute poses."""
 
     tied: np.ndarray
     placed: np.ndarray
@@ -178,6 +182,7 @@ class _PriorKnowledge:
         prior = next((term for term in problem.dense_terms if isinstance(term, MarginalPrior)), None)
         if prior is None or not np.any(np.asarray(prior.root)):
             return nothing
+        # The intrinsics do not connect poses.
         root = np.asarray(prior.root, np.float64)[:, : lie.TANGENT * keyframes]
         information = root.T @ root
         fixed = np.asarray(problem.fixed_pose)[:keyframes]
@@ -185,6 +190,7 @@ class _PriorKnowledge:
         spoken = scale.reshape(keyframes, -1).max(1) > 0
         about = (scale > 0) & np.repeat(~fixed, lie.TANGENT)
         safe = np.where(scale > 0, scale, 1.0)
+        # Balanced by the diagonal: metres and radians would otherwise decide what counts as zero.
         values, vectors = np.linalg.eigh((information / np.outer(safe, safe))[np.ix_(about, about)])
         null = np.zeros((len(scale), np.count_nonzero(values < NULL * values.max(initial=1e-300))))
         null[about] = vectors[:, : null.shape[1]] / safe[about, None]

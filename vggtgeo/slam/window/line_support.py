@@ -22,6 +22,7 @@ def supported(
     pixels = rigid.project(points, pose, intrinsics)
     along = endpoints[:, 1] - endpoints[:, 0]
     length = np.linalg.norm(along, axis=1)
+    # Degenerate segments have a length of zero.
     direction = along / np.maximum(length, 1e-9)[:, None]
     offset = pixels - endpoints[:, 0]
     place = (offset * direction).sum(1)

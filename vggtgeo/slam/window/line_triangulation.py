@@ -25,7 +25,7 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 PIXELS = 1.0
 """Standard deviation of the distance of an endpoint from its line in another view, pixels."""
-LARGEST_SIGMA = 0.05
+MAX_SIGMA = 0.05
 """Largest relative standard deviation of a depth that counts as known."""
 MIN_VIEWS = 2
 CHANCE = 0.99
@@ -64,9 +64,11 @@ def _triangulated(
         views[edge.line_slots] += weight > 0
     mean = first / np.maximum(total, 1e-18)
     sigma = 1.0 / np.sqrt(np.maximum(total, 1e-18))
+    # Weighted sum of squared residuals about the mean: chi-square with `views - 1` degrees of freedom.
     spread = second - total * mean**2
     agree = spread < chi_square.ppf(CHANCE, np.maximum(views - 1, 1))
-    known = (views >= MIN_VIEWS) & agree & (mean > 1e-3) & (sigma < LARGEST_SIGMA * mean)
+    known = (views >= MIN_VIEWS) & agree & (mean > 1e-3) & (sigma < MAX_SIGMA * mean)
+    # One end alone does not give a line in space.
     both = known.all(1, keepdims=True)
     return np.where(both, mean, np.nan), np.where(both, sigma, np.nan)
 
@@ -80,6 +82,7 @@ def _intersected(
     lines = line_coefficients(target.lines.segments.endpoints[edge.line_targets])
     normal = lines @ pinhole.matrix(intrinsics)
     lever = normal @ relative[:3, 3]
+    # A ray parallel to the plane: an infinite lever gives inverse depth 0, and its weight is zero.
     safe = np.where(np.abs(lever) > 1e-9, lever, np.inf)[:, None]
     value = -(turned * normal[:, None]).sum(2) / safe
     z = turned[..., 2] + value * relative[2, 3]
@@ -93,6 +96,7 @@ def _with_depths(keyframe: Keyframe, new: np.ndarray, inverse: np.ndarray, sigma
     ends, samples, segment = keyframe.lines.segments.endpoints, keyframe.samples, keyframe.sample_segment
     along = ends[:, 1] - ends[:, 0]
     fraction = ((samples.pixels - ends[segment, 0]) * along[segment]).sum(1) / (along**2).sum(1)[segment]
+    # Inverse depth is affine in the pixel along the image of a straight line.
     on_line = inverse[segment, 0] + fraction * (inverse[segment, 1] - inverse[segment, 0])
     here = new[segment]
     own = replace(

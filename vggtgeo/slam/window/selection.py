@@ -46,10 +46,12 @@ class Selection:
         """Select at most `point_slots` key points of each keyframe."""
         counts = [np.zeros(len(keyframe.features)) for keyframe in keyframes]
         for edge in edges:
+            # Number of observations first; confidence decides between equal numbers (fewer than ten views).
             counts[local[edge.host]][edge.slots] += 1 + 0.1 * edge.confidence
         chosen = []
         for count in counts:
             order = np.argsort(-count, kind="stable")[: settings.window.point_slots]
+            # A slot without a match has only its prior, which is its optimum.
             chosen.append(np.sort(order[count[order] > 0]))
         return cls.of(chosen, [len(c) for c in counts])
 
@@ -69,6 +71,7 @@ class Selection:
                 taken = spread_samples(keyframe.sample_segment, SEGMENT_SAMPLES)
             length = np.bincount(keyframe.sample_segment[taken], minlength=len(count))
             if settings.line.two_ends_lines:
+                # With two unknowns a segment, every segment takes the same room in the padded arrays.
                 length = np.full_like(length, SEGMENT_SAMPLES)
             order = np.argsort(-count, kind="stable")
             order = order[count[order] > 0]

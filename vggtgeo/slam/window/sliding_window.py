@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
-from vggtgeo.bundle.marginalisation import marginalise_jit, no_prior
+from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
@@ -18,7 +18,6 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.models.classical import can_search
 from vggtgeo.slam.precision import in_double_precision
@@ -31,8 +30,7 @@ from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.window.gauge import Gauge, gauge_notes, with_one_gauge
 from vggtgeo.slam.window.line_triangulation import with_segment_depths
-from vggtgeo.slam.window.window import Window
-from vggtgeo.slam.window.window_prior import WindowPrior
+from vggtgeo.slam.window.window import Window, WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 
@@ -79,12 +77,12 @@ def _compile_marginalisation(problem: Problem, initial: State) -> None:
 
 @in_double_precision
 def _smallest_window(settings: SlamSettings, metric: bool) -> tuple[Problem, State]:
-    terms = (no_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric), metric=metric))
+    terms = (empty_prior(settings.window.size), *factor_terms((), {}, factor_room(settings, metric), metric=metric))
     return smallest_problem(window_size(settings), settings, terms)
 
 
 def smallest_problem(
-    size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm], camera: type[AbstractCamera] = Pinhole
+    size: PaddedSize, settings: SlamSettings, terms: Sequence[AbstractTerm], shared_focal: bool = False
 ) -> tuple[Problem, State]:
     """Return a problem of the given shape with one observation, and its initial state, for compilation."""
     one = Observations(
@@ -98,9 +96,11 @@ def smallest_problem(
         segment=np.full(1, -1) if settings.line.two_ends_lines else None,
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
-    intrinsics = np.array([100.0, 100.0, 50.0, 50.0])[-len(camera.names) :]
-    kernel = settings.window.kernel
-    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=size, camera=camera, kernel=kernel, terms=terms)
+    intrinsics = np.array([100.0, 100.0, 50.0, 50.0])[int(shared_focal) :]
+    kernel, depth = settings.window.kernel, np.ones(1)
+    problem, initial, _ = pack(
+        one, poses, intrinsics, depth, size=size, shared_focal=shared_focal, kernel=kernel, terms=terms
+    )
     return problem, initial
 
 
@@ -130,9 +130,11 @@ def make_room(window: Window, settings: SlamSettings, needed: int | None = None)
         return window
     leaving = next(number for number in window.members if number != needed)
     staying = tuple(number for number in window.members if number != leaving)
+    # Nothing was solved with it, so nothing can be kept of it.
     if window.solved is None or leaving not in window.solved[0].keyframes:
         return replace(window, members=staying)
     adjustment, state = window.solved
+    # The problem as it was solved: its linearisation point and its factors belong together.
     prior = marginalise_jit(adjustment.problem, state, jnp.asarray(adjustment.keyframes.index(leaving)))
     return replace(window, members=staying, prior=WindowPrior(adjustment.keyframes, prior))
 
@@ -155,6 +157,7 @@ def enter(
     matched = map_in_threads(match, window.members, alone=not can_search(keyframe.features))
     pairs = tuple(pair for pair in matched if pair is not None)
     inside = (*window.members, keyframe.number)
+    # Members are read at every adjustment; decoding them each time would cost more than the memory is worth.
     kept = tuple(k.expanded() if k.number in inside else k.compressed() for k in known.keyframes)
     known = replace(known, keyframes=(*kept, keyframe), pairs=(*known.pairs, *pairs))
     return known, replace(window, members=inside)
@@ -169,6 +172,7 @@ def adjust(
     adjustment, gauge = window_problem(known, window, intrinsics, camera, settings)
     notes = gauge_notes(gauge, adjustment.keyframes, "window")
     solution = solve_jit(adjustment.problem, adjustment.initial, window_solver(settings))
+    # The keyframes before the solve are still valid: go on with them, and report.
     if not np.isfinite(float(solution.energy)):
         failure = f"window at keyframe {members[-1].number}: {solution.message}"
         return AdjustedWindow(known, window, intrinsics, (*notes, failure))
@@ -204,7 +208,7 @@ def window_problem(
     """Return the problem of the current window with fixed gauge."""
     numbers, size = window.members, settings.window.size
     places = {number: row for row, number in enumerate(numbers)}
-    prior = no_prior(size) if window.prior is None else window.prior.aligned(numbers, size)
+    prior = empty_prior(size) if window.prior is None else window.prior.aligned(numbers, size)
     adjustment = build(
         [known.keyframes[number] for number in numbers],
         window_edges(known, numbers),
@@ -224,6 +228,7 @@ def _held(window: Window, roots: tuple[int, ...]) -> np.ndarray:
     the roots of submaps.
     """
     hung = np.isin(window.members, window.held)
+    # When the camera has returned to old keyframes, the old part must not move: the roots would be a second gauge.
     return hung if hung.any() else np.isin(window.members, roots)
 
 
@@ -236,6 +241,7 @@ def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
 
 def window_edges(known: Map, members: Iterable[int]) -> list[Directed]:
     """Return both directions of each pair inside the window."""
+    # Matches with keyframes that have left are part of the prior, or were dropped with them.
     inside = set(members)
     pairs = [pair for pair in known.pairs if pair.first in inside and pair.second in inside]
     by_number = {number: known.keyframes[number] for number in inside}

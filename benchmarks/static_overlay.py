@@ -1,7 +1,7 @@
 """Bars, text and a board, painted over clips: what they cost, and what is left of that where they are found.
 
     D=../shared/data
-    .venv/bin/python benchmarks/still_parts.py $D/building-walk $D/corridor-office $D/redkitchen $D/icl-office
+    .venv/bin/python benchmarks/static_overlay.py $D/building-walk $D/corridor-office $D/redkitchen $D/icl-office
 
 The first 40 frames of each clip, with depth and without, as they are and painted over; `camera.static_overlay`
 off and on.
@@ -28,9 +28,9 @@ def cells(sequence: SequenceView) -> Iterator[str]:
     yield from _run(sequence, True)
 
 
-def _run(sequence: SequenceView, still_parts: bool) -> list[str]:
+def _run(sequence: SequenceView, static_overlay: bool) -> list[str]:
     """ATE in cm, the verdict, and the share of the picture that is left out."""
-    settings = vg.SlamSettings(camera=vg.settings.CameraSettings(static_overlay=still_parts))
+    settings = vg.SlamSettings(camera=vg.settings.CameraSettings(static_overlay=static_overlay))
     result, error = judged(sequence, settings)
     return [f"{100 * error:.1f}", result.verdict.level, f"{100 * result.summary.get('static_overlay', 0.0):.0f} %"]
 

@@ -1,4 +1,4 @@
-"""What stays in its place in the picture while the rest moves is found before the first frame, and left out."""
+"""What stays in its place in the image while the rest moves is found before the first frame, and left out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vggtgeo.results.reconstruction import StaticOverlaySearch
 from vggtgeo.results.source import open_source
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.perception.still_parts import StillParts, find_still_parts
+from vggtgeo.slam.perception.static_overlay import StaticOverlay, find_static_overlay
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.verdict.input import check_still_parts
@@ -41,33 +41,33 @@ def moving(count: int = 12, step: tuple[int, int] = (17, 11), noise: float = 4.0
     return found
 
 
-def bars(picture: np.ndarray) -> None:
-    picture[:20] = picture[-20:] = 0
+def bars(image: np.ndarray) -> None:
+    image[:20] = image[-20:] = 0
 
 
-def text(picture: np.ndarray) -> None:
-    cv2.putText(picture, "REC 12:03", (20, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255, 255, 255), 2)
+def text(image: np.ndarray) -> None:
+    cv2.putText(image, "REC 12:03", (20, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255, 255, 255), 2)
 
 
-def display(picture: np.ndarray) -> None:
+def display(image: np.ndarray) -> None:
     """As bright as what passes behind it: its edges are those of something brighter now, of something darker then."""
-    cv2.putText(picture, "ALT 1.2", (20, 200), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (60, 190, 60), 3)
+    cv2.putText(image, "ALT 1.2", (20, 200), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (60, 190, 60), 3)
 
 
-def specks(picture: np.ndarray) -> None:
+def specks(image: np.ndarray) -> None:
     for x, y in ((60, 60), (220, 90), (150, 180)):
-        cv2.circle(picture, (x, y), 6, (10, 10, 10), -1)
+        cv2.circle(image, (x, y), 6, (10, 10, 10), -1)
 
 
-def board(picture: np.ndarray) -> None:
-    picture[190:] = cv2.resize(np.random.default_rng(5).integers(0, 255, (8, 40, 3)).astype(np.uint8), (WIDTH, 50))
+def board(image: np.ndarray) -> None:
+    image[190:] = cv2.resize(np.random.default_rng(5).integers(0, 255, (8, 40, 3)).astype(np.uint8), (WIDTH, 50))
 
 
-def painted(pictures: list[np.ndarray], paint: Callable[[np.ndarray], None]) -> tuple[list[np.ndarray], np.ndarray]:
-    """The pictures with something that moves with the camera, and where it has edges or is a bar, bool [H, W]."""
-    found, plain = [picture.copy() for picture in pictures], np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
-    for picture in found:
-        paint(picture)
+def painted(images: list[np.ndarray], paint: Callable[[np.ndarray], None]) -> tuple[list[np.ndarray], np.ndarray]:
+    """The images with something that moves with the camera, and where it has edges or is a bar, bool [H, W]."""
+    found, plain = [image.copy() for image in images], np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    for image in found:
+        paint(image)
     paint(plain)
     edge = cv2.morphologyEx(plain[..., 0], cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 40
     return found, edge | (plain[..., 0] == 0)
@@ -76,8 +76,8 @@ def painted(pictures: list[np.ndarray], paint: Callable[[np.ndarray], None]) -> 
 @pytest.mark.parametrize("paint", [bars, text, display, specks, board])
 def test_what_the_camera_carries_is_found(paint: Callable[[np.ndarray], None]) -> None:
     """Its edges, nearly all of them, and little of the rest. Oracle: where it was painted."""
-    pictures, edges = painted(moving(), paint)
-    found = find_still_parts(pictures)
+    images, edges = painted(moving(), paint)
+    found = find_static_overlay(images)
     assert found is not None
     assert found.sure
     mask = found.mask
@@ -87,7 +87,7 @@ def test_what_the_camera_carries_is_found(paint: Callable[[np.ndarray], None]) -
 
 
 @pytest.mark.parametrize(
-    "pictures",
+    "images",
     [
         moving(),
         moving(step=(0, 0)),
@@ -97,37 +97,37 @@ def test_what_the_camera_carries_is_found(paint: Callable[[np.ndarray], None]) -
     ],
     ids=["nothing there", "camera stands", "camera stands, with text", "too few", "none"],
 )
-def test_where_nothing_is_sure_nothing_is_left_out(pictures: list[np.ndarray]) -> None:
+def test_where_nothing_is_sure_nothing_is_left_out(images: list[np.ndarray]) -> None:
     """Of a camera that stands nobody can say what belongs to it. Oracle: None."""
-    assert find_still_parts(pictures) is None
+    assert find_static_overlay(images) is None
 
 
 @pytest.mark.parametrize(("width", "step", "count"), [(140, 15, 12), (80, 20, 12), (200, 8, 16), (120, 25, 14)])
 def test_a_walker_before_a_camera_that_stands_is_not_the_world(width: int, step: int, count: int) -> None:
-    """A patterned figure crosses the picture; the room behind it stays where it is, and is the world."""
+    """A patterned figure crosses the image; the room behind it stays where it is, and is the world."""
     room, figure = moving(count, (0, 0)), moving(1)[0][:200, :width]
-    for row, picture in enumerate(room):
+    for row, image in enumerate(room):
         left = step * row % (WIDTH - width)
-        picture[20:220, left : left + width] = figure
-    assert find_still_parts(room) is None
+        image[20:220, left : left + width] = figure
+    assert find_static_overlay(room) is None
 
 
 def rare_edges() -> list[np.ndarray]:
     """A camera that moves; at the right border a white wall, over which a strong edge passes twice."""
-    pictures = moving(20)
-    for row, picture in enumerate(pictures):
-        picture[:, WIDTH - 40 - 9 * (row % 4) :] = 250
+    images = moving(20)
+    for row, image in enumerate(images):
+        image[:, WIDTH - 40 - 9 * (row % 4) :] = 250
         if row % 9 == 4:
-            picture[20:220, -30:-12] = 5
-    return pictures
+            image[20:220, -30:-12] = 5
+    return images
 
 
 def board_from(row: int) -> list[np.ndarray]:
-    """A board that covers all below a row of the picture."""
-    pictures, pattern = moving(), moving(1)[0]
-    for picture in pictures:
-        picture[row:] = pattern[row:]
-    return pictures
+    """A board that covers all below a row of the image."""
+    images, pattern = moving(), moving(1)[0]
+    for image in images:
+        image[row:] = pattern[row:]
+    return images
 
 
 @pytest.mark.parametrize(("row", "separable"), [(90, True), (30, False)])
@@ -135,7 +135,7 @@ def test_what_covers_most_of_the_picture_is_told(row: int, separable: bool) -> N
     """Of more than a third nobody is sure; where nothing else is left, it is not left out. Oracle: the board, and what
     the verdict says.
     """
-    found = find_still_parts(board_from(row))
+    found = find_static_overlay(board_from(row))
     assert found is not None
     assert not found.sure
     assert found.separable == separable
@@ -148,14 +148,14 @@ def test_what_covers_most_of_the_picture_is_told(row: int, separable: bool) -> N
 @pytest.mark.parametrize(("count", "every"), [(11, 1), (30, 1), (50, 1), (50, 13), (600, 1)])
 def test_of_a_stream_it_is_told(count: int, every: int) -> None:
     """Frames that come once cannot be looked at before the first is tracked; at the end the verdict knows. Oracle: text
-    that was painted into every picture, or into one in thirteen, which nobody can take for a part of the camera.
+    that was painted into every image, or into one in thirteen, which nobody can take for a part of the camera.
     """
-    search, pictures, slam = StaticOverlaySearch(), moving(19, (25, 20)), begin(CAMERA, vg.Roles())
+    search, images, slam = StaticOverlaySearch(), moving(19, (25, 20)), begin(CAMERA, vg.Roles())
     for row in range(count):
-        picture = pictures[row % 19].copy()
+        image = images[row % 19].copy()
         if row % every == 0:
-            text(picture)
-        search.on_frame(slam, vg.data.Frame(row, row / 30, picture, None, str(row)))
+            text(image)
+        search.on_frame(slam, vg.data.Frame(row, row / 30, image, None, str(row)))
     assert len(search._images) <= 40
     found = [finding.text for finding in search.findings()]
     assert search.found is None
@@ -167,14 +167,14 @@ def walker_in_a_bare_room() -> list[np.ndarray]:
     """A broad walker before a band of texture, which comes back behind him; above it a frieze that stays."""
     room = [np.full((HEIGHT, WIDTH, 3), 128, np.uint8) for _ in range(16)]
     texture, figure = moving(1)[0], moving(2)[1]
-    for row, picture in enumerate(room):
-        picture[:40], picture[100:] = texture[:40], texture[100:]
-        picture[100:, 5 * row : 5 * row + 240] = figure[100:, :240]
+    for row, image in enumerate(room):
+        image[:40], image[100:] = texture[:40], texture[100:]
+        image[100:, 5 * row : 5 * row + 240] = figure[100:, :240]
     return room
 
 
 def poster_before_a_slow_camera() -> list[np.ndarray]:
-    """Small soft squares everywhere, which move by a third of a pixel a picture; a dense poster crosses quickly."""
+    """Small soft squares everywhere, which move by a third of a pixel a image; a dense poster crosses quickly."""
     squares = np.full((HEIGHT + 20, WIDTH + 20), 128, np.float32)
     for y in range(8, HEIGHT + 10, 24):
         for x in range(8, WIDTH + 10, 24):
@@ -183,30 +183,30 @@ def poster_before_a_slow_camera() -> list[np.ndarray]:
     poster, found = moving(1)[0][:80, :150], []
     for row in range(20):
         shift = np.array([[1.0, 0, -0.3 * row], [0, 1.0, -0.24 * row]])
-        picture = np.dstack([cv2.warpAffine(squares, shift, (WIDTH, HEIGHT))] * 3).astype(np.uint8)
+        image = np.dstack([cv2.warpAffine(squares, shift, (WIDTH, HEIGHT))] * 3).astype(np.uint8)
         left = 37 * row % (WIDTH - 150)
-        picture[100:180, left : left + 150] = poster
-        found.append(picture)
+        image[100:180, left : left + 150] = poster
+        found.append(image)
     return found
 
 
 @pytest.mark.parametrize(
     ("make", "rule", "off"),
     [
-        (rare_edges, "LEAST_SEEN", 0.0),
-        (walker_in_a_bare_room, "LEAST_CHANGED", 0.0),
-        (poster_before_a_slow_camera, "MOST_STANDING", 1.0),
+        (rare_edges, "MIN_SEEN", 0.0),
+        (walker_in_a_bare_room, "MIN_CHANGED", 0.0),
+        (poster_before_a_slow_camera, "MAX_STATIC_CELLS", 1.0),
     ],
 )
 def test_each_rule_is_needed(
     make: Callable[[], list[np.ndarray]], rule: str, off: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One rule alone refuses each of these: how often a pixel has its edge, how much else changes, and in how much of
-    the picture. Oracle: with that rule switched off there is a mask.
+    the image. Oracle: with that rule switched off there is a mask.
     """
-    assert find_still_parts(make()) is None
-    monkeypatch.setattr(f"vggtgeo.slam.perception.still_parts.{rule}", off)
-    assert find_still_parts(make()) is not None
+    assert find_static_overlay(make()) is None
+    monkeypatch.setattr(f"vggtgeo.slam.perception.static_overlay.{rule}", off)
+    assert find_static_overlay(make()) is not None
 
 
 @pytest.mark.parametrize("matcher", [SiftMatcher(), OrbMatcher()])
@@ -214,11 +214,11 @@ def test_nothing_is_looked_for_there(matcher: SiftMatcher | OrbMatcher) -> None:
     """No key point, segment, depth or corner of the verdict's witness lies there; all others stay. Oracle: the same
     without a mask.
     """
-    picture = moving()[0]
+    image = moving()[0]
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[60:120, 100:220] = True
-    parts = StillParts(mask)
-    before = matcher.describe(picture)
+    parts = StaticOverlay(mask)
+    before = matcher.describe(image)
     after = parts.without_points(before)
     inside = mask[tuple(np.rint(before.pixels).astype(int).T[::-1])]
     assert 0 < inside.sum() < len(before)
@@ -242,7 +242,7 @@ def test_the_mask_is_undistorted_with_the_images() -> None:
     lens = vg.Camera(CAMERA.intrinsics, WIDTH, HEIGHT, (-0.3, 0.05, 0.0, 0.0))
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[20:31, 20:31] = True
-    row, column = np.argwhere(StillParts(mask).undistorted(lens).mask).mean(axis=0)
+    row, column = np.argwhere(StaticOverlay(mask).undistorted(lens).mask).mean(axis=0)
     expected = cv2.undistortPoints(np.array([[[25.0, 25.0]]]), lens.matrix, np.array(lens.distortion), P=lens.matrix)
     np.testing.assert_allclose([column, row], expected[0, 0], atol=0.7)
 
@@ -252,7 +252,7 @@ def test_a_lens_that_was_found_undistorts_the_mask(monkeypatch: pytest.MonkeyPat
     Oracle: the mask that the lens itself undistorts.
     """
     lens = vg.Camera(CAMERA.intrinsics, WIDTH, HEIGHT, (-0.3, 0.05, 0.0, 0.0))
-    parts = StillParts(np.tile(np.arange(HEIGHT)[:, None] < 30, (1, WIDTH)))
+    parts = StaticOverlay(np.tile(np.arange(HEIGHT)[:, None] < 30, (1, WIDTH)))
     settings, given = vg.SlamSettings(), {}
     known = begin(CAMERA, vg.Roles())
     known = replace(known, camera=replace(known.camera, lens=lens))
@@ -271,9 +271,9 @@ def test_which_frames_are_looked_at(tmp_path: Path) -> None:
         tiny.write_image(folder / f"{row}.png", np.full((48, 64, 3), 10 * row, np.uint8))
     (folder / "calibration.txt").write_text("55 55 31.5 23.5\n")
     seen = open_source(folder, None, vg.SlamSettings()).sample_images(1, 10, 2, 3, 12)
-    assert [int(picture[0, 0, 0]) for picture in seen] == [10, 30, 50]
+    assert [int(image[0, 0, 0]) for image in seen] == [10, 30, 50]
     seen = open_source(folder, None, vg.SlamSettings()).sample_images(0, None, 1, 3, 2)
-    assert [int(picture[0, 0, 0]) for picture in seen] == [0, 20, 40]
+    assert [int(image[0, 0, 0]) for image in seen] == [0, 20, 40]
     assert open_source(folder, None, vg.SlamSettings()).repeatable((0, None, 1))
     assert not open_source(vg.simulate("room", 9, size=(64, 48)), None, vg.SlamSettings()).repeatable((0, 9, 1))
     assert not open_source(iter(moving(9)), CAMERA, vg.SlamSettings()).repeatable((0, 9, 1))
@@ -281,15 +281,15 @@ def test_which_frames_are_looked_at(tmp_path: Path) -> None:
 
 @pytest.mark.long  # two runs of 24 frames
 def test_a_run_with_text_in_the_picture_is_as_good_as_one_without(tmp_path: Path) -> None:
-    """A simulated room with three lines of text in every picture: what is told, and the path. Oracle: the truth; where
+    """A simulated room with three lines of text in every image: what is told, and the path. Oracle: the truth; where
     nothing is left out, the path is drawn to the text, and the verdict says so.
     """
     for frame in write_tum_folder(vg.simulate("room", 24, size=(WIDTH, HEIGHT)), tmp_path / "room"):
         file = tmp_path / "room" / "rgb" / f"{frame.timestamp:.6f}.png"
-        picture = cv2.imread(str(file))
+        image = cv2.imread(str(file))
         for row in (40, 120, 200):
-            cv2.putText(picture, "REC 12:03 CAM 3", (10, row), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255,) * 3, 2)
-        cv2.imwrite(str(file), picture)
+            cv2.putText(image, "REC 12:03 CAM 3", (10, row), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255,) * 3, 2)
+        cv2.imwrite(str(file), image)
     with pytest.warns(InputWarning, match="% of the image is a static overlay"):
         result = vg.reconstruct(tmp_path / "room", dense="none")
     assert 0.1 < result.summary["static_overlay"] < 0.35

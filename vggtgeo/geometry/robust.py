@@ -1,0 +1,20 @@
+"""Constants of robust estimation, and the inverse of an information matrix that may be singular."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+TUKEY = 4.685
+"""Cut of Tukey's biweight in standard deviations: 95 % efficient under Gaussian noise (Holland and Welsch 1977)."""
+MAD_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+POSE_GATE = float(chi2.ppf(0.9999, 6))
+"""Gate of a squared Mahalanobis distance between poses, 6 degrees of freedom: one right pose in 10,000 is rejected."""
+REGULARISER = 1e-9
+"""Information, 1/m^2 and 1/rad^2, that makes a singular matrix invertible: a standard deviation of 30 km."""
+
+
+def inverse_information(information: np.ndarray) -> np.ndarray:
+    """Return the covariances [..., 6, 6] of information matrices; very large in directions without information."""
+    return np.asarray(np.linalg.inv(information + REGULARISER * np.eye(6)))
