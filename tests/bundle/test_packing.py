@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from reported import raises
 from scenes import Scene, make_scene
+from vggtgeo.solvers.arrow import reduce
 from vggtgeo.solvers.kernels import Huber
 
 import vggtgeo as vg
+from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
@@ -83,7 +86,9 @@ def observed(problem: Problem) -> set[tuple[float, ...]]:
     }
 
 
-@pytest.mark.parametrize("size", [None, PaddedSize(4, 8, 6, 3), PaddedSize(3, 6, 3, 2)])
+@pytest.mark.parametrize(
+    "size", [None, PaddedSize(4, 8, 6, 3), PaddedSize(3, 6, 3, 2), PaddedSize(4, 8, 6, 3, edges=8)]
+)
 def test_every_observation_is_packed_once(size: PaddedSize | None) -> None:
     # Proves that packing keeps each match with its pixel, edge and weight. Oracle: the flat lists.
     seen = SCENE.observations
@@ -108,7 +113,7 @@ def test_the_order_of_the_lists_does_not_matter() -> None:
     assert np.all(np.diff(other.edges.source) >= 0)
 
 
-@pytest.mark.parametrize("size", [None, PaddedSize(5, 7, 4, 4)])
+@pytest.mark.parametrize("size", [None, PaddedSize(5, 7, 4, 4), PaddedSize(5, 7, 4, 4, edges=11)])
 def test_ranks_invert_the_graph(size: PaddedSize | None) -> None:
     # Proves that `of_host` finds each edge by host and rank. Oracle: the definition of both.
     edges = SCENE.pack(size=size)[0].edges
@@ -125,6 +130,19 @@ def test_padding_is_harmless_and_held() -> None:
     assert bool(jnp.all(state.inverse_depth > 0))
     assert bool(jnp.all(problem.depth.sigma > 0))
     np.testing.assert_array_equal(jnp.linalg.norm(state.poses.wxyz_xyz[:, :4], axis=1).round(12), 1.0)
+
+
+@pytest.mark.parametrize("edges", [6, 7, 12])
+def test_padding_edges_change_nothing(edges: int) -> None:
+    # Proves that stored edges beyond those of the problem leave its normal equations. Oracle: every row padded.
+    systems = []
+    for stored in (None, edges):
+        problem, state, _ = SCENE.pack(size=PaddedSize(4, 8, 6, 3, edges=stored))
+        assert len(problem.edges.source) == (stored or 12)
+        systems.append(reduce(linearise(prepared(problem), state)))
+    for name in ("hessian", "gradient", "schur", "schur_gradient"):
+        every, some = (np.asarray(getattr(system, name)) for system in systems)
+        np.testing.assert_allclose(some, every, rtol=1e-10, atol=1e-10 * np.abs(every).max(), err_msg=name)
 
 
 def test_dtype_goes_through_everything() -> None:
@@ -206,6 +224,8 @@ def test_a_size_that_is_too_small_is_refused(name: str) -> None:
     SCENE.pack(size=fits)
     with raises(f"`size.{name}`", getattr(fits, name) - 1, getattr(fits, name)):
         SCENE.pack(size=replace(fits, **{name: getattr(fits, name) - 1}))
+    with raises("`size.edges`", 7, 6):  # three keyframes have no place for more than two edges each
+        SCENE.pack(size=replace(fits, edges=7))
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import compile_global, expected_keyframes
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
-from vggtgeo.slam.global_map.global_shape import padded_count, shape_for
+from vggtgeo.slam.global_map.global_shape import padded_count, padded_edges, shape_for
 from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
@@ -179,7 +179,7 @@ def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
     )
     kept = lambda: solve_jit.prepared
     before = kept()
-    compile_global(shape_for(len(tracked.keyframes), settings), settings)
+    compile_global(shape_for(len(tracked.keyframes), 0, settings), settings)
     compiled = kept()
     assert compiled == before + 1
     finish(tracked, ROLES, settings)
@@ -193,6 +193,8 @@ def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
     assert expected_keyframes(6, 30, 100) == 20
     assert expected_keyframes(6, 31, 100) is None
     assert [expected_keyframes(count, 31, None) for count in (7, 8, 70)] == [None, 8, 70]
+    assert [padded_edges(edges, 64) for edges in (0, 512, 513, 768, 769, 1024)] == [512, 512, 768, 768, 1024, 1024]
+    assert padded_edges(10, 16) == 256
     assert [padded_count(count) for count in (1, 16, 17, 64, 65, 96, 97, 129)] == [16, 16, 64, 64, 96, 96, 128, 192]
 
 

@@ -288,7 +288,10 @@ def check_size(size: PaddedSize, needed: PaddedSize) -> None:
         raise InputError(f"`size.lines` must be a multiple of `size.samples`, {needed.samples}, got {size.lines}")
     for name in ("keyframes", "points", "lines", "degree", "rows", "edges"):
         have, need = getattr(size, name), getattr(needed, name)
-        # Stored edges are laid out without gaps, so their number must be exact.
-        exact = name == "edges" or (name == "rows" and size.edges is not None)
+        # Several rows of a keyframe have the same edges: then there is no room for padding ones.
+        exact = (name == "edges" and size.rows is not None) or (name == "rows" and size.edges is not None)
         if have is not None and (have < need or (exact and have != need)):
             raise InputError(f"`size.{name}` must be {'' if exact else 'at least '}{need} for this problem, got {have}")
+    if size.edges is not None and size.rows is None and size.edges > size.keyframes * size.degree:
+        most = size.keyframes * size.degree
+        raise InputError(f"`size.edges` must be at most {most}, `size.keyframes` times `size.degree`, got {size.edges}")

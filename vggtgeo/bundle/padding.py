@@ -39,7 +39,8 @@ class PaddedSize:
         points: Points in a row of landmarks (a keyframe has one row, unless `rows` is given).
         lines: Line samples in a row.
         degree: Largest number of edges of one host.
-        edges: Number of stored edges; None: every row is padded to `degree` edges.
+        edges: Number of stored edges, at least those of the problem; None: every row is padded to `degree` edges. With
+            several rows for a keyframe it is the exact number.
         samples: Samples of a segment, if observations have a `segment`; `lines` is a multiple of it.
         terms: Names of terms on poses, pairs and the camera, with the padded number of observations of each; other
             terms are not padded.
@@ -377,9 +378,12 @@ def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEd
     host = np.repeat(np.arange(size.keyframes), rows)
     rank = np.arange(len(edges)) - np.searchsorted(source, np.arange(size.keyframes))[source]
     degree = np.bincount(source, minlength=size.keyframes)
-    # A size without `edges`, or for another graph: all rows get the same number of edges.
-    if size.edges != np.sum(rows * degree):
+    if size.edges is None:
         degree = np.full(size.keyframes, size.degree)
+    elif size.rows is None:
+        # Padding edges fill the free places of the first rows: edges are sorted by row, and no two share a place.
+        free = size.degree - degree
+        degree = degree + np.clip(size.edges - len(edges) - (np.cumsum(free) - free), 0, free)
     of_row = degree[host]
     start = np.cumsum(of_row) - of_row
     row = np.repeat(np.arange(len(host)), of_row)

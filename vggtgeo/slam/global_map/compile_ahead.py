@@ -9,7 +9,13 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.global_map.global_adjustment import shares_focal
-from vggtgeo.slam.global_map.global_shape import MAX_DENSE, GlobalShape, global_solver, padded_count, shape_for
+from vggtgeo.slam.global_map.global_shape import (
+    MAX_DENSE,
+    MAX_NEIGHBOURS,
+    GlobalShape,
+    global_solver,
+    shape_for,
+)
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -32,7 +38,7 @@ class CompileAhead(Callback):
     def __init__(self, settings: SlamSettings) -> None:
         self._settings = settings
         self._total: int | None = None
-        self._asked: dict[int, Future[None]] = {}
+        self._asked: dict[GlobalShape, Future[None]] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="compile")
 
     def on_begin(self, name: str, total: int | None) -> None:
@@ -42,16 +48,21 @@ class CompileAhead(Callback):
         count = expected_keyframes(len(slam.keyframes), len(slam.frames), self._total)
         if count is None or not slam.metric or not self._settings.refinement.global_adjustment:
             return
-        padded = padded_count(count)
-        if padded <= MAX_DENSE and padded not in self._asked:
-            shape = shape_for(padded, self._settings)
-            self._asked[padded] = self._pool.submit(compile_global, shape, self._settings, shares_focal(slam))
+        shape = self._shape(slam, count)
+        if shape.size.keyframes <= MAX_DENSE and shape not in self._asked:
+            self._asked[shape] = self._pool.submit(compile_global, shape, self._settings, shares_focal(slam))
 
     def on_adjust(self, slam: Slam) -> None:
         """Wait for the program that is needed now."""
-        future = self._asked.get(padded_count(len(slam.keyframes)))
+        future = self._asked.get(self._shape(slam, len(slam.keyframes))) if slam.keyframes else None
         if future is not None:
             wait([future])
+
+    def _shape(self, slam: Slam, keyframes: int) -> GlobalShape:
+        """Return the shape of a map with so many keyframes and as many edges for each as now."""
+        ends = np.array([pair.key for pair in slam.map.pairs], int).reshape(-1, 2)
+        edges = np.minimum(np.bincount(ends.ravel(), minlength=1), MAX_NEIGHBOURS).sum()
+        return shape_for(keyframes, round(edges * keyframes / len(slam.keyframes)), self._settings)
 
 
 def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | None:

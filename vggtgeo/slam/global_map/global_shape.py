@@ -27,6 +27,8 @@ TIES, PAIRS = 2, 12
 """Room for tracked motions and pairs for each keyframe; an office sequence of 64 keyframes has 533 pairs."""
 MAX_NEIGHBOURS = 16
 """Largest number of edges of one keyframe: it determines the padded size, and so time and memory of the adjustment."""
+EDGE_SHARES = (0.5, 0.75, 1.0)
+"""Stored edges as a share of the largest number: time is in proportion to them, and each is a program of its own."""
 MAX_DENSE = 128
 """Keyframes up to which the reduced system is factorised as a dense matrix: at 64 as fast as conjugate gradients, with
 16 s to compile instead of 24 s."""
@@ -46,10 +48,11 @@ class GlobalShape:
         return dict(self.factors)
 
 
-def shape_for(keyframes: int, settings: SlamSettings) -> GlobalShape:
-    """Return the shape of a map of so many keyframes with odometry factors and metric depth."""
+def shape_for(keyframes: int, edges: int, settings: SlamSettings) -> GlobalShape:
+    """Return the shape of a map of so many keyframes and edges, with odometry factors and metric depth."""
     padded = padded_count(keyframes)
-    size = replace(window_size(settings), keyframes=padded, degree=MAX_NEIGHBOURS)
+    stored = padded_edges(edges, padded)
+    size = replace(window_size(settings), keyframes=padded, degree=MAX_NEIGHBOURS, edges=stored)
     return GlobalShape(size, ((MeasuredRelativePose, TIES * padded),), PAIRS * padded)
 
 
@@ -60,8 +63,9 @@ def shape_of(
 
     edges_of_host: number of edges of each keyframe, at most `MAX_NEIGHBOURS`.
     """
-    usual, counts = shape_for(keyframes, settings), Counter(type(factor) for factor in factors)
-    size, edges = usual.size, sum(edges_of_host)
+    edges, counts = sum(edges_of_host), Counter(type(factor) for factor in factors)
+    usual = shape_for(keyframes, edges, settings)
+    size = usual.size
     if keyframes > SMALL[-1] and size.keyframes * size.degree > MAX_PADDING * edges:
         size = replace(size, keyframes=keyframes, degree=max(edges_of_host), edges=edges)
     room = {kind: max(padded_count(count), usual.room.get(kind, 0)) for kind, count in counts.items()}
@@ -78,6 +82,14 @@ def padded_count(count: int) -> int:
         power *= 2
     # Powers of two and their three quarters: at most a third of the rows is padding.
     return 3 * power // 4 if 3 * power // 4 >= count else power
+
+
+def padded_edges(edges: int, keyframes: int) -> int:
+    """Return the number of stored edges for so many, at most `MAX_NEIGHBOURS` for each of the padded keyframes."""
+    most = MAX_NEIGHBOURS * keyframes
+    if keyframes <= SMALL[0]:
+        return most
+    return next(int(share * most) for share in EDGE_SHARES if edges <= share * most)
 
 
 def global_solver(problem: Problem, settings: SlamSettings) -> SchurLevenbergMarquardt:
