@@ -1,16 +1,15 @@
 """What the verdict cannot see: whether the true fault explains the witness better than the run does.
 
-    .venv/bin/python benchmarks/verdict_oracle.py [--out runs/verdict-bank] [--half set]
+    .venv/bin/python benchmarks/verdict_oracle.py RUN... [--out runs/verdict-bank]
 
-For each run of the bank that is wrong and called good, or right and doubted, a table has for the windows of the run:
+The runs are those that `verdict_bank.py judge --verbose` prints. For each, a table has for its windows:
 
+- run, corners: RMS distance of the run's places, and of those that the verdict's corners prefer, from the true ones
+  after alignment, in the worst window, cm (of its extent, %, without depth). The verdict compares the difference of
+  both with 5 cm (without depth with 6 % of the extent).
 - gain of the fault: minus twice the log likelihood ratio of an adjustment with the true parameters of the planted
   fault, poses free, against one without any fault, with as many observations as count as one. Nothing is estimated
   for it. Below 28 it is chance at the verdict's level, 10^-6: nothing in the witness shows the fault.
-- gain over the truth: the same of the preferred motion against the true poses. Beyond 28 the corners contradict the
-  truth itself: they are followed wrongly, or are of another thing.
-- error: of the run's places, RMS after alignment, in the whole run and in the worst window. The verdict compares the
-  latter with 5 cm (without depth with 6 % of the extent).
 """
 
 from __future__ import annotations
@@ -22,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from verdict_bank import HALVES, Judged, judged, read
+from verdict_bank import read
 
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.verdict.adjustment import (
@@ -41,7 +41,7 @@ from vggtgeo.slam.verdict.adjustment import (
     start_of,
 )
 from vggtgeo.slam.verdict.alternatives import START, explain
-from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.claim import Claim, extent
 from vggtgeo.slam.verdict.judge import aligned, tracks_of_windows
 from vggtgeo.slam.verdict.noise import scores, with_own_noise
 
@@ -88,11 +88,11 @@ def truth_of(case: dict[str, Any], tracks: Tracks, numbers: np.ndarray) -> Truth
 
 @dataclass(frozen=True)
 class Window:
-    """Of one window: gain of the fault, gain over the truth, and the true error inside, in the unit of the map."""
+    """Of one window: true errors of the run and of the preferred motion, and gain of the fault."""
 
-    fault: float
-    over_truth: float
-    error: float
+    run: float
+    corners: float
+    gain: float
 
 
 def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray) -> Window:
@@ -100,18 +100,12 @@ def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray)
     best = explain(tracks).best
     start = replace(START, pixel=START.pixel * max(tracks.size) / 320.0)
     free = with_own_noise(solve(tracks, start_of(tracks), start))
-    as_one = scores(free).as_one
-    metric = tracks.with_depth
-    there, here = rigid.centres(tracks.poses), true[:, :3, 3]
-    fitted = umeyama(here, there, not metric)
-    places = fitted.scale * here @ fitted.rotation.T + fitted.translation
-    error = float(np.sqrt(np.mean(np.sum((places - there) ** 2, 1))))
-    poses = rigid.invert(true)
-    poses[:, :3, :3] = poses[:, :3, :3] @ fitted.rotation.T
-    poses[:, :3, 3] = -np.einsum("fij,fj->fi", poses[:, :3, :3], places)
-    exact = solve(best.tracks, _started(best.tracks, poses), best.noise, poses_free=False)
-    truth = truth_of(case, tracks, claim.frames[tracks.rows])
-    gain = 0.0
+    there, metric = rigid.centres(tracks.poses), tracks.with_depth
+    fitted = umeyama(true[:, :3, 3], there, not metric)
+    poses = rigid.invert(fitted.trajectory(Trajectory(tracks.times, true)).poses)
+    unit = 0.01 if metric else 0.01 * extent(tracks.poses)
+    errors = (_distance(found, poses, not metric) / unit for found in (tracks.poses, best.unknowns.poses))
+    truth, gain = truth_of(case, tracks, claim.frames[tracks.rows]), 0.0
     if truth is not None:
         shares, theta = truth
         own = {one.name: getattr(tracks, one.name) for one in fields(tracks)}
@@ -122,7 +116,12 @@ def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray)
         gain = plain.linear.energy - min(fit.linear.energy for fit in fits)
     elif case["degradation"] == "cut":
         gain = free.linear.energy - solve(tracks, _started(tracks, poses), free.noise).linear.energy
-    return Window(gain / as_one, (exact.linear.energy - best.linear.energy) / scores(best).as_one, error)
+    return Window(*errors, gain / scores(free).as_one)
+
+
+def _distance(poses: np.ndarray, true: np.ndarray, with_scale: bool) -> float:
+    places, there = rigid.centres(poses), rigid.centres(true)
+    return float(np.sqrt(np.mean(np.sum((umeyama(places, there, with_scale).points(places) - there) ** 2, 1))))
 
 
 def _started(tracks: Tracks, poses: np.ndarray) -> Unknowns:
@@ -136,11 +135,10 @@ def _started(tracks: Tracks, poses: np.ndarray) -> Unknowns:
     return Unknowns(poses, np.column_stack([inside[:, :2] / z[:, None], -np.log(z)]), np.zeros(SIZE))
 
 
-def row(one: Judged, out: Path) -> str:
+def row(name: str, out: Path) -> str:
     """Of the table."""
-    folder = out / one.name
-    case, truth = json.loads((folder / "case.json").read_text()), np.load(folder / "truth.npz")
-    slam, evidence = (read(folder / f"{name}.pkl") for name in ("slam", "evidence"))
+    case, truth = json.loads((out / name / "case.json").read_text()), np.load(out / name / "truth.npz")
+    slam, evidence = (read(out / name / f"{part}.pkl") for part in ("slam", "evidence"))
     claim = Claim.of(slam)
     corners = aligned(slam, claim, evidence)
     found = []
@@ -149,23 +147,21 @@ def row(one: Judged, out: Path) -> str:
         true = truth["poses"][[row_of[int(frame)] for frame in claim.frames]]
         for tracks in tracks_of_windows(slam, claim, corners):
             found.append(window(case, tracks, claim, true[tracks.rows]))
-    cells = [f"{max(getattr(each, name) for each in found):.0f}" if found else "-" for name in ("fault", "over_truth")]
-    worst = f"{100 * max(each.error for each in found):.1f}" if found else "-"
-    return f"| {one.name} | {one.outcome}, {one.level} | {100 * case['ate']:.1f} | {worst} | {cells[0]} | {cells[1]} |"
+    cells = [f"{max(getattr(each, field) for each in found):.3g}" for field in ("run", "corners", "gain") if found]
+    return f"| {name} | {case['outcome']} | {100 * case['ate']:.1f} | {' | '.join(cells or ['-'] * 3)} |"
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", help="names of runs of the bank")
     parser.add_argument("--out", type=Path, default=Path("runs/verdict-bank"))
-    parser.add_argument("--half", choices=HALVES, help="this half alone")
     options = parser.parse_args()
-    print("| run | is, and is called | error, cm | in a window, cm | gain of the fault | gain over the truth |")
+    print("| run | outcome | ATE, cm | run | corners | gain of the fault |")
     print("|---|---|---|---|---|---|", flush=True)
-    for one in judged(options.out, half=options.half):
-        if (one.outcome, one.level) == ("wrong", "good") or (one.outcome == "good" and one.level != "good"):
-            with program_settings():
-                print(in_double_precision(row)(one, options.out), flush=True)
+    for name in options.runs:
+        with program_settings():
+            print(in_double_precision(row)(name, options.out), flush=True)
 
 
 if __name__ == "__main__":

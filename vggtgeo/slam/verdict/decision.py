@@ -3,7 +3,8 @@
 An explanation of a window (`alternatives.py`) is reported where
 
 - it is significant: two halves of the tracks, fitted apart, confirm its consequence by more than `SIGMAS` standard
-  deviations; an alternative beside free poses is added only at the level of `LEVEL`; and
+  deviations, those that the run itself states for its places included; an alternative beside free poses is added only
+  at the level of `LEVEL`; and
 - it has a consequence: places differ from those of the run by more than `PLACES` (without depth `SHARE` of the path's
   extent), or turns from frame to frame by more than `TURN`.
 
@@ -54,18 +55,23 @@ class Contradiction:
     size: float
 
 
-def contradiction(one: Explanation, metric: bool) -> Contradiction | None:
-    """What the explanation of a window contradicts; None where it is what the run claims."""
+def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contradiction | None:
+    """What the explanation of a window contradicts; None where it is what the run claims.
+
+    stated: standard deviation of the places that the run itself states, as a share of their extent.
+    """
     cause = None
     if one.rival > RIVAL * (one.rival + one.share):
         cause = "second motion"
     elif one.tracks.with_depth and one.best.noise.depth > DEPTH_NOISE:
         cause = "depth"
-    limits = np.array([PLACES if metric else SHARE * max(extent(one.tracks.poses), 1e-12), TURN])
+    around = max(extent(one.tracks.poses), 1e-12)
+    limits = np.array([PLACES if metric else SHARE * around, TURN])
     found, size = difference(one.best), 0.0
     if cause or found.places >= limits[0] or found.turn >= limits[1]:  # else small even with its noise
         found = confirmed(one.best)
-        values, sigmas = np.array([found.places, found.turn]), np.array([found.places_sigma, found.turn_sigma])
+        values = np.array([found.places, found.turn])
+        sigmas = np.array([np.hypot(found.places_sigma, stated * around), found.turn_sigma])
         size = float(np.max(values / limits, where=values > SIGMAS * sigmas, initial=0.0))
     if cause is None and size < 1.0 and not one.added:
         return None
@@ -73,9 +79,12 @@ def contradiction(one: Explanation, metric: bool) -> Contradiction | None:
     return Contradiction(one, found, cause or named, max(size, 1.0) if cause else size)
 
 
-def findings(claim: Claim, explanations: Sequence[Explanation]) -> list[Finding]:
-    """One finding a cause, the largest consequence first; then those that do not matter, of the level "good"."""
-    found = [what for one in explanations if (what := contradiction(one, claim.metric))]
+def findings(claim: Claim, explanations: Sequence[Explanation], stated: float = 0.0) -> list[Finding]:
+    """One finding a cause, the largest consequence first; then those that do not matter, of the level "good".
+
+    stated: as in `contradiction`.
+    """
+    found = [what for one in explanations if (what := contradiction(one, claim.metric, stated))]
     groups: dict[tuple[bool, str], list[Contradiction]] = {}
     for one in found:
         groups.setdefault((one.size >= 1.0, one.cause), []).append(one)

@@ -30,12 +30,12 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
 
     """
     claim = Claim.of(slam)
-    found = [*input_findings, *check_record(claim)]
-    found += check_extent(claim, frame_uncertainty(slam) if slam.keyframes else None)
+    known = stated_share(claim, frame_uncertainty(slam) if slam.keyframes else None)
+    found = [*input_findings, *check_record(claim), *check_extent(claim, known)]
     corners = aligned(slam, claim, evidence) if claim.started and len(claim) > 1 else None
     if corners is not None:
         found += [*check_unit(claim, corners), *check_frozen(claim, corners)]
-        found += findings(claim, [explain(tracks) for tracks in tracks_of_windows(slam, claim, corners)])
+        found += findings(claim, [explain(tracks) for tracks in tracks_of_windows(slam, claim, corners)], known)
     return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
 
 
@@ -50,12 +50,16 @@ def judge_or_report(slam: Slam, evidence: Evidence = (), input_findings: tuple[F
         return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
 
 
-def check_extent(claim: Claim, known: PoseUncertainty | None) -> list[Finding]:
-    """Whether a path without depth is longer than its stated error."""
-    if claim.metric or known is None or not np.isfinite(known.translation).any():
-        return []
-    share = float(np.nanmedian(known.translation)) / max(extent(claim.poses[claim.tracked]), 1e-12)
-    if share < MAX_UNKNOWN:
+def stated_share(claim: Claim, known: PoseUncertainty | None) -> float:
+    """Median standard deviation of the places, as the run states it, over their spread; 0 where it is unknown."""
+    if known is None or not np.isfinite(known.translation).any():
+        return 0.0
+    return float(np.nanmedian(known.translation)) / max(extent(claim.poses[claim.tracked]), 1e-12)
+
+
+def check_extent(claim: Claim, share: float) -> list[Finding]:
+    """Whether a path without depth is longer than its stated error. share: as `stated_share` returns it."""
+    if claim.metric or share < MAX_UNKNOWN:
         return []
     text = (
         f"the places are known to {min(100 * share, 100):.0f} % of their spread only: the camera turns more than it "
