@@ -325,10 +325,13 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """The class of this name where it is now."""
-        return super().find_class(MOVED.get(module, module), name)
+        return super().find_class(MOVED.get((module, name), module), name)
 
 
-MOVED = {"vggtgeo.geometry.cameras": "vggtgeo.geometry.camera"}
+MOVED = {
+    ("vggtgeo.geometry.cameras", "Camera"): "vggtgeo.geometry.camera",
+    ("vggtgeo.geometry.cameras", "Pinhole"): "vggtgeo.geometry.camera_models",
+}
 
 
 def read(path: Path) -> Any:
