@@ -6,7 +6,7 @@ They were set on simulated runs, and are measured on those of `benchmarks/verdic
 import numpy as np
 
 LEVEL = 1e-6
-"""Significance of an alternative; eight families are tried in each window."""
+"""Significance of an alternative; seven are tried in each window."""
 SIGMAS = 2.0
 """Standard deviations of a consequence: two halves of the tracks then agree on four fifths of its square."""
 PLACES = 0.05
