@@ -58,6 +58,8 @@ WALKS = 24
 MAPPED_BY_IMAGES = ("office", "hall", "staircase", "building")
 """Worlds of the runs without depth. In the others such small pictures show one wall at a time, or too little to match,
 and a run that never has a map is no test of a verdict on one."""
+VERDICT = "vggtgeo.slam.verdict.judge"
+"""Module of the function `judge`."""
 BASE = 0.01
 """Metres: the ATE that excuses nothing (`stress.excused`)."""
 
@@ -97,7 +99,7 @@ def main() -> None:
     if options.command == "make":
         make(options)
     else:
-        text = table(judged(options))
+        text = table(judged(options.out, options.half, options.saved, options.judge, options.verbose))
         print(text)
         if options.page:
             options.page.write_text(text + "\n")
@@ -289,20 +291,21 @@ class Judged:
     name: str
 
 
-def judged(options: argparse.Namespace) -> list[Judged]:
-    """Every run that is there, with the verdict computed again, or, with `--saved`, as the run gave it."""
-    module = importlib.import_module(options.judge)
-    judge = in_double_precision(module.judge)
+def judged(
+    out: Path, half: str | None = None, saved: bool = False, module: str = VERDICT, verbose: bool = False
+) -> list[Judged]:
+    """Every run that is there, with the verdict computed again, or, where `saved`, as the run gave it."""
+    judge = in_double_precision(importlib.import_module(module).judge)
     found = []
-    for folder in sorted(path.parent for path in options.out.glob("[!.]*/outcome.json")):
+    for folder in sorted(path.parent for path in out.glob("[!.]*/outcome.json")):
         case, outcome = (json.loads((folder / name).read_text()) for name in ("case.json", "outcome.json"))
-        if outcome["outcome"] == "error" or (options.half and case["half"] != options.half):
+        if outcome["outcome"] == "error" or (half and case["half"] != half):
             continue
         # A run that never had a map is wrong, but cannot be taken for a right one: it counts for no recall.
         word = outcome["outcome"] if np.isfinite(outcome["ate"]) else NO_MAP
         level, reasons = outcome["level"], outcome["reasons"]
-        if not options.saved:
-            slam, evidence, of_input = (_read(folder / f"{name}.pkl") for name in ("slam", "evidence", "input"))
+        if not saved:
+            slam, evidence, of_input = (read(folder / f"{name}.pkl") for name in ("slam", "evidence", "input"))
             with warnings.catch_warnings(), program_settings():
                 warnings.simplefilter("ignore")
                 verdict = judge(slam, evidence, of_input)
@@ -312,7 +315,7 @@ def judged(options: argparse.Namespace) -> list[Judged]:
             folder.name,
         )
         found.append(one)
-        if options.verbose and (one.level == "good") == (one.outcome in ("wrong", NO_MAP)):
+        if verbose and (one.level == "good") == (one.outcome in ("wrong", NO_MAP)):
             print(f"{one.name}: {one.outcome}, {one.level}: {'; '.join(one.reasons)[:300]}", flush=True)
     return found
 
@@ -322,13 +325,16 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """The class of this name where it is now."""
-        return super().find_class(MOVED.get(module, module), name)
+        return super().find_class(MOVED.get((module, name), module), name)
 
 
-MOVED = {"vggtgeo.geometry.cameras": "vggtgeo.geometry.camera"}
+MOVED = {
+    ("vggtgeo.geometry.cameras", "Camera"): "vggtgeo.geometry.camera",
+    ("vggtgeo.geometry.cameras", "Pinhole"): "vggtgeo.geometry.camera_models",
+}
 
 
-def _read(path: Path) -> Any:
+def read(path: Path) -> Any:
     """What `make` kept. Fields that are newer than a bank have their default: no deviation of a depth is known."""
     with path.open("rb") as file:
         kept = _Unpickler(file).load()
@@ -386,7 +392,7 @@ def _options() -> argparse.Namespace:
     making.add_argument("--count", type=int, default=420, help="runs in both halves together")
     making.add_argument("--jobs", type=int, default=1, help="processes; each runs many cases")
     judging.add_argument("--saved", action="store_true", help="take the verdicts that the runs gave")
-    judging.add_argument("--judge", default="vggtgeo.slam.verdict.judge", help="module with the function `judge`")
+    judging.add_argument("--judge", default=VERDICT, help="module with the function `judge`")
     judging.add_argument("--half", choices=HALVES, help="this half alone")
     judging.add_argument("--verbose", action="store_true", help="print each run whose verdict is not right")
     judging.add_argument("--page", type=Path, help="file that gets the table, too")

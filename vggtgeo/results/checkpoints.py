@@ -33,7 +33,7 @@ from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
-from vggtgeo.slam.verdict.witness import EvidenceSoFar, FrameEvidence
+from vggtgeo.slam.verdict.witness import FrameEvidence
 from vggtgeo.slam.window_recorder import WindowRecord
 
 _EXCERPT = 110
@@ -128,7 +128,7 @@ class RunSoFar:
                 setattr(refusals[role], entry.name, value)
 
 
-KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, EvidenceSoFar, FrameEvidence, WindowRecord)
+KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, FrameEvidence, WindowRecord)
 CHECKPOINT = Format("checkpoint", VERSION, by_name(KEPT_CLASSES))
 
 

@@ -9,11 +9,12 @@ import pytest
 from witness import SIZE, K, Walk, walk
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.verdict.adjustment import start_of
-from vggtgeo.slam.verdict.alternatives import TABLE, Explanation, explain, reversed_poses, second_motion
-from vggtgeo.slam.verdict.consequence import Consequence, Motion, consequence, halves
+from vggtgeo.slam.verdict.adjustment import solve, start_of
+from vggtgeo.slam.verdict.alternatives import TABLE, explain, second_motion
+from vggtgeo.slam.verdict.claim import extent
+from vggtgeo.slam.verdict.consequence import confirmed
 from vggtgeo.slam.verdict.decision import contradiction
-from vggtgeo.slam.verdict.levels import DEPTH_NOISE, LIKELIER, RIVAL
+from vggtgeo.slam.verdict.levels import DEPTH_NOISE, RIVAL
 
 COUNT = 20
 
@@ -66,10 +67,6 @@ PLANTED = {
 NAMES = {"zoom": "focal length", "depth factor": "depth", "depth offset": "depth"}
 
 
-def _consequence(found: Explanation, free_scale: bool) -> Consequence:
-    return consequence(*halves(found), free_scale)
-
-
 def test_the_table_has_what_is_tested() -> None:
     """Every alternative of the table has a planted fault here."""
     assert {(one.name, one.columns.shape[1]) for one in TABLE} == {
@@ -79,16 +76,16 @@ def test_the_table_has_what_is_tested() -> None:
 
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_fault_is_named_and_measured(name: str) -> None:
-    """The first alternative added is the fault, its estimate within four standard deviations of what was planted (one
+    """The alternative added is the fault, its estimate within four standard deviations of what was planted (one
     for each of several knots). Oracle: the simulation.
     """
     here, truth = PLANTED[name]
     found = here.explanation()
     assert found.added, "nothing was found"
-    first = found.added[0]
+    first = found.added
     off = first.estimate - np.asarray(truth)
     sigma = np.sqrt(np.diag(first.covariance))
-    assert first.name == NAMES.get(name, name)
+    assert first.alternative.name == NAMES.get(name, name)
     assert len(first.estimate) == len(truth)
     assert np.all(np.abs(off) < 4 * sigma + 0.01 * np.abs(truth)), (off, sigma)
 
@@ -99,9 +96,9 @@ def test_a_healthy_walk_has_no_alternative(seed: int, metric: bool) -> None:
     """With true poses and camera nothing is added, and free poses stay near the true ones. Oracle: the truth."""
     here = walk(COUNT, seed=seed)
     found = here.explanation(metric=metric)
-    assert found.added == ()
+    assert found.added is None
     assert found.rival == 0.0
-    off = _consequence(found, not metric)
+    off = confirmed(found.best)
     assert off.places < 3 * off.places_sigma + 0.002, off
     assert contradiction(found, metric) is None
 
@@ -114,11 +111,11 @@ def test_wrong_poses_are_found_and_their_size() -> None:
     poses = here.claim.poses.copy()
     poses[8:14, 0, 3] += 0.12
     found = here.explanation(poses=poses)
-    assert found.added == ()
+    assert found.added is None
     one = contradiction(found, True)
     assert one is not None
     assert one.cause == "poses"
-    off = rigid.invert(found.best.unknowns.poses)[:, :3, 3] - here.claim.centres
+    off = rigid.invert(found.best.unknowns.poses)[:, :3, 3] - rigid.centres(here.claim.poses)
     assert np.sqrt(np.mean(np.sum(off**2, 1))) < 0.01
     planted = np.sqrt(0.12**2 * 6 / COUNT * (1 - 6 / COUNT))
     assert abs(one.consequence.places - planted) < 0.2 * planted, (one.consequence, planted)
@@ -156,7 +153,7 @@ def test_depth_of_another_scene_contradicts_the_images() -> None:
     rng = np.random.default_rng(1)
     here = walk(COUNT, measured=lambda row, z: rng.permutation(z))
     found = here.explanation()
-    assert found.depth_noise > DEPTH_NOISE
+    assert found.best.noise.depth > DEPTH_NOISE
     one = contradiction(found, True)
     assert one is not None
     assert one.cause == "depth"
@@ -168,9 +165,8 @@ def test_no_second_motion_in_noise() -> None:
     rng = np.random.default_rng(0)
     tracks = here.tracks()
     wild = replace(tracks, pixels=rng.uniform(0, 400, tracks.pixels.shape))
-    share, poses, _ = second_motion(wild, explain(tracks).noise, np.ones(len(wild.first), bool))
-    assert share == 0.0
-    assert poses is None
+    fit = solve(wild, start_of(wild), explain(tracks).best.noise)
+    assert not second_motion(fit, np.ones(len(wild.first), bool)).any()
     assert np.isfinite(start_of(wild).points).all()
 
 
@@ -185,7 +181,8 @@ def test_halves_confirm_a_displacement_and_not_mistracked_corners(seed: int) -> 
     wander = np.cumsum(3.0 * rng.standard_normal(tracks.pixels.shape), axis=0)
     wander = np.where((tracks.track % 4 == 0)[:, None], wander - wander[tracks.first][tracks.track], 0.0)
     wandering = replace(tracks, pixels=tracks.pixels + wander)
-    assert contradiction(explain(wandering), True) is None
+    found = contradiction(explain(wandering), True)
+    assert found is None or found.size < 1
     poses = here.claim.poses.copy()
     poses[8:14, 0, 3] += 0.15
     one = contradiction(explain(replace(wandering, poses=poses)), True)
@@ -193,19 +190,17 @@ def test_halves_confirm_a_displacement_and_not_mistracked_corners(seed: int) -> 
     assert one.consequence.places == pytest.approx(np.sqrt(0.15**2 * 6 / COUNT * (1 - 6 / COUNT)), rel=0.3)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_reversed_motion_is_told_from_the_true_one(seed: int) -> None:
-    """A run without depth whose motion has the opposite sign, near and far exchanged, is found to be reversed, and the
-    places that the corners prefer are the true ones; the true motion is not. Oracle: the truth.
+def test_what_the_run_states_as_its_error_contradicts_nothing() -> None:
+    """Without depth, places that are off by 8 % of their extent are reported where the run states to know them to 1 %,
+    and not where it states 10 %. Oracle: what was planted, beyond the limit of 6 %.
     """
-    here = walk(COUNT, seed=seed)
-    wrong = reversed_poses(here.claim.poses, here.tracks(replace(here.claim, metric=False)))
-    found = here.explanation(metric=False, poses=wrong)
-    assert found.reversal > LIKELIER
-    one = contradiction(found, False)
-    assert one is not None
-    assert one.cause == "reversal"
-    off = Motion(np.arange(COUNT), found.best.unknowns.poses, here.claim.poses).difference(True)
-    assert off[0] < 0.02
-    assert here.explanation(metric=False).reversal < -LIKELIER
-    assert np.isnan(here.explanation().reversal), "measured depth tells the sign"
+    here = walk(COUNT)
+    poses, centres = here.claim.poses.copy(), rigid.centres(here.claim.poses)
+    bend = 0.12 * extent(poses) * np.sqrt(2) * np.cos(2 * np.pi * np.arange(COUNT) / COUNT)
+    poses[:, :3, 3] = -np.einsum("fij,fj->fi", poses[:, :3, :3], centres + bend[:, None] * [0.0, 1.0, 0.0])
+    found = here.explanation(metric=False, poses=poses)
+    confident, doubtful = (contradiction(found, False, stated) for stated in (0.01, 0.1))
+    assert confident is not None
+    assert confident.cause == "poses"
+    assert confident.size > 1
+    assert doubtful is None

@@ -10,7 +10,9 @@ from dataclasses import replace
 import numpy as np
 from witness import Walk
 
-from vggtgeo.slam.verdict.judge import check_extent
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
+from vggtgeo.slam.verdict.judge import check_extent, stated_share
 
 
 def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) -> None:
@@ -18,10 +20,11 @@ def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) 
     with metres it is no matter of scale. Oracle: the spread of the walk's own path.
     """
     free = replace(healthy.claim, metric=False)
-    spread = float(np.sqrt(free.centres.var(0).sum()))
+    spread = float(np.sqrt(rigid.centres(free.poses).var(0).sum()))
     sigma = np.where(np.arange(len(free)) % 3, np.nan, spread / 1.5)
-    assert [f.check for f in check_extent(free, sigma)] == ["extent"]
-    assert "67 % of their spread" in check_extent(free, sigma)[0].text
-    assert check_extent(free, sigma / 2) == []
-    assert check_extent(free, None) == []
-    assert check_extent(healthy.claim, sigma) == []
+    known = lambda places: stated_share(free, PoseUncertainty(free.times, places, np.zeros(len(free))))
+    assert [f.check for f in check_extent(free, known(sigma))] == ["extent"]
+    assert "67 % of their spread" in check_extent(free, known(sigma))[0].text
+    assert check_extent(free, known(sigma / 2)) == []
+    assert check_extent(free, stated_share(free, None)) == []
+    assert check_extent(healthy.claim, known(sigma)) == []

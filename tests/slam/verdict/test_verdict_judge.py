@@ -10,17 +10,16 @@ import numpy as np
 import pytest
 from recorded_run import recorded_run
 from scipy.spatial.transform import Rotation
-from witness import SIZE, K, Walk, walk
+from witness import K, walk
 
 from vggtgeo.results.result import Result
 from vggtgeo.slam.verdict import judge as judge_module
-from vggtgeo.slam.verdict.alternatives import Explanation, explain
-from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.decision import findings, noted
-from vggtgeo.slam.verdict.finding import Finding, Verdict
+from vggtgeo.slam.verdict.adjustment import Noise, solve, start_of
+from vggtgeo.slam.verdict.decision import findings
+from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
 from vggtgeo.slam.verdict.judge import check_unit, judge, judge_or_report
 from vggtgeo.slam.verdict.levels import MAX_REASONS
-from vggtgeo.slam.verdict.windows import WINDOW, linked, thinned, tracks_of, windows
+from vggtgeo.slam.verdict.windows import WINDOW, linked, thinned, windows
 from vggtgeo.slam.verdict.witness import EvidenceRecorder
 
 
@@ -67,7 +66,8 @@ def test_a_cause_is_one_reason() -> None:
     """
     here = walk(20)
     growing = walk(20, measured=lambda row, z: z * np.exp(0.5 * row / 19))
-    fitted = growing.explanation().free.unknowns.poses
+    tracks = growing.tracks()
+    fitted = solve(tracks, start_of(tracks), Noise(0.3, 0.02)).unknowns.poses
     wrong = growing.explanation(poses=fitted)
     poses = here.claim.poses.copy()
     poses[8:14, 0, 3] += 0.12
@@ -78,17 +78,6 @@ def test_a_cause_is_one_reason() -> None:
     depth = next(one for one in found if one.check == "depth")
     assert (depth.start, depth.end, depth.scale, depth.level) == (0, 19, True, "degraded")
     assert findings(here.claim, [here.explanation()]) == []
-
-
-def test_windows_without_depth_leave_the_scale_in_doubt() -> None:
-    """Where some windows of a metric run have no depth and others do, that is a finding; where none has (the depth of a
-    network), it is not. Oracle: the depths taken away.
-    """
-    here = walk(20)
-    free = here.explanation(metric=False)
-    (found,) = findings(here.claim, [here.explanation(), free])
-    assert (found.check, found.scale) == ("no depth", True)
-    assert findings(here.claim, [free]) == []
 
 
 def test_windows_cover_all_linked_frames_and_break_where_nothing_is_common() -> None:
@@ -118,29 +107,6 @@ def test_a_wrong_unit_of_depth_is_reported() -> None:
     assert check_unit(replace(here.claim, metric=False), here.evidence) == []
 
 
-def _windows_of(here: Walk, claim: Claim) -> list[Explanation]:
-    """What the corners of each window prefer to a claim."""
-    tracks = [tracks_of(claim, here.evidence, rows, SIZE) for rows in windows(np.arange(len(claim)))]
-    return [explain(one) for one in tracks if one is not None]
-
-
-def test_slow_drift_is_found_in_a_chain_of_windows() -> None:
-    """A path that winds slowly by 30 cm: each window agrees with its corners, all of them in a chain do not. Nothing is
-    found where nothing drifts, nor where the run itself states as much. Oracle: what was planted.
-    """
-    here = walk(80)
-    poses = here.claim.poses.copy()
-    bend = 0.3 * np.sin(2 * np.pi * np.arange(80) / 80)
-    poses[:, :3, 3] -= poses[:, :3, :3] @ np.array([0.0, 1.0, 0.0]) * bend[:, None]
-    bent = replace(here.claim, poses=poses)
-    explained = _windows_of(here, bent)
-    (found,) = findings(bent, explained)
-    assert found.check == "drift"
-    assert (found.start, found.end) == (0, 79)
-    assert findings(bent, explained, stated=1.0) == []
-    assert findings(here.claim, _windows_of(here, here.claim)) == []
-
-
 def test_what_has_no_consequence_is_a_number() -> None:
     """A slight distortion is significant and moves nothing: no reason, but noted with its size. Oracle: the k1."""
 
@@ -149,10 +115,10 @@ def test_what_has_no_consequence_is_a_number() -> None:
         return normalised * (1 - 0.01 * np.sum(normalised**2, 1, keepdims=True)) * K[:2] + K[2:]
 
     here = walk(20, noise=0.1, seen=seen)
-    explained = [here.explanation()]
-    assert findings(here.claim, explained) == []
-    (one,) = noted(here.claim, explained)
-    assert one.check == "distortion"
-    assert one.estimate[0] == pytest.approx(-0.01, abs=4 * one.sigma[0])
-    verdict = Verdict("good", noted=(one,))
+    (one,) = findings(here.claim, [here.explanation()])
+    assert (one.check, one.level) == ("distortion", "good")
+    assert "by -0.01 +- " in one.text
+    verdict = conclude([one], range(20), here.claim.times.tolist(), True)
+    assert (verdict.level, verdict.reasons, verdict.noted) == ("good", (), (one.text,))
+    assert [(part.start, part.end, part.checks) for part in verdict.segments] == [(0, 19, ())]
     assert Verdict.from_dict(json.loads(json.dumps(verdict.to_dict()))) == verdict

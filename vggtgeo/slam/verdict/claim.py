@@ -58,13 +58,7 @@ class Claim:
     def __len__(self) -> int:
         return len(self.frames)
 
-    @property
-    def centres(self) -> np.ndarray:
-        """Camera centres, float64 [n, 3]."""
-        return rigid.invert(self.poses)[:, :3, 3]
-
 
 def extent(poses: np.ndarray) -> float:
     """RMS distance of the places from their mean, of poses world -> camera [n, 4, 4]."""
-    places = rigid.invert(poses)[:, :3, 3]
-    return float(np.sqrt(np.mean(np.sum((places - places.mean(0)) ** 2, 1))))
+    return float(np.sqrt(np.sum(rigid.centres(poses).var(0))))

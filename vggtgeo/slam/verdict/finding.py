@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -27,29 +27,6 @@ class Finding:
     end: int | None = None
     scale: bool = False
     local: bool = False
-
-
-@dataclass(frozen=True)
-class Noted:
-    """An alternative that is significant, but without consequence.
-
-    check: its name. start, end: first and last frame concerned. estimate, sigma: of its parameters (natural units:
-    metres, seconds, logarithms). places: by how much the places would differ, in the unit of the map; turn: the turns
-    from frame to frame, rad.
-    """
-
-    check: str
-    start: int
-    end: int
-    estimate: tuple[float, ...]
-    sigma: tuple[float, ...]
-    places: float
-    turn: float
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The inverse of `dataclasses.asdict`."""
-        return cls(**{**values, "estimate": tuple(values["estimate"]), "sigma": tuple(values["sigma"])})
 
 
 @dataclass(frozen=True)
@@ -85,7 +62,7 @@ class Verdict:
 
     level: "good"; "degraded", something contradicts the result or is missing from it; "failed", it is not to be used.
     reasons: one sentence each, the worst first. segments: the run by time, in order, without gaps. metric: False where
-    lengths are not metres, or doubtful. noted: what is significant and without consequence.
+    lengths are not metres, or doubtful. noted: what is significant and without consequence, one sentence each.
 
     Example:
         >>> import vggtgeo as vg
@@ -98,7 +75,7 @@ class Verdict:
     reasons: tuple[str, ...] = ()
     segments: tuple[Segment, ...] = ()
     metric: bool = True
-    noted: tuple[Noted, ...] = ()
+    noted: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"Verdict({': '.join((self.level, '; '.join(self.reasons))) if self.reasons else self.level})"
@@ -109,15 +86,14 @@ class Verdict:
             "level": self.level,
             "reasons": list(self.reasons),
             "segments": [segment.to_dict() for segment in self.segments],
-            "noted": [asdict(one) for one in self.noted],
+            "noted": list(self.noted),
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], metric: bool = True) -> Self:
         """The inverse of `to_dict`."""
         segments = tuple(Segment.from_dict(segment) for segment in values["segments"])
-        noted = tuple(Noted.from_dict(one) for one in values.get("noted", ()))
-        return cls(values["level"], tuple(values["reasons"]), segments, metric, noted)
+        return cls(values["level"], tuple(values["reasons"]), segments, metric, tuple(values.get("noted", ())))
 
 
 def worst(levels: Iterable[Level]) -> Level:
@@ -127,30 +103,32 @@ def worst(levels: Iterable[Level]) -> Level:
 
 def conclude(findings: Iterable[Finding], frames: Sequence[int], times: Sequence[float], metric: bool) -> Verdict:
     """Combine the findings on a run with these frame numbers and times."""
-    ordered = sorted(findings, key=lambda finding: -LEVELS.index(finding.level))
-    doubtful = any(finding.scale and finding.level != "good" for finding in ordered)
+    findings = list(findings)
+    reasons = sorted((one for one in findings if one.level != "good"), key=lambda one: -LEVELS.index(one.level))
     return Verdict(
-        worst(finding.level for finding in ordered if not finding.local),
-        tuple(finding.text for finding in ordered if finding.level != "good" and not finding.local),
-        _segments(ordered, np.asarray(frames), np.asarray(times, np.float64)),
-        metric and not doubtful,
+        worst(one.level for one in reasons if not one.local),
+        tuple(one.text for one in reasons if not one.local),
+        _segments(reasons, frames, times),
+        metric and not any(one.scale for one in reasons),
+        tuple(one.text for one in findings if one.level == "good"),
     )
 
 
-def _segments(findings: Sequence[Finding], frames: np.ndarray, times: np.ndarray) -> tuple[Segment, ...]:
-    if not len(frames):
-        return ()
-    labels: list[tuple[Level, tuple[str, ...]]] = []
-    for frame in frames:
-        here = [f for f in findings if (f.start is None or f.start <= frame) and (f.end is None or frame <= f.end)]
-        checks = tuple(dict.fromkeys(finding.check for finding in here if finding.level != "good"))
-        labels.append((worst(finding.level for finding in here), checks))
-    firsts = [row for row, label in enumerate(labels) if row == 0 or label != labels[row - 1]]
-    lasts = [row - 1 for row in firsts[1:]] + [len(labels) - 1]
-    return tuple(
-        Segment(int(frames[a]), int(frames[b]), float(times[a]), float(times[b]), *labels[a])
-        for a, b in zip(firsts, lasts, strict=True)
-    )
+def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence[float]) -> tuple[Segment, ...]:
+    """Frames in a row that the same findings concern."""
+    found: list[Segment] = []
+    for frame, time in zip(frames, times, strict=True):
+        here = [
+            one
+            for one in reasons
+            if (one.start is None or one.start <= frame) and (one.end is None or frame <= one.end)
+        ]
+        level, checks = worst(one.level for one in here), tuple(dict.fromkeys(one.check for one in here))
+        if found and (found[-1].level, found[-1].checks) == (level, checks):
+            found[-1] = replace(found[-1], end=int(frame), end_time=float(time))
+        else:
+            found.append(Segment(int(frame), int(frame), float(time), float(time), level, checks))
+    return tuple(found)
 
 
 def spans(rows: np.ndarray, join: int = 1) -> list[tuple[int, int]]:

@@ -6,17 +6,13 @@ They were set on simulated runs, and are measured on those of `benchmarks/verdic
 import numpy as np
 
 LEVEL = 1e-6
-"""Significance of an alternative; eight families are tried in each window."""
-LIKELIER = -2.0 * float(np.log(LEVEL))
-"""Minus twice the log likelihood ratio at that level, of two explanations with as many parameters."""
+"""Significance of an alternative; seven are tried in each window."""
 SIGMAS = 2.0
 """Standard deviations of a consequence: two halves of the tracks then agree on four fifths of its square."""
 PLACES = 0.05
 """Metres, RMS over a window."""
 SHARE = 0.06
 """Of the path's extent, in place of `PLACES` where lengths have no unit."""
-DRIFT = 0.02
-"""Of the path's length, by which windows in a chain may differ from it, if that is more."""
 TURN = np.deg2rad(0.45)
 """Radians from frame to frame of a window, RMS."""
 MIN_SHARE = 0.15

@@ -1,7 +1,7 @@
 """The noise model of the verdict, estimated from the run itself. Everything that is called significant uses this file.
 
-- A corner has the standard deviation `pixel`, a measured depth `hypot(depth, growth z)` (relative), both by the median
-  absolute deviation of the residuals with free poses, corrected for the unknowns that these residuals determine.
+- A corner has the standard deviation `pixel`, a measured depth the relative one `depth`, both by the median absolute
+  deviation of the residuals with free poses, corrected for the unknowns that these residuals determine.
 - The depth errors of a track are common to it (an edge, a material): `n` depths of a track weigh as one.
 - Errors are not independent along a track, which drifts, nor within a frame. So covariances are cluster-robust, by
   track and by frame (two-way, Cameron, Gelbach & Miller 2011): with the score `g_o` of each observation, and `H` the
@@ -18,34 +18,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.slam.verdict.adjustment import SIZE, Fit, Noise, Tracks, linearise, reduce
+from vggtgeo.slam.verdict.adjustment import SIZE, Fit, Noise, reduce, solve
 
 MIN_PIXEL, MIN_DEPTH = 0.05, 0.003
 """Pixels and relative: below these a simulated recording without noise would find everything significant."""
 
 
-def estimated(tracks: Tracks, fit: Fit, noise: Noise) -> Noise:
+def with_own_noise(fit: Fit) -> Fit:
+    """The fit once more, with the noise that its residuals show."""
+    return solve(fit.tracks, fit.unknowns, estimated(fit), fit.columns)
+
+
+def estimated(fit: Fit) -> Noise:
     """The noise by the residuals of a fit with free poses."""
-    count = len(tracks.frame)
-    unknowns = 3 * len(tracks.first) + 6 * len(tracks.rows)
-    freedom = max(2 * count - unknowns, 0.3 * count)
-    pixel = noise.pixel * _deviation(fit.linear.residual[:, :2]) * np.sqrt(2 * count / freedom)
+    tracks, noise, residual = fit.tracks, fit.noise, fit.linear.residual
+    count = 2 * len(tracks.frame)
+    freedom = max(count - 3 * len(tracks.first) - 6 * len(tracks.rows), 0.15 * count)
+    pixel = noise.pixel * _deviation(residual[:, :2]) * np.sqrt(count / freedom)
     known = np.isfinite(tracks.depth)
-    depth, growth = noise.depth, 0.0
-    if known.any():
-        metres = tracks.depth[known]
-        error = fit.linear.residual[known, 2] * np.sqrt(tracks.depths[known]) * noise.of_depth(metres)
-        depth, growth = _growing(np.abs(error), metres)
-    return Noise(max(float(pixel), MIN_PIXEL), max(depth, MIN_DEPTH), growth)
-
-
-def _growing(error: np.ndarray, metres: np.ndarray) -> tuple[float, float]:
-    """Standard deviation at no distance, and its growth a metre, by the nearer and the farther half."""
-    near = metres <= np.median(metres)
-    parts = [(_deviation(error[part]), float(np.mean(metres[part] ** 2))) for part in (near, ~near) if part.any()]
-    (first, close), (second, far) = parts[0], parts[-1]
-    growth = max(second**2 - first**2, 0.0) / max(far - close, 1e-12)
-    return float(np.sqrt(max(first**2 - growth * close, 0.0))), float(np.sqrt(growth))
+    shared = residual[known, 2] * np.sqrt(tracks.depths[known])  # the error of a depth is common to its track
+    depth = noise.depth * _deviation(shared) if known.any() else noise.depth
+    return Noise(max(float(pixel), MIN_PIXEL), max(depth, MIN_DEPTH))
 
 
 def _deviation(values: np.ndarray) -> float:
@@ -63,39 +56,41 @@ class Scores:
     information: np.ndarray
     clustered: np.ndarray
 
-    def step(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Linear estimate [k] of the calibration's `columns` [SIZE, k], its robust covariance [k, k], and how many
-        observations count as one.
-        """
-        own = columns.T @ self.information @ columns
-        inverse = np.linalg.pinv(own, hermitian=True)
-        robust = inverse @ (columns.T @ self.clustered @ columns) @ inverse + 1e-3 * inverse
-        as_one = max(float(np.trace(robust @ own)) / columns.shape[1], 1.0)
-        return inverse @ columns.T @ self.side, robust, as_one
+    def gain(self, columns: np.ndarray) -> float:
+        """Decrease of minus twice the log likelihood that a linear step of the calibration's `columns` promises."""
+        side = columns.T @ self.side
+        return float(side @ np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True) @ side)
+
+    def covariance(self, columns: np.ndarray) -> np.ndarray:
+        """Robust covariance of the calibration's `columns` [SIZE, k], float64 [k, k]."""
+        inverse = np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True)
+        return np.asarray(inverse @ (columns.T @ self.clustered @ columns) @ inverse + 1e-3 * inverse)
 
     @property
     def as_one(self) -> float:
         """Observations that count as one, in the mean over the directions that the corners determine."""
-        determined = np.flatnonzero(np.diag(self.information) > 0)
-        each = [self.step(np.eye(SIZE)[:, [place]])[2] for place in determined]
-        return float(np.mean(each)) if each else 1.0
+        information = np.diag(self.information)
+        known = np.flatnonzero(information > 0)
+        each = [self.covariance(np.eye(SIZE)[:, [place]])[0, 0] * information[place] for place in known]
+        return max(float(np.mean(each)), 1.0) if each else 1.0
 
 
-def scores(tracks: Tracks, fit: Fit, noise: Noise) -> Scores:
+def scores(fit: Fit) -> Scores:
     """The scores of the calibration at a fit, all of it, whatever was free there."""
-    linear = linearise(tracks, fit.unknowns, noise)
+    tracks, linear = fit.tracks, fit.linear
     reduced = reduce(tracks, linear, np.eye(SIZE), True, 0.0)
     width = 6 * len(tracks.rows)
     poses = np.zeros((width, SIZE))
     poses[6:] = -np.linalg.solve(reduced.matrix[6:width, 6:width], reduced.matrix[6:width, width:])
-    points = -np.einsum("tji,tjn->tin", reduced.factor, reduced.both @ np.vstack([poses, np.eye(SIZE)]))
+    points = -np.swapaxes(reduced.inverse, 1, 2) @ (reduced.coupling @ np.vstack([poses, np.eye(SIZE)]))
     along = linear.by_theta + linear.by_point @ points[tracks.track]
-    along = along + linear.by_pose @ poses.reshape(-1, 6, SIZE)[tracks.frame]
-    each = -np.einsum("mrk,mr->mk", along, linear.weight * linear.residual)
+    along += linear.by_pose @ poses.reshape(-1, 6, SIZE)[tracks.frame]
+    weighted = along * linear.weight[:, :, None]
+    each = -(np.swapaxes(weighted, 1, 2) @ linear.residual[:, :, None])[:, :, 0]
     # Second derivative of Cauchy's kernel over its weight: what the weights alone overstate of the information.
-    weighted = along**2 * linear.weight[:, :, None]
-    curved = np.sum(weighted * (2.0 * linear.weight - 1.0)[:, :, None]) / max(float(np.sum(weighted)), 1e-300)
-    information = np.einsum("mri,mr,mrj->ij", along, linear.weight, along, optimize=True)
+    square = np.sum(weighted * along, 2)
+    curved = np.sum(square * (2.0 * linear.weight - 1.0)) / max(float(np.sum(square)), 1e-300)
+    information = np.tensordot(weighted, along, ((0, 1), (0, 1)))
     clustered = _clustered(each, tracks.track) + _clustered(each, tracks.frame) - each.T @ each
     return Scores(each.sum(0), information, clustered / max(float(curved), 0.3) ** 2)
 

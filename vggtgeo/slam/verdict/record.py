@@ -8,21 +8,16 @@ relocalized by `a T^2 / 2`. The RMS over all frames is the effect on the traject
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
+from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.claim import Claim, extent
-from vggtgeo.slam.verdict.finding import Finding, spans
+from vggtgeo.slam.verdict.finding import Finding, Level, spans
 from vggtgeo.slam.verdict.levels import ACCELERATION, MAX_BRIDGED, MAX_LOST, MIN_TRACKED, SHARE, UNMOVED
 from vggtgeo.slam.verdict.windows import MIN_COMMON
 from vggtgeo.slam.verdict.witness import FrameEvidence
-
-AROUND = 3
-"""Steps before and after a picture that is shown again, which tell the speed."""
-MAX_SENTENCES = 5
-"""Lost stretches that have a sentence each."""
 
 
 def check_record(claim: Claim) -> list[Finding]:
@@ -48,50 +43,40 @@ def check_record(claim: Claim) -> list[Finding]:
 
 
 def _lost(claim: Claim) -> list[Finding]:
-    share = float(np.mean(claim.tracked))
     stretches = spans(~claim.tracked)
-    serious = 1 - share > MAX_LOST or bridging_error(claim) > MAX_BRIDGED
-    found = []
-    for first, last in stretches:
-        start, end = int(claim.frames[first]), int(claim.frames[last])
-        text = f"frames {start} to {end} were lost; they have no pose"
-        text = text if end > start else f"frame {start} was lost; it has no pose"
-        local = not serious or len(stretches) > MAX_SENTENCES
-        found.append(Finding("lost", "degraded", text, start, end, local=local))
-    if serious and len(stretches) > MAX_SENTENCES:
-        longest = max(found, key=lambda finding: (finding.end or 0) - (finding.start or 0))
-        text = (
-            f"{len(claim) - np.count_nonzero(claim.tracked)} of {len(claim)} frames were lost, {len(stretches)} times, "
-            f"longest from frame {longest.start} to {longest.end}; they have no pose"
-        )
-        found.append(replace(longest, text=text, local=False))
-    if share < MIN_TRACKED:
-        found.append(Finding("lost", "failed", f"only {100 * share:.0f} % of the frames were tracked"))
+    named = [(int(claim.frames[first]), int(claim.frames[last])) for first, last in stretches]
+    found = [Finding("lost", "degraded", f"frames {a} to {b} were lost", a, b, local=True) for a, b in named]
+    count = len(claim) - np.count_nonzero(claim.tracked)
+    if count > MAX_LOST * len(claim) or bridging_error(claim) > MAX_BRIDGED:
+        start, end = max(named, key=lambda ends: ends[1] - ends[0])
+        times = "once" if len(named) == 1 else f"{len(named)} times, longest"
+        text = f"{count} of {len(claim)} frames were lost, {times} from frame {start} to {end}; they have no pose"
+        level: Level = "failed" if len(claim) - count < MIN_TRACKED * len(claim) else "degraded"
+        found.append(Finding("lost", level, text, start, end))
     return found
 
 
 def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
-    """Pictures that were shown again while the camera moved on.
+    """Pictures that were shown again while the camera moved on, at its usual speed.
 
     Where a camera is at rest, the noise of a new picture still moves its corners a little: all of them in the very
-    same place have no likelihood but that of the same picture. Meanwhile the camera goes on as before and after.
+    same place have no likelihood but that of the same picture.
     """
     repeated = np.array([False, *(_same(*pair) for pair in pairwise(corners))], bool)
-    speeds = np.linalg.norm(np.diff(claim.centres, axis=0), axis=1) / np.maximum(np.diff(claim.times), 1e-9)
-    squares, found = 0.0, []
-    for first, last in spans(repeated & claim.tracked):
-        around = range(max(first - 1 - AROUND, 0), min(last + AROUND, len(speeds)))
-        moving = [speeds[row] for row in around if not repeated[row + 1]]
-        seconds = float(claim.times[last] - claim.times[first - 1])
-        off = seconds * float(np.median(moving)) if moving else 0.0
-        squares += (last - first + 1) * off**2 / 3
-        found.append(f"{claim.frames[first]} to {claim.frames[last]}")
-    off = float(np.sqrt(squares / max(len(claim), 1)))
-    if not found or off <= (MAX_BRIDGED if claim.metric else SHARE * extent(claim.poses[claim.tracked])):
+    stretches = spans(repeated & claim.tracked)
+    if not stretches or repeated[1:].all():
         return []
-    told = ", ".join(found[:MAX_SENTENCES])
-    text = f"frames {told} show the picture before them again, while the camera moved; film them again"
-    return [Finding("frozen", "degraded", text)]
+    speeds = np.linalg.norm(np.diff(rigid.centres(claim.poses), axis=0), axis=1) / np.maximum(
+        np.diff(claim.times), 1e-9
+    )
+    squares = [(last - first + 1) * (claim.times[last] - claim.times[first - 1]) ** 2 / 3 for first, last in stretches]
+    off = float(np.median(speeds[~repeated[1:]]) * np.sqrt(sum(squares) / len(claim)))
+    if off <= (MAX_BRIDGED if claim.metric else SHARE * extent(claim.poses[claim.tracked])):
+        return []
+    first, last = max(stretches, key=lambda ends: ends[1] - ends[0])
+    start, end = int(claim.frames[first]), int(claim.frames[last])
+    text = f"frames {start} to {end} show the picture before them again, while the camera moved; film them again"
+    return [Finding("frozen", "degraded", text, start, end)]
 
 
 def _same(before: FrameEvidence, after: FrameEvidence) -> bool:

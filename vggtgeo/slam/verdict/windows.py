@@ -15,6 +15,8 @@ WINDOW = 24
 """Frames that are adjusted together."""
 MIN_VIEWS = 3
 """Frames of a window that a track is seen in; two of them determine its point."""
+MIN_FRAMES = 4
+"""Frames of a window; in fewer, free poses explain nearly all."""
 MIN_COMMON = 10
 """Corners that link a frame to the next: twenty numbers for six unknowns."""
 SHARED, MAX_STEP = 0.5, 3
@@ -64,28 +66,26 @@ def windows(rows: np.ndarray) -> list[np.ndarray]:
 def tracks_of(
     claim: Claim, evidence: Sequence[FrameEvidence], rows: np.ndarray, size: tuple[int, int]
 ) -> Tracks | None:
-    """The tracks that at least `MIN_VIEWS` of these frames see; None where there are none.
+    """The tracks that at least `MIN_VIEWS` of these frames see; None where there are none, or few frames.
 
     rows: int [f], increasing, of tracked frames.
     """
-    ids = np.concatenate([evidence[row].ids for row in rows])
-    frame = np.repeat(np.arange(len(rows)), [len(evidence[row].ids) for row in rows])
-    pixels = np.concatenate([evidence[row].pixels for row in rows]).astype(np.float64)
-    depth = np.concatenate([evidence[row].depth for row in rows]).astype(np.float64)
-    velocity = np.concatenate([_velocities(evidence, int(row)) for row in rows])
-    order = np.lexsort((frame, ids))
-    ids, frame, pixels, depth, velocity = ids[order], frame[order], pixels[order], depth[order], velocity[order]
-    _, track, views = np.unique(ids, return_inverse=True, return_counts=True)
-    kept = views[track] >= MIN_VIEWS
-    if not kept.any():
+    if len(rows) < MIN_FRAMES:
         return None
-    _, first, track = np.unique(ids[kept], return_index=True, return_inverse=True)
-    pixels = pixels[kept]
+    seen = [evidence[row] for row in rows]
+    ids, pixels, depth = (np.concatenate([getattr(one, name) for one in seen]) for name in ("ids", "pixels", "depth"))
+    frame = np.repeat(np.arange(len(rows)), [len(one.ids) for one in seen])
+    velocity = np.concatenate([_velocities(evidence, int(row)) for row in rows])
+    _, track, views = np.unique(ids, return_inverse=True, return_counts=True)
+    kept = np.flatnonzero(views[track] >= MIN_VIEWS)
+    if not len(kept):
+        return None
+    kept = kept[np.lexsort((frame[kept], ids[kept]))]
+    pixels = pixels[kept].astype(np.float64)
     axis = 0 if claim.readout is not None and claim.readout.columns else 1
     readout = (pixels[:, [axis]] / size[axis] - 0.5) * velocity[kept]
     if claim.readout is not None:
         pixels = pixels - claim.readout.seconds * readout
-    depth = np.where(depth > 0, depth, np.nan) if claim.metric else np.full(len(depth), np.nan)
     return Tracks(
         rows=rows,
         times=claim.times[rows],
@@ -93,11 +93,10 @@ def tracks_of(
         intrinsics=np.asarray(claim.intrinsics, np.float64),
         size=size,
         frame=frame[kept],
-        track=track,
+        track=np.unique(ids[kept], return_inverse=True)[1],
         pixels=pixels,
-        depth=depth[kept],
+        depth=np.where(depth[kept] > 0, depth[kept], np.nan).astype(np.float64) * (1.0 if claim.metric else np.nan),
         readout=readout,
-        first=first,
     )
 
 

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,20 +53,6 @@ class FrameEvidence:
     def through(self, lens: Camera) -> FrameEvidence:
         """The same corners without the distortion of `lens`."""
         return replace(self, pixels=lens.undistorted(self.pixels).astype(np.float32))
-
-
-@dataclass(frozen=True, eq=False)
-class EvidenceSoFar:
-    """State of an `EvidenceRecorder`: the frames so far; of the last one the small grey image, every `STRIDE`-th depth,
-    and the corners with their tracks' numbers; the next number.
-    """
-
-    frames: tuple[FrameEvidence, ...]
-    image: np.ndarray | None
-    depth: np.ndarray | None
-    ids: np.ndarray
-    pixels: np.ndarray
-    next: int
 
 
 class EvidenceRecorder(Callback):
@@ -114,16 +101,15 @@ class EvidenceRecorder(Callback):
             self._waiting.popleft().result()
         self._waiting.append(self._pool.submit(self._add, frame))
 
-    def so_far(self) -> EvidenceSoFar:
+    def so_far(self) -> tuple[object, ...]:
         """State to resume from."""
-        return EvidenceSoFar(tuple(self.frames), self._image, self._depth, self._ids, self._pixels, self._next)
+        return tuple(self.frames), self._image, self._depth, self._ids, self._pixels, self._next
 
-    def on_resume(self, so_far: EvidenceSoFar, slam: Slam) -> None:
+    def on_resume(self, so_far: Any, slam: Slam) -> None:
         """Continue after the last of these frames."""
-        self._frames = list(so_far.frames)
-        self._image, self._depth, self._next = so_far.image, so_far.depth, so_far.next
-        self._ids, self._pixels = so_far.ids, so_far.pixels
-        self._owned = so_far.depth is None or bool(np.isfinite(so_far.frames[-1].depth).any())
+        frames, self._image, self._depth, self._ids, self._pixels, self._next = so_far
+        self._frames = list(frames)
+        self._owned = self._depth is None or bool(np.isfinite(frames[-1].depth).any())
 
     def add(self, frame: Frame) -> None:
         """Follow the corners into this frame, and detect new ones where there are none."""
@@ -144,22 +130,23 @@ class EvidenceRecorder(Callback):
         self._ids = np.concatenate([self._ids, numbers])
         self._pixels = np.concatenate([self._pixels, fresh])
         full = (self._pixels + 0.5) * scale - 0.5
-        own = self._own_depth(frame.depth, grey)
-        depth = np.full(len(full), np.nan, np.float32) if own is None else _read(own, full)
+        depth = self._read(frame.depth, grey, full)
         self._image = grey
         ideal = self._camera.undistorted(full).astype(np.float32)
         self._frames.append(FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth))
 
-    def _own_depth(self, depth: np.ndarray | None, grey: np.ndarray) -> np.ndarray | None:
-        """The depth image, unless it repeats that of another picture: the run does not use it either."""
-        before, small = self._depth, None if depth is None else depth[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-        self._depth = None if small is None else small.copy()
-        same = before is not None and small is not None and np.array_equal(before, small, equal_nan=True)
-        if not same:
+    def _read(self, depth: np.ndarray | None, grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """Depths at pixels; NaN where the image repeats that of another picture: the run does not use it either."""
+        some = slice(STRIDE // 2, None, STRIDE)
+        before, self._depth = self._depth, None if depth is None else depth[some, some].copy()
+        if before is None or self._depth is None or not np.array_equal(before, self._depth, equal_nan=True):
             self._owned = True
         elif self._image is None or not np.array_equal(grey, self._image):
             self._owned = False
-        return depth if self._owned else None
+        if depth is None or not self._owned:
+            return np.full(len(pixels), np.nan, np.float32)
+        row, column = np.clip(np.rint(pixels[:, ::-1]), 0, np.array(depth.shape) - 1).astype(int).T
+        return depth[row, column].astype(np.float32)
 
     def _of_the_world(self, pixels: np.ndarray) -> np.ndarray:
         """Which corners of the small image may be followed."""
@@ -167,12 +154,6 @@ class EvidenceRecorder(Callback):
             return np.ones(len(pixels), bool)
         column, row = np.clip(np.rint(pixels), 0, np.array(self._left_out.shape[::-1]) - 1).astype(int).T
         return ~self._left_out[row, column]
-
-
-def _read(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    columns, rows = np.rint(pixels).astype(int).T
-    height, width = depth.shape
-    return depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float32)
 
 
 Evidence = Sequence[FrameEvidence]
