@@ -69,9 +69,10 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
     next is then that of the map, or the recorded one where both disagree by more than the recording drifts.
     """
     poses, scales = np.array([keyframe.pose for keyframe in slam.keyframes]), np.ones(len(slam.keyframes))
-    for numbers in pieces_by_size(slam):
-        if not np.isfinite(units[numbers[0]]):
+    for submap in pieces_by_size(slam):
+        if not np.isfinite(units[submap[0]]):
             continue
+        numbers = tuple(sorted(submap, key=lambda number: slam.keyframes[number].timestamp))
         ties = [
             recorded_tie(recorded, slam.keyframes[first], slam.keyframes[second], 1.0)
             for first, second in pairwise(numbers)

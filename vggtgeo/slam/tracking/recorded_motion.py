@@ -93,15 +93,16 @@ def recorded_tie(
 
 
 def recorded_ties(recorded: RecordedPoses, known: Map, units: np.ndarray) -> list[MeasuredRelativePose]:
-    """Those between keyframes that follow each other in one submap. units: of the recording at each keyframe, float64
-    [n], NaN = not known.
+    """Those between keyframes that follow each other in time, in one submap. units: of the recording at each keyframe,
+    float64 [n], NaN = not known.
     """
     label = piece_of(known)
     placed = [keyframe for keyframe in known.keyframes if np.isfinite(units[keyframe.number])]
+    placed.sort(key=lambda keyframe: keyframe.timestamp)
     ties = [
-        recorded_tie(recorded, first, second, float(units[second.number]))
-        for first, second in pairwise(placed)
-        if label[first.number] == label[second.number]
+        recorded_tie(recorded, *sorted(pair, key=lambda keyframe: keyframe.number), float(units[pair[1].number]))
+        for pair in pairwise(placed)
+        if label[pair[0].number] == label[pair[1].number]
     ]
     return [tie for tie in ties if tie is not None]
 
