@@ -84,7 +84,8 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
             before, after = (slam.keyframes[number].pose for number in (first, second))
             poses[second] = longer(after @ rigid.invert(before), 1.0 / local[row]) @ poses[first]
             if tie is not None and distance(tie, poses) > BELIEF:
-                poses[second] = tie.pose @ poses[first]
+                recorded_motion = tie.pose if tie.second == second else rigid.invert(tie.pose)
+                poses[second] = recorded_motion @ poses[first]
     factors = tuple(factor for factor in slam.map.factors if not isinstance(factor, MeasuredBaseline))
     return at_poses(replace(slam, map=replace(slam.map, factors=factors)), poses, scales)
 
@@ -115,9 +116,7 @@ def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
     for other in others:
         pairs = product((slam.keyframes[number] for number in main), (slam.keyframes[number] for number in other))
         near, own = min(pairs, key=lambda pair: abs(pair[0].timestamp - pair[1].timestamp))
-        tie = recorded_tie(
-            recorded, *sorted((near, own), key=lambda keyframe: keyframe.number), float(units[own.number])
-        )
+        tie = recorded_tie(recorded, near, own, float(units[own.number]))
         if tie is None:
             continue
         motion = tie.pose if tie.second == own.number else rigid.invert(tie.pose)

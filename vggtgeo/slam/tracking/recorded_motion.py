@@ -83,7 +83,11 @@ def recorded_units(recorded: RecordedPoses, known: Map) -> np.ndarray:
 def recorded_tie(
     recorded: RecordedPoses, first: Keyframe, second: Keyframe, unit: float
 ) -> MeasuredRelativePose | None:
-    """The recorded motion between two keyframes in the unit of the map; None where the recording does not tell."""
+    """The recorded motion between two keyframes in the unit of the map, from the one of the smaller number; None where
+    the recording does not tell.
+    """
+    if first.number > second.number:
+        first, second = second, first
     motion = recorded.motion(first.timestamp, second.timestamp)
     if motion is None:
         return None
@@ -100,9 +104,9 @@ def recorded_ties(recorded: RecordedPoses, known: Map, units: np.ndarray) -> lis
     placed = [keyframe for keyframe in known.keyframes if np.isfinite(units[keyframe.number])]
     placed.sort(key=lambda keyframe: keyframe.timestamp)
     ties = [
-        recorded_tie(recorded, *sorted(pair, key=lambda keyframe: keyframe.number), float(units[pair[1].number]))
-        for pair in pairwise(placed)
-        if label[pair[0].number] == label[pair[1].number]
+        recorded_tie(recorded, first, second, float(units[second.number]))
+        for first, second in pairwise(placed)
+        if label[first.number] == label[second.number]
     ]
     return [tie for tie in ties if tie is not None]
 
