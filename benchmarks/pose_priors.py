@@ -5,7 +5,8 @@ phone's poses are, and with poses of another recording.
         [--other ../shared/data/corridor-office] [--frames 0 240] [--depth] [--seed 0]
 
 own: the truth in another world, with 2 % of the path drift, 1 degree a minute, and 5 % too long. other: the poses of
-another clip at the times of this one. ATE after Sim(3), cm, over the frames that have a pose in the largest piece.
+another clip at the times of this one. evidence: logarithm of the ratio of likelihoods. ATE after Sim(3), cm, over the
+frames that have a pose in the largest piece. lengths: of the map, over the true ones.
 """
 
 from __future__ import annotations
@@ -44,18 +45,20 @@ def main() -> None:
     priors = {"none": None, "own": RecordedPoses(disturbed(truth))}
     if options.other is not None:
         priors["other"] = RecordedPoses(_at_times(open_sequence(options.other).ground_truth(), truth.timestamps))
-    print("| prior | used | frames | pieces | ATE Sim(3), cm | keyframes | s |\n" + "|---" * 7 + "|")
+    print("| prior | evidence | frames | pieces | ATE Sim(3), cm | lengths | keyframes | s |\n" + "|---" * 8 + "|")
     for name in options.priors:
         roles = replace(default_roles(options.depth).seeded(options.seed), recorded=priors[name])
         began = time.monotonic()
         frames = _frames(sequence, options)
         slam = finish(deque(run(frames, roles, camera=sequence.camera), maxlen=1).pop(), roles)
-        used = prior_summary(slam, roles).get("pose_prior", {}).get("used", "")
+        found = prior_summary(slam, roles).get("pose_prior")
+        evidence = "" if found is None else f"{found['evidence']:.1f}{', used' if found['used'] else ''}"
         estimate = frame_trajectory(slam)
-        error = 100 * absolute_error(*associate(estimate, truth), "sim3").statistics.rmse
+        error = absolute_error(*associate(estimate, truth), "sim3")
         counts = f"{len(estimate)} of {len(slam.frames)} | {len(pieces_by_size(slam))}"
         seconds = time.monotonic() - began
-        print(f"| {name} | {used} | {counts} | {error:.2f} | {len(slam.keyframes)} | {seconds:.0f} |", flush=True)
+        figures = f"{100 * error.statistics.rmse:.2f} | {1 / error.alignment.scale:.3f}"
+        print(f"| {name} | {evidence} | {counts} | {figures} | {len(slam.keyframes)} | {seconds:.0f} |", flush=True)
 
 
 def disturbed(truth: Trajectory) -> Trajectory:

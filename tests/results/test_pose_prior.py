@@ -60,7 +60,7 @@ def test_a_run_says_what_became_of_the_prior() -> None:
     """Two frames compare no motion: the prior is not used, and the summary and a note say so; there is no truth."""
     sequence = simulate("room", 2, size=(160, 120))
     summary = reconstruct(sequence, settings=SETTINGS, pose_prior="recorded", dense="none").summary
-    assert summary["pose_prior"] == {"used": False, "unit": 1.0, "compared": 0, "agreeing": 0}
+    assert summary["pose_prior"] == {"used": False, "unit": None, "compared": 0, "evidence": 0.0}
     assert "truth" not in summary
     other = Trajectory(np.array([100.0, 101.0]), np.tile(np.eye(4), (2, 1, 1)))
     summary = reconstruct(sequence, settings=SETTINGS, pose_prior=other, dense="none").summary

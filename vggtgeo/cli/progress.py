@@ -132,7 +132,7 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
             f", of the original images; {sizes['from']} pixels were reduced to {sizes['to']} for everything else"
         )
     if summary["scale"].startswith("free"):
-        lines.append("scale: free, there is no metric depth; lengths have no unit")
+        lines.append(f"scale: {summary['scale']}")
     elif not verdict.metric:
         lines.append("scale: doubtful, lengths may not be metres")
     else:

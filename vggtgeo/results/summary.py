@@ -79,7 +79,7 @@ def summarise(
         "pairs": len(slam.map.pairs),
         "pieces": list_submaps(slam),
         "peak_memory_gb": round(peak_memory_gb(), 3),
-        "scale": scale_name(slam, verdict),
+        "scale": scale_name(slam, verdict, recorded=counts.get("pose_prior", {}).get("used", False)),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
         **_pose_sigma(slam),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
@@ -139,10 +139,13 @@ def lens_parameters(lens: Camera) -> dict[str, float]:
 SCALE_BASIS = "depth only: a constant factor on the depth cannot be observed in the images"
 
 
-def scale_name(slam: Slam, verdict: Verdict) -> str:
-    """Return the kind of scale; "metric" only if no check of the verdict doubts it."""
+def scale_name(slam: Slam, verdict: Verdict, *, recorded: bool = False) -> str:
+    """Return the kind of scale; "metric" only if no check of the verdict doubts it. recorded: whether recorded poses
+    were used as a prior, which then give a map without depth its unit.
+    """
     if not slam.metric:
-        return "free (no metric depth): lengths have no unit"
+        unit = "lengths are in the unit of the recorded poses" if recorded else "lengths have no unit"
+        return f"free (no metric depth): {unit}"
     return "metric" if verdict.metric else "doubtful (see the verdict): lengths may not be metres"
 
 

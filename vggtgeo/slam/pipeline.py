@@ -13,13 +13,13 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.join_submaps import join_pieces
-from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe
+from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe, view_change
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pending_window import begin_window, is_due, settled
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.recorded_prior import recorded_prior
+from vggtgeo.slam.recorded_prior import RecordedPrior, recorded_prior
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import without_matches
@@ -90,15 +90,16 @@ def step(
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
             return begun or start_without_depth(slam, frame, features, roles, settings)
 
-    slam, data, found = _track(slam, frame, description, roles, settings, clock)
+    recorded = recorded_prior(slam, roles)
+    slam, data, found = _track(slam, frame, description, recorded, roles, settings, clock)
     if found is None or not found.accepted:
-        return _missed(slam, data, Evidence() if found is None else found.evidence, roles, settings, clock)
+        return _missed(slam, data, Evidence() if found is None else found.evidence, recorded, roles, settings, clock)
     was_lost = bool(slam.tracker.lost)
     slam = _moved(slam, frame, found)
 
     slam, found, becomes_keyframe = _decide(slam, data, found, roles, settings, clock)
     if becomes_keyframe:
-        slam = _insert_and_adjust(slam, data, found, roles, settings, clock)
+        slam = _insert_and_adjust(slam, data, found, recorded, roles, settings, clock)
     else:
         slam = _refer_to(slam, found.keyframe, roles)
         slam = _with_record(slam, record_of(frame, found))
@@ -137,7 +138,13 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
 
 
 def _track(
-    slam: Slam, frame: Frame, description: Description, roles: Roles, settings: SlamSettings, clock: Clock
+    slam: Slam,
+    frame: Frame,
+    description: Description,
+    recorded: RecordedPrior | None,
+    roles: Roles,
+    settings: SlamSettings,
+    clock: Clock,
 ) -> tuple[Slam, FrameData, Track | None]:
     """The frame and its pose by the map, and the state that the pose belongs to.
 
@@ -147,11 +154,11 @@ def _track(
         data = _with_lines(frame_data(frame, description, slam.intrinsics, roles, slam.metric), roles, settings)
         # In a map of another run the place of the first frame is unknown: it is searched by appearance alone.
         unknown_place = _in_known_map(slam) and slam.tracker.reference is None
-        found = None if unknown_place else _find(slam, data, roles, settings)
+        found = None if unknown_place else _find(slam, data, recorded, roles, settings)
     if slam.pending is not None and (found is None or not found.accepted):
         slam = _settled(slam, clock)
         with clock.measure("track"):
-            found = _find(slam, data, roles, settings)
+            found = _find(slam, data, recorded, roles, settings)
     if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
         slam = _settled(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
@@ -162,8 +169,7 @@ def _track(
     if grows and not slam.metric and found is not None and not found.accepted:
         with clock.measure("track"):
             newest = slam.keyframes[slam.window.members[-1]]
-            given = TrackingInput(data, slam.intrinsics, roles, _prior(slam, frame, roles))
-            recorded = recorded_prior(slam, roles)
+            given = TrackingInput(data, slam.intrinsics, roles, _prior(slam, frame, recorded))
             length = None if recorded is None else recorded.length(newest, frame.timestamp)
             found = track_by_rays(given, newest, length or usual_step(slam.keyframes, frame.index)) or found
     return slam, data, found
@@ -190,9 +196,9 @@ def _decide(
     return slam, found, not settings.keyframes.localise_only and _needs_keyframe(found, settings)
 
 
-def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Track:
+def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Roles, settings: SlamSettings) -> Track:
     """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
-    prior = _prior(slam, data.frame, roles)
+    prior = _prior(slam, data.frame, recorded)
     first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
     others = [number for number in reversed(slam.window.members) if number != first][:2]
     window = tuple(slam.keyframes[number] for number in (first, *others))
@@ -216,9 +222,8 @@ def _find(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> 
     return refined_by_map(best, given, piece)
 
 
-def _prior(slam: Slam, frame: Frame, roles: Roles) -> MotionPrior:
+def _prior(slam: Slam, frame: Frame, recorded: RecordedPrior | None) -> MotionPrior:
     """Where a frame is, as recorded, or if the camera goes on as it did."""
-    recorded = recorded_prior(slam, roles)
     step = None if recorded is None else recorded.step(slam, frame.timestamp)
     velocity = slam.tracker.velocity if step is None else step
     predicted = rigid.orthonormal(velocity @ slam.last_pose)
@@ -235,7 +240,13 @@ def _rank(found: Track) -> tuple[bool, int]:
 
 
 def _insert_and_adjust(
-    slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
+    slam: Slam,
+    data: FrameData,
+    found: Track,
+    recorded: RecordedPrior | None,
+    roles: Roles,
+    settings: SlamSettings,
+    clock: Clock,
 ) -> Slam:
     """The state with the frame as a keyframe, whose window is matched and adjusted.
 
@@ -258,7 +269,8 @@ def _insert_and_adjust(
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
             entered = insert_keyframe(slam, keyframe, roles, settings, tied_to=odometry.first)
-            entered = _with_recorded(_with_odometry(entered, odometry), roles)
+            entered = _with_odometry(entered, odometry)
+            entered = entered if recorded is None else recorded.with_tie(entered)
             entered = constrain_rotation(entered, settings)
         with clock.measure("place frames" + own):
             entered = replace(entered, tracker=against_reference(entered.map, entered.tracker))
@@ -290,14 +302,6 @@ def _with_odometry(slam: Slam, odometry: MeasuredRelativePose) -> Slam:
     if all(pair.key != odometry.keyframes for pair in known.pairs):
         known = replace(known, pairs=(*known.pairs, without_matches(*odometry.keyframes)))
     return replace(slam, map=known)
-
-
-def _with_recorded(slam: Slam, roles: Roles) -> Slam:
-    """The state with the recorded motion to the newest keyframe, where the images agree with recorded poses."""
-    recorded, (before, newest) = recorded_prior(slam, roles), slam.keyframes[-2:]
-    if recorded is None or any(tie.keyframes == (before.number, newest.number) for tie in slam.map.recorded_factors):
-        return slam
-    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, *recorded.tie(before, newest))))
 
 
 def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
@@ -336,19 +340,26 @@ def _noted_found(slam: Slam, frame: Frame) -> Slam:
 
 
 def _missed(
-    slam: Slam, data: FrameData, evidence: Evidence, roles: Roles, settings: SlamSettings, clock: Clock
+    slam: Slam,
+    data: FrameData,
+    evidence: Evidence,
+    recorded: RecordedPrior | None,
+    roles: Roles,
+    settings: SlamSettings,
+    clock: Clock,
 ) -> Slam:
     """No pose by images: that of the recording, if it is known; else after too many such frames begin a piece of map of
     its own.
     """
     frame, features = data.frame, data.features
-    recorded = recorded_prior(slam, roles)
     carried = None if recorded is None else recorded.carried(slam, frame.timestamp)
     if carried is not None:
         slam = _moved(slam, frame, carried)
-        if settings.keyframes.localise_only or len(features) <= settings.keyframes.min_inliers:
+        shows = len(features) > settings.keyframes.min_inliers
+        moved = view_change(carried.pose, slam.keyframes[-1].pose, settings.keyframes) > 1.0
+        if settings.keyframes.localise_only or not (shows and moved):
             return _with_record(slam, record_of(frame, carried))
-        return _insert_and_adjust(slam, data, carried, roles, settings, clock)
+        return _insert_and_adjust(slam, data, carried, recorded, roles, settings, clock)
     if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))

@@ -14,11 +14,10 @@ import numpy as np
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.connected import piece_of
-from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.units import longer
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.recorded_motion import Comparison, carried, compare, recorded_tie, recorded_ties
+from vggtgeo.slam.tracking.recorded_motion import carried, compare, recorded_tie
 from vggtgeo.slam.tracking.track import Track
 from vggtgeo.slam.tracking.tracker import FramePose
 
@@ -46,10 +45,14 @@ class RecordedPrior:
         motion = self.recorded.motion(keyframe.timestamp, time)
         return None if motion is None else self.unit * float(np.linalg.norm(motion[:3, 3]))
 
-    def tie(self, first: Keyframe, second: Keyframe) -> tuple[MeasuredRelativePose, ...]:
-        """The recorded motion between two keyframes, if any."""
-        found = recorded_tie(self.recorded, first, second, self.unit)
-        return () if found is None else (found,)
+    def with_tie(self, slam: Slam) -> Slam:
+        """The state with the recorded motion to its newest keyframe from the one before, if both are in one submap."""
+        label, (before, newest) = piece_of(slam.map), slam.keyframes[-2:]
+        known = any(tie.keyframes == (before.number, newest.number) for tie in slam.map.recorded_factors)
+        tie = recorded_tie(self.recorded, before, newest, self.unit)
+        if tie is None or known or label[before.number] != label[newest.number]:
+            return slam
+        return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie)))
 
 
 def recorded_prior(slam: Slam, roles: Roles) -> RecordedPrior | None:
@@ -57,7 +60,7 @@ def recorded_prior(slam: Slam, roles: Roles) -> RecordedPrior | None:
     if roles.recorded is None:
         return None
     found = compare(roles.recorded, slam.map)
-    return RecordedPrior(roles.recorded, found.unit) if found.believed else None
+    return RecordedPrior(roles.recorded, found.unit) if found.believed and found.unit is not None else None
 
 
 def last_placed(slam: Slam) -> FramePose | None:
@@ -65,50 +68,11 @@ def last_placed(slam: Slam) -> FramePose | None:
     return next((record for record in reversed(slam.frames) if record.tracked), None)
 
 
-def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
-    """The state before its last adjustment, with all recorded motions between keyframes in the unit that all of them
-    tell; without any where the images contradict them. A map of free scale takes its unit from them.
-    """
-    if roles.recorded is None:
-        return slam
-    found = compare(roles.recorded, slam.map)
-    factors = [factor for factor in slam.map.factors if not getattr(factor, "recorded", False)]
-    # A keyframe that no image ties to the others stays tied by what was recorded.
-    alone = [tie for tie in slam.map.recorded_factors if not found.believed and _alone(slam, tie)]
-    ties = recorded_ties(roles.recorded, slam.map, piece_of(slam.map), found.unit) if found.believed else alone
-    if ties and not slam.metric:
-        factors = [factor for factor in factors if not isinstance(factor, MeasuredBaseline)]
-    note = _note(found)
-    return replace(
-        slam, map=replace(slam.map, factors=(*factors, *ties)), notes=(*slam.notes, *([note] if note else []))
-    )
-
-
 def prior_summary(slam: Slam, roles: Roles) -> dict[str, Any]:
-    """Return the summary's entry on recorded poses, if there are any: whether they were used, how many of the last
-    motions were compared and agree, and how many of the map's units a unit of theirs is.
+    """Return the summary's entry on recorded poses, if there are any: whether they were used, how many motions were
+    compared, the logarithm of the likelihood ratio, and how many of the map's units a unit of theirs is.
     """
     if roles.recorded is None:
         return {}
     found = compare(roles.recorded, slam.map)
     return {"pose_prior": {"used": found.believed, **asdict(found)}}
-
-
-def _alone(slam: Slam, tie: MeasuredRelativePose) -> bool:
-    """Whether nothing else ties the later keyframe of a recorded motion to an earlier one."""
-    earlier = [pair.first for pair in slam.map.pairs if pair.second == tie.second and len(pair.points)]
-    tracked = [other.first for other in slam.map.odometry_factors if other.second == tie.second]
-    return not any(number < tie.second for number in (*earlier, *tracked))
-
-
-def _note(found: Comparison) -> str:
-    if found.believed:
-        return (
-            f"recorded poses are a prior of the motion: {found.agreeing} of the last {found.compared} agree with images"
-        )
-    if found.contradicted:
-        return (
-            f"the recorded poses are not of these images, and are not used: {found.agreeing} of the last "
-            f"{found.compared} motions agree"
-        )
-    return f"the recorded poses could be compared with {found.compared} motions, too few, and are not used"

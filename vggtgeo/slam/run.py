@@ -27,6 +27,8 @@ from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.join_at_end import join_at_end
 from vggtgeo.slam.global_map.loops import close_loops
+from vggtgeo.slam.global_map.lost_frames import place_lost
+from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.made_ahead import made_ahead
 from vggtgeo.slam.pending_window import settled
@@ -34,7 +36,6 @@ from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.recorded_prior import with_recorded_ties
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import pieces_by_size
@@ -161,7 +162,9 @@ def finish(
     with clock.measure("place frames"):
         slam = replace(slam, tracker=against_nearest(slam.map, slam.tracker, slam.intrinsics, roles))
     with clock.measure("loops"):
-        slam = close_loops(with_recorded_ties(join_at_end(slam, roles), roles), roles, settings)
+        slam = place_lost(join_at_end(slam, roles), roles, settings)
+        slam = with_recorded_ties(join_at_end(slam, roles), roles)
+        slam = close_loops(slam, roles, settings)
     with clock.measure("global adjustment"):
         return adjust_all(slam, settings)
 

@@ -16,7 +16,7 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track
-from vggtgeo.slam.tracking.tracker import FramePose, Waiting
+from vggtgeo.slam.tracking.tracker import FramePose, Waiting, given_up
 from vggtgeo.slam.window.sliding_window import scale_anchor
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
@@ -174,6 +174,6 @@ def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
                 *(frame.index, frame.timestamp, first.number, found.relative, True, evidence.inliers, evidence)
             )
             placed[frame.index] = replace(record, seen=found.seen)
-    return replace(
-        slam, tracker=replace(slam.tracker, frames=tuple(placed.get(record.frame, record) for record in slam.frames))
-    )
+    frames = tuple(placed.get(record.frame, record) for record in slam.frames)
+    left = () if slam.metric else (waiting for waiting in slam.tracker.waiting if waiting.frame not in placed)
+    return replace(slam, tracker=replace(slam.tracker, frames=frames, unplaced=given_up(slam.tracker, left)))

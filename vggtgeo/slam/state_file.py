@@ -74,7 +74,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All classes that a file may have; a state with any other is not written."""
-VERSION = 18
+VERSION = 19
 STATE = Format("state", VERSION, by_name(STATE_CLASSES))
 
 

@@ -73,7 +73,7 @@ def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     true = np.zeros(len(measured), bool)
     true[sure] = found.believed
     dropped = [tie for tie, fits in zip(closing, true[: len(closing)], strict=True) if not fits]
-    moved = _taken(_without(slam, dropped), found.poses, units)
+    moved = at_poses(_without(slam, dropped), found.poses, units)
     # A loop that took no part (refused, or alone) is used where the corrected map agrees with it.
     own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
     believed = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
@@ -92,8 +92,8 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
             tree[tie.second] = tie
         else:
             others.append(tie)
-    for tie in slam.map.recorded_factors:
-        tree.setdefault(tie.second, tie)
+    # Recorded motions are there where images agree with the recording, and drift less than tracked ones.
+    tree |= {tie.second: tie for tie in slam.map.recorded_factors if tie.second not in slam.map.roots}
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     between = lambda first, second: rigid.orthonormal(poses[second] @ rigid.invert(poses[first]))
     loose = np.diag(1.0 / np.repeat(UNTRACKED, 3) ** 2)
@@ -133,8 +133,8 @@ def _graph(
 
 
 def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
-    """Return the factor on the lengths of each keyframe, float64 [n]; 1 if they are metres."""
-    if slam.metric:
+    """Return the factor on the lengths of each keyframe, float64 [n]; 1 if they are metres or in the recording's unit."""
+    if slam.metric or slam.map.recorded_factors:
         return np.ones(len(slam.keyframes))
     ratios = [UnitRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
     return solve_units(len(slam.keyframes), motions, ratios)
@@ -148,7 +148,7 @@ def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
     )
 
 
-def _taken(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
+def at_poses(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
     """Return the map at other poses, lengths scaled keyframe by keyframe."""
     unit = lambda number: float(units[number])
     factors = tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors)

@@ -1,75 +1,93 @@
 """Recorded poses against the images: whether they are of this recording, and how long their unit is in the map.
 
-Each tracked motion between keyframes is compared with the recorded one, in the noise of both. Recorded poses take part
-while most of the last motions agree; those of another recording, or of another clock, never do.
+Two hypotheses about the tracked motions `m_k` between keyframes are compared. Of this recording: `m_k` is the recorded
+motion `r_k` of the same time, up to one unit, to within the noise of both. Of another one, or of another clock: `m_k`
+may as well belong to the recorded motion `r_j` of any other time. With the likelihood `p(m_k | r)`, in the noise of the
+motion and of the recording, the ratio of the likelihoods is
+
+    rho_k = p(m_k | r_k) / mean_j p(m_k | r_j)
+
+A share of the motions is tracked wrongly, so the first hypothesis is a mixture, a half of each, and the ratio for the
+whole record is the product of `(rho_k + 1) / 2`. Where the recording is another one, `r_k` is any of the `r_j`, and the
+expected product is 1, at any time: it exceeds `1 / a` in a share `a` of such runs at most, however often one looks
+(Ville's inequality). So one recorded motion that agrees by chance, or many that are all alike, are no evidence.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import GeometryResult
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
+from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.sparse_map.units import longer
-from vggtgeo.slam.tracking.evidence import Evidence, tangent, worst_sigma
-from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
+from vggtgeo.slam.tracking.evidence import Evidence, worst_sigma
 from vggtgeo.slam.tracking.track import Track
 from vggtgeo.slam.tracking.tracker import FramePose
 
-LEAST, RECENT = 8, 20
-"""Motions that are compared before anything is believed, and how many of the last decide."""
+SIGNIFICANT = float(np.log(1e4))
+"""Logarithm of the ratio of likelihoods that decides: one false decision in 10,000 runs, as at the other gates."""
+FOLLOWING = 0.5
+"""Share of the tracked motions that follow the recording, if it is of these images."""
+MAX_OTHERS = 32
+"""Recorded motions of other times that each motion is compared with, spread over the record."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Recorded poses and a map. unit: what a unit of theirs is in the map's. compared, agreeing: of the last motions
-    between keyframes that images measured.
+    """Recorded poses and a map. unit: what a unit of theirs is in that of the map's newest submap, None where no motion
+    tells. compared: motions between keyframes that images measured. evidence: logarithm of the ratio of likelihoods,
+    that the recording is of these images over that it is not.
     """
 
-    unit: float
+    unit: float | None
     compared: int
-    agreeing: int
+    evidence: float
 
     @property
     def believed(self) -> bool:
-        return self.compared >= LEAST and 2 * self.agreeing > self.compared
+        return self.evidence > SIGNIFICANT
 
     @property
     def contradicted(self) -> bool:
-        return self.compared >= LEAST and not self.believed
+        return self.evidence < -SIGNIFICANT
 
 
 def compare(recorded: RecordedPoses, known: Map) -> Comparison:
     """Compare the recorded motions with those that images have measured."""
-    pairs = []
-    for tie in known.odometry_factors:
-        first, second = (known.keyframes[number] for number in tie.keyframes)
-        motion = recorded.motion(first.timestamp, second.timestamp)
-        if motion is not None and not tie.by_rays:
-            pairs.append((tie, motion, second.timestamp - first.timestamp))
-    if not pairs:
-        return Comparison(1.0, 0, 0)
-    unit = _unit([(tie.pose, motion) for tie, motion, _ in pairs])
-    agreeing = 0
-    for tie, motion, seconds in pairs[-RECENT:]:
-        scaled = longer(motion, unit)
-        measured = tie if known.metric else tie.of_free_length()
-        noise = np.linalg.inv(measured.information) + recorded.covariance(scaled, seconds)
-        off = tangent(tie.pose @ rigid.invert(scaled))
-        agreeing += bool(off @ np.linalg.solve(noise, off) < AGREEMENT_GATE)
-    return Comparison(unit, len(pairs[-RECENT:]), agreeing)
+    record = _Record.of(recorded, known)
+    if record is None:
+        return Comparison(None, 0, 0.0)
+    units = record.units()
+    newest = float(units[-1])
+    return Comparison(newest if np.isfinite(newest) else None, len(record.motions), record.evidence(recorded, units))
+
+
+def recorded_units(recorded: RecordedPoses, known: Map) -> np.ndarray:
+    """What a unit of the recording is at each keyframe, float64 [n]: in its submap, or in metres; NaN where no measured
+    motion tells.
+    """
+    record = _Record.of(recorded, known)
+    return np.full(len(known.keyframes), np.nan) if record is None else record.units()
 
 
 def recorded_tie(
     recorded: RecordedPoses, first: Keyframe, second: Keyframe, unit: float
 ) -> MeasuredRelativePose | None:
-    """The recorded motion between two keyframes in the unit of the map; None where the recording does not tell."""
+    """The recorded motion between two keyframes in the unit of the map, from the one of the smaller number; None where
+    the recording does not tell.
+    """
+    if first.number > second.number:
+        first, second = second, first
     motion = recorded.motion(first.timestamp, second.timestamp)
     if motion is None:
         return None
@@ -78,11 +96,16 @@ def recorded_tie(
     return MeasuredRelativePose(first.number, second.number, scaled, np.linalg.inv(noise), recorded=True)
 
 
-def recorded_ties(recorded: RecordedPoses, known: Map, label: np.ndarray, unit: float) -> list[MeasuredRelativePose]:
-    """Those between successive keyframes of one piece; label: piece of each keyframe, int [n]."""
+def recorded_ties(recorded: RecordedPoses, known: Map, units: np.ndarray) -> list[MeasuredRelativePose]:
+    """Those between keyframes that follow each other in time, in one submap. units: of the recording at each keyframe,
+    float64 [n], NaN = not known.
+    """
+    label = piece_of(known)
+    placed = [keyframe for keyframe in known.keyframes if np.isfinite(units[keyframe.number])]
+    placed.sort(key=lambda keyframe: keyframe.timestamp)
     ties = [
-        recorded_tie(recorded, first, second, unit)
-        for first, second in zip(known.keyframes, known.keyframes[1:], strict=False)
+        recorded_tie(recorded, first, second, float(units[second.number]))
+        for first, second in pairwise(placed)
         if label[first.number] == label[second.number]
     ]
     return [tie for tie in ties if tie is not None]
@@ -104,12 +127,88 @@ def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, u
     return Track(keyframe, relative @ keyframe.pose, information, evidence, GeometryResult.SUCCESS)
 
 
-def _unit(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Median of the ratios of lengths, measured over recorded, weighted by the length."""
-    lengths = np.array([[np.linalg.norm(motion[:3, 3]) for motion in pair] for pair in pairs])
-    lengths = lengths[lengths.min(1) > 0]
-    if not len(lengths):
-        return 1.0
-    ratios, order = lengths[:, 0] / lengths[:, 1], np.argsort(lengths[:, 0] / lengths[:, 1])
-    share = np.cumsum(lengths[order, 0])
-    return float(ratios[order][np.searchsorted(share, 0.5 * share[-1])])
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """The value [n] that half of the weight is below."""
+    order = np.argsort(values)
+    share = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
+
+
+@dataclass(frozen=True, eq=False)
+class _Record:
+    """Motions that images measured, each with the recorded one. motions: float64 [m, 4, 4], in the unit of the
+    recording. second: keyframe that each ends at, int [m]. label: of the part with one unit that each keyframe belongs
+    to, int [n].
+    """
+
+    measured: tuple[MeasuredRelativePose, ...]
+    motions: np.ndarray
+    seconds: np.ndarray
+    second: np.ndarray
+    label: np.ndarray
+
+    @classmethod
+    def of(cls, recorded: RecordedPoses, known: Map) -> _Record | None:
+        """Of the record so far; None where the recording tells none of its motions."""
+        label, rows = np.zeros(len(known.keyframes), int) if known.metric else piece_of(known), []
+        for factor in known.odometry_factors:
+            first, second = (known.keyframes[number] for number in factor.keyframes)
+            motion = recorded.motion(first.timestamp, second.timestamp)
+            if motion is not None:
+                own = factor if known.metric else factor.of_free_length()
+                rows.append((own, motion, second.timestamp - first.timestamp, factor.second))
+        if not rows:
+            return None
+        measured, motions, seconds, ends = zip(*rows, strict=True)
+        return cls(measured, np.array(motions), np.array(seconds), np.array(ends), label)
+
+    def units(self) -> np.ndarray:
+        """Of each keyframe, float64 [n]: the median over the motions of its submap of the ratios of lengths, measured
+        over recorded, weighted by the recorded length, which no wrong match changes.
+        """
+        measured = np.array([0.0 if own.by_rays else np.linalg.norm(own.pose[:3, 3]) for own in self.measured])
+        lengths = np.linalg.norm(self.motions[:, :3, 3], axis=1)
+        known, found = (measured > 0) & (lengths > 0), np.full(len(self.label), np.nan)
+        for submap in np.unique(self.label[self.second[known]]):
+            own = known & (self.label[self.second] == submap)
+            found[self.label == submap] = weighted_median(measured[own] / lengths[own], lengths[own])
+        return found
+
+    def evidence(self, recorded: RecordedPoses, units: np.ndarray) -> float:
+        """Logarithm of the ratio of likelihoods. Motions in a unit that is not known say nothing."""
+        rows = np.flatnonzero(np.isfinite(units[self.second]))
+        if len(rows) < 2:
+            return 0.0
+        scale = units[self.second[rows]]
+        own = _longer(self.motions[rows], scale)
+        noise = [
+            np.linalg.inv(self.measured[row].information) + recorded.covariance(motion, float(self.seconds[row]))
+            for row, motion in zip(rows, own, strict=True)
+        ]
+        # Whitens an error: |root^T e|^2 is its squared Mahalanobis distance.
+        root = np.linalg.cholesky(np.linalg.inv(np.array(noise)))
+        others = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_OTHERS)).round().astype(int))
+        elsewhere = _longer(self.motions[rows[others]][None], scale[:, None])
+        candidates = np.concatenate([own[:, None], elsewhere], 1)
+        measured = np.array([self.measured[row].pose for row in rows])
+        error = _tangents(measured[:, None] @ rigid.invert(candidates))
+        log_likelihood = -0.5 * ((error @ root) ** 2).sum(2)
+        # The motion's own time is among the candidates once.
+        again = np.concatenate([np.zeros((len(rows), 1), bool), others[None] == np.arange(len(rows))[:, None]], 1)
+        log_likelihood[again] = -np.inf
+        count = (~again).sum(1)
+        log_ratio = log_likelihood[:, 0] - logsumexp(log_likelihood, axis=1) + np.log(count)
+        return float(np.logaddexp(np.log(FOLLOWING) + log_ratio, np.log(1.0 - FOLLOWING)).sum())
+
+
+def _longer(motions: np.ndarray, ratios: np.ndarray) -> np.ndarray:
+    """Motions [..., 4, 4] whose translations are multiplied by ratios that broadcast to [...]."""
+    found = np.broadcast_to(motions, (*np.broadcast_shapes(motions.shape[:-2], ratios.shape), 4, 4)).copy()
+    found[..., :3, 3] *= ratios[..., None]
+    return found
+
+
+def _tangents(motions: np.ndarray) -> np.ndarray:
+    """Translation and rotation vector of motions [n, m, 4, 4], float64 [n, m, 6]."""
+    turned = Rotation.from_matrix(motions[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*motions.shape[:2], 3)
+    return np.concatenate([motions[..., :3, 3], turned], -1)

@@ -19,7 +19,7 @@ from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.tracking.evidence import STEP_GATE
 from vggtgeo.slam.tracking.odometry import Odometry
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_between, track
-from vggtgeo.slam.tracking.tracker import FramePose, Tracker, Waiting, frame_pose
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker, Waiting, frame_pose, given_up
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
@@ -115,7 +115,8 @@ def place_waiting(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: R
         step, pose = found.pose @ rigid.invert(pose), found.pose
         placed[waiting.frame] = record_of(frame, found)
     frames = tuple(placed.get(record.frame, record) for record in tracker.frames)
-    return replace(tracker, frames=frames, waiting=())
+    left = () if known.metric else (waiting for waiting in tracker.waiting if waiting.frame not in placed)
+    return replace(tracker, frames=frames, waiting=(), unplaced=given_up(tracker, left))
 
 
 def frame_data(frame: Frame, description: Description, intrinsics: np.ndarray, roles: Roles, metric: bool) -> FrameData:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,6 +12,9 @@ from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.sparse_map.units import longer, scaled_information
 from vggtgeo.slam.tracking.evidence import Evidence
+
+MAX_UNPLACED = 90
+"""Each takes half a megabyte at 480 x 270, its image and descriptors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,8 @@ class Tracker:
         reference: Number of the keyframe that frames are tracked against, and its view for the alignment.
         lost: Frames since tracking was lost, 0 while it goes well.
         waiting: Frames without a pose so far.
+        unplaced: Frames that stayed without a pose in a map of free scale, the last `MAX_UNPLACED` of them: the end
+            tries them again (`global_map/lost_frames.py`).
         between: Rows of the last frames, and their views, that wait for the next keyframe (`frame_refinement.py`).
 
     """
@@ -87,7 +93,13 @@ class Tracker:
     reference: tuple[int, RgbdView | None] | None = None
     lost: int = 0
     waiting: tuple[Waiting, ...] = ()
+    unplaced: tuple[Waiting, ...] = ()
     between: tuple[tuple[int, RgbdView], ...] = ()
+
+
+def given_up(tracker: Tracker, frames: Iterable[Waiting]) -> tuple[Waiting, ...]:
+    """The unplaced frames with these."""
+    return (*tracker.unplaced, *frames)[-MAX_UNPLACED:]
 
 
 def frame_pose(known: Map, record: FramePose) -> np.ndarray:

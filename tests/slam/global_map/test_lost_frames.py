@@ -1,0 +1,98 @@
+"""Frames that tracking has lost, tried again at the end. Exact truth: the renderer's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from vggtgeo.models.classical import NoDepth, SiftMatcher
+
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.evaluation import evaluate_trajectory
+from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.simulation import simulate
+from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.global_map.lost_frames import place_lost
+from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.run import frame_trajectory, run_frames
+from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.tracking.relocalisation import place_waiting
+from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, Waiting
+
+SIZE = (320, 240)
+# The window of test_pipeline.py, so that the solver is compiled once.
+SETTINGS = SlamSettings(
+    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    refinement=RefinementSettings(global_adjustment=False),
+)
+ROLES = Roles(points=SiftMatcher(count=500))
+FREE_ROLES = replace(ROLES, depth=NoDepth())
+KNOWN = 12
+"""Frames of the walk that are tracked; the others are lost."""
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[list[Frame], Camera, Trajectory]:
+    sequence = simulate("room", 30, 0, SIZE, rate=10.0)
+    truth = sequence.ground_truth()
+    assert truth is not None
+    return list(sequence.frames()), sequence.camera, truth
+
+
+@pytest.fixture(scope="module")
+def lost(walk: tuple[list[Frame], Camera, Trajectory]) -> Slam:
+    """A map of the first frames whose scale is free, and all later frames without a pose."""
+    frames, camera, _ = walk
+    slam = settled(list(run_frames(iter(frames[:KNOWN]), camera, ROLES, SETTINGS, Clock()))[-1])
+    last = slam.frames[-1]
+    later = [replace(last, frame=frame.index, timestamp=frame.timestamp, tracked=False) for frame in frames[KNOWN:]]
+    unplaced = tuple(_waiting(frame) for frame in frames[KNOWN:])
+    tracker = replace(slam.tracker, frames=(*slam.frames, *later), unplaced=unplaced)
+    return replace(slam, map=replace(slam.map, metric=False), tracker=tracker)
+
+
+def _waiting(frame: Frame) -> Waiting:
+    return Waiting(frame.index, frame.timestamp, frame.image, ROLES.points.describe(frame.image))
+
+
+def test_lost_frames_are_placed_by_keyframes_made_of_them(
+    lost: Slam, walk: tuple[list[Frame], Camera, Trajectory]
+) -> None:
+    """The camera leaves what the map shows; frames that see its border become keyframes, which place those beyond.
+    Oracle: the renderer's poses.
+    """
+    found = place_lost(lost, FREE_ROLES, SETTINGS)
+    assert all(record.tracked for record in found.frames), [r.frame for r in found.frames if not r.tracked]
+    assert len(found.keyframes) > len(lost.keyframes)
+    assert not found.tracker.unplaced
+    error = evaluate_trajectory(frame_trajectory(found), walk[2]).se3.statistics.rmse
+    assert error < 0.03, f"{100 * error:.1f} cm"
+
+
+def test_frames_of_another_place_stay_lost(lost: Slam) -> None:
+    """Frames that show nothing of the map get no pose, and the map stays as it is."""
+    other = simulate("corridor", 3, 5, SIZE, rate=10.0)
+    elsewhere = tuple(
+        replace(_waiting(frame), frame=KNOWN + row, timestamp=(KNOWN + row) / 10)
+        for row, frame in enumerate(other.frames())
+    )
+    found = place_lost(replace(lost, tracker=replace(lost.tracker, unplaced=elsewhere)), FREE_ROLES, SETTINGS)
+    assert found.map is lost.map
+    assert not any(record.tracked for record in found.frames[KNOWN:])
+
+
+def test_frames_that_stay_without_a_pose_are_kept(lost: Slam) -> None:
+    """Of the frames that waited, those that the next tracked one does not place are kept, and not more than fit."""
+    blank = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    waiting = tuple(
+        Waiting(100 + row, 100.0 + row, blank, ROLES.points.describe(blank)) for row in range(MAX_UNPLACED + 5)
+    )
+    tracked = FramePose(300, 300.0, 0, np.eye(4), True, 50)
+    tracker = replace(lost.tracker, frames=(*lost.frames, tracked), waiting=waiting, unplaced=())
+    kept = place_waiting(lost.map, tracker, lost.intrinsics, FREE_ROLES)
+    assert not kept.waiting
+    assert [one.frame for one in kept.unplaced] == [one.frame for one in waiting[-MAX_UNPLACED:]]

@@ -1,0 +1,174 @@
+"""Recorded poses in the last adjustment: the unit of a map without depth, submaps that never met, frames that no image
+has placed, and the motions between keyframes. All this only where the images agree with them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise, product
+
+import numpy as np
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.global_map.pose_graph import BELIEF, distance
+from vggtgeo.slam.global_map.straightening import at_poses
+from vggtgeo.slam.perception.recorded_poses import RecordedPoses
+from vggtgeo.slam.settings.slam_settings import Roles
+from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
+from vggtgeo.slam.sparse_map.units import longer
+from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.tracking.recorded_motion import (
+    Comparison,
+    carried,
+    compare,
+    recorded_tie,
+    recorded_ties,
+    recorded_units,
+    weighted_median,
+)
+from vggtgeo.slam.tracking.track import Track
+from vggtgeo.slam.tracking.tracker import FramePose
+
+AROUND = 5
+"""Motions before and after a keyframe that tell its unit: about as many as are adjusted together."""
+
+
+def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
+    """The state before its last adjustment, with all recorded motions between keyframes; without any where the images
+    do not agree with them.
+
+    A map of free scale gets the unit of the recording. Submaps, and frames that no image has placed, are joined to the
+    rest by the recorded motions.
+    """
+    if roles.recorded is None:
+        return slam
+    found = compare(roles.recorded, slam.map)
+    slam = replace(slam, notes=(*slam.notes, _note(found)))
+    if not found.believed:
+        # A keyframe that no image ties to the others stays tied by what was recorded.
+        return _with_ties(slam, [tie for tie in slam.map.recorded_factors if _alone(slam, tie)])
+    units = recorded_units(roles.recorded, slam.map)
+    if not slam.metric:
+        slam = _in_recorded_unit(slam, roles.recorded, units)
+        units = np.where(np.isfinite(units), 1.0, np.nan)
+    slam = _with_carried_frames(_joined(slam, roles.recorded, units), roles.recorded, units)
+    return _with_ties(slam, recorded_ties(roles.recorded, slam.map, units))
+
+
+def _with_ties(slam: Slam, ties: list[MeasuredRelativePose]) -> Slam:
+    """The state with these recorded motions and no others."""
+    factors = [factor for factor in slam.map.factors if not getattr(factor, "recorded", False)]
+    return replace(slam, map=replace(slam.map, factors=(*factors, *ties)))
+
+
+def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
+    """The state with lengths in the unit of the recording, in submaps where it is known at all.
+
+    Scale drifts from keyframe to keyframe: each has the unit that the motions around it tell. The way from one to the
+    next is then that of the map, or the recorded one where both disagree by more than the recording drifts.
+    """
+    poses, scales = np.array([keyframe.pose for keyframe in slam.keyframes]), np.ones(len(slam.keyframes))
+    for submap in pieces_by_size(slam):
+        if not np.isfinite(units[submap[0]]):
+            continue
+        numbers = tuple(sorted(submap, key=lambda number: slam.keyframes[number].timestamp))
+        ties = [
+            recorded_tie(recorded, slam.keyframes[first], slam.keyframes[second], 1.0)
+            for first, second in pairwise(numbers)
+        ]
+        local = _local_units(slam, ties, numbers, float(units[numbers[0]]))
+        scales[list(numbers)] = 1.0 / local
+        poses[numbers[0], :3, 3] /= local[0]
+        for row, (tie, (first, second)) in enumerate(zip(ties, pairwise(numbers), strict=True)):
+            before, after = (slam.keyframes[number].pose for number in (first, second))
+            poses[second] = longer(after @ rigid.invert(before), 1.0 / local[row]) @ poses[first]
+            if tie is not None and distance(tie, poses) > BELIEF:
+                recorded_motion = tie.pose if tie.second == second else rigid.invert(tie.pose)
+                poses[second] = recorded_motion @ poses[first]
+    factors = tuple(factor for factor in slam.map.factors if not isinstance(factor, MeasuredBaseline))
+    return at_poses(replace(slam, map=replace(slam.map, factors=factors)), poses, scales)
+
+
+def _local_units(
+    slam: Slam, ties: list[MeasuredRelativePose | None], numbers: tuple[int, ...], usual: float
+) -> np.ndarray:
+    """What a unit of the recording is at each keyframe of a submap: the median over the motions around it of the ratio
+    of lengths, weighted by the recorded length; `usual` where no motion tells.
+    """
+    places = rigid.centres(np.array([slam.keyframes[number].pose for number in numbers]))
+    lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    true = np.array([0.0 if tie is None else np.linalg.norm(tie.pose[:3, 3]) for tie in ties])
+    found = np.full(len(numbers), usual)
+    for row in range(len(numbers)):
+        around = slice(max(row - AROUND, 0), row + AROUND)
+        known = (lengths[around] > 0) & (true[around] > 0)
+        if known.any():
+            found[row] = weighted_median(lengths[around][known] / true[around][known], true[around][known])
+    return found
+
+
+def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
+    """The state with submaps of a known unit placed by the recorded motion from the nearest keyframe of the largest
+    submap, or of those joined to it before.
+    """
+    main, *others = [set(numbers) for numbers in pieces_by_size(slam) if np.isfinite(units[numbers[0]])]
+    for other in others:
+        pairs = product((slam.keyframes[number] for number in main), (slam.keyframes[number] for number in other))
+        near, own = min(pairs, key=lambda pair: abs(pair[0].timestamp - pair[1].timestamp))
+        tie = recorded_tie(recorded, near, own, float(units[own.number]))
+        if tie is None:
+            continue
+        motion = tie.pose if tie.second == own.number else rigid.invert(tie.pose)
+        carried_by = rigid.invert(own.pose) @ motion @ near.pose
+        keyframes = tuple(
+            replace(keyframe, pose=rigid.orthonormal(keyframe.pose @ carried_by))
+            if keyframe.number in other
+            else keyframe
+            for keyframe in slam.keyframes
+        )
+        roots = tuple(root for root in slam.map.roots if root not in other)
+        joined = replace(slam.map, keyframes=keyframes, roots=roots, factors=(*slam.map.factors, tie))
+        note = (
+            f"the submap that began at frame {slam.keyframes[min(other)].frame} is joined to the rest by recorded poses"
+        )
+        slam = replace(
+            slam, map=joined, window=replace(slam.window, prior=None, solved=None, held=()), notes=(*slam.notes, note)
+        )
+        main |= other
+    return slam
+
+
+def _with_carried_frames(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
+    """The state with each frame that no image has placed, carried on from the frame before."""
+    frames: list[FramePose] = []
+    last: FramePose | None = None
+    for record in slam.frames:
+        found = None
+        if not record.tracked and last is not None and np.isfinite(units[last.reference]):
+            found = carried(recorded, slam.map, last, record.timestamp, float(units[last.reference]))
+        frames.append(record if found is None else _by_recording(record, found))
+        last = frames[-1] if frames[-1].tracked else last
+    return replace(slam, tracker=replace(slam.tracker, frames=tuple(frames)))
+
+
+def _by_recording(record: FramePose, found: Track) -> FramePose:
+    return replace(
+        record, reference=found.keyframe.number, relative=found.relative, tracked=True, evidence=found.evidence
+    )
+
+
+def _alone(slam: Slam, tie: MeasuredRelativePose) -> bool:
+    """Whether nothing else ties the later keyframe of a recorded motion to an earlier one."""
+    earlier = [pair.first for pair in slam.map.pairs if pair.second == tie.second and len(pair.points)]
+    tracked = [other.first for other in slam.map.odometry_factors if other.second == tie.second]
+    return not any(number < tie.second for number in (*earlier, *tracked))
+
+
+def _note(found: Comparison) -> str:
+    basis = f"{found.compared} motions between keyframes, logarithm of the likelihood ratio {found.evidence:.1f}"
+    if found.believed:
+        return f"recorded poses are a prior of the motion: the images agree with them ({basis})"
+    if found.contradicted:
+        return f"the recorded poses are not of these images, and are not used ({basis})"
+    return f"the recorded poses are not used: too little is known to compare them with the images ({basis})"
