@@ -13,7 +13,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, PoseGraph, distance, solve_pose_graph
+from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, distance, solve_pose_graph
 from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
@@ -57,27 +57,27 @@ def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     motions, closing = odometry(slam)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     drifted = [loop for loop in loops if not loop.agrees(slam)]
-    torn = [tie for tie in closing if distance(tie, poses) > LOOP_GATE and _pixels(tie, slam) > MAX_LOOP_ERROR]
+    torn = [tie for tie in closing if distance(tie, poses) > BELIEF and _pixels(tie, slam) > MAX_LOOP_ERROR]
     if not drifted and not torn:
         return slam, list(loops)
     measured = (*closing, *(loop.motion for loop in loops))
-    graph = _graph(slam, motions, measured, _scales(slam, motions, loops))
+    graph = _graph(slam, motions, measured, _units(slam, motions, loops))
     tracked = graph.motions if slam.metric else [motion.of_free_length() for motion in graph.motions]
     # Before the solve: with several wrong loops even a robust kernel may settle on their consensus.
-    sure = consistent_loops(graph.loops, tracked, LOOP_GATE, alone=np.arange(len(measured)) < len(closing))
+    sure = consistent_loops(graph.loops, tracked, BELIEF, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
         return _noted(_without(slam, closing), len(loops) - len(agreeing)), agreeing
-    scales = _scales(slam, motions, tuple(compress(loops, sure[len(closing) :])))
-    found = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), scales))
+    units = _units(slam, motions, tuple(compress(loops, sure[len(closing) :])))
+    found = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), units))
     true = np.zeros(len(measured), bool)
     true[sure] = found.accepted
     dropped = [tie for tie, fits in zip(closing, true[: len(closing)], strict=True) if not fits]
-    moved = _taken(_without(slam, dropped), found.poses, scales)
+    moved = at_poses(_without(slam, dropped), found.poses, units)
     # A loop that took no part (refused, or alone) is used where the corrected map agrees with it.
     own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
-    accepted = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
-    return _noted(moved, len(loops) - len(accepted), slam), accepted
+    believed = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
+    return _noted(moved, len(loops) - len(believed), slam), believed
 
 
 def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelativePose]]:
@@ -103,7 +103,7 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
         if number in tree:
             tie = tree[number]
             # Adjusted poses are more accurate than the tracked motion, unless an adjustment went wrong.
-            agrees = distance(tie, poses) < LOOP_GATE
+            agrees = distance(tie, poses) < BELIEF
             motions.append(replace(tie, pose=between(tie.first, tie.second)) if agrees else tie)
         elif (number - 1, number) in matched:
             motions.append(MeasuredRelativePose(number - 1, number, between(number - 1, number), loose))
@@ -118,13 +118,13 @@ def _pixels(tie: MeasuredRelativePose, slam: Slam) -> float:
 
 
 def _graph(
-    slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[MeasuredRelativePose], scales: np.ndarray
+    slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[MeasuredRelativePose], units: np.ndarray
 ) -> PoseGraph:
     """Return the graph in the scale of the first keyframe, with one fixed keyframe in each connected component."""
-    inside = lambda measured: scaled_motion(measured, float(scales[measured.first]))
+    inside = lambda measured: scaled_motion(measured, float(units[measured.first]))
     scaled_motions, scaled_loops = tuple(map(inside, motions)), tuple(map(inside, loops))
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
-    start = np.array([longer(pose, unit) for pose, unit in zip(poses, scales, strict=True)])
+    start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])
     whole = replace(slam, map=replace(slam.map, factors=(*slam.map.factors, *loops)))
     label = piece_of(whole.map)
     held = np.zeros(len(poses), bool)
@@ -132,8 +132,8 @@ def _graph(
     return PoseGraph(start, scaled_motions, scaled_loops, held)
 
 
-def _scales(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
-    """Return the factor on the lengths of each keyframe, float64 [n]; 1 if they are metres."""
+def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
+    """By what the lengths of each keyframe must be multiplied, float64 [n]; by 1 where they are metres."""
     if slam.metric:
         return np.ones(len(slam.keyframes))
     ratios = [ScaleRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
@@ -148,9 +148,9 @@ def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
     )
 
 
-def _taken(slam: Slam, poses: np.ndarray, scales: np.ndarray) -> Slam:
+def at_poses(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
     """Return the map at other poses, lengths scaled keyframe by keyframe."""
-    unit = lambda number: float(scales[number])
+    unit = lambda number: float(units[number])
     factors = tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors)
     return replace(
         slam,
