@@ -149,7 +149,7 @@ def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
 
 
 def at_poses(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
-    """Return the map at other poses, lengths scaled keyframe by keyframe."""
+    """The map at other poses, its lengths multiplied keyframe by keyframe."""
     unit = lambda number: float(units[number])
     factors = tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors)
     return replace(
