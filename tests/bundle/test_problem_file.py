@@ -19,6 +19,7 @@ from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem_file import LAYOUT, load_problem, save_problem, save_solution
+from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 
 
@@ -27,6 +28,27 @@ def test_a_file_is_the_problem(tmp_path: Path) -> None:
     loaded, packed = load_problem(write(tmp_path)), SCENE.pack()
     for found, expected in zip(jax.tree.leaves(loaded[:2]), jax.tree.leaves(packed[:2]), strict=True):
         np.testing.assert_array_equal(found, expected)
+
+
+class Own(Pinhole):
+    """A camera model of a user."""
+
+
+@pytest.mark.parametrize(("model", "given"), [(Pinhole, ()), (Own, (Own,))])
+def test_a_shared_focal_length_is_saved(tmp_path: Path, model: type[Pinhole], given: tuple[type, ...]) -> None:
+    # Proves that a camera class made by `shared_focal`, of the package or of a user, is written and found again.
+    # Oracle: the packed class and parameters; without the user's class, the error names it.
+    scene = replace(SCENE, start_intrinsics=SCENE.start_intrinsics[1:])
+    problem, state, index = scene.pack(camera=model, shared_focal=True)
+    path = tmp_path / "shared.npz"
+    save_problem(path, problem, state, index)
+    loaded, again, _ = load_problem(path, terms=given)
+    assert loaded.camera is problem.camera
+    assert loaded.shared_focal
+    np.testing.assert_array_equal(again.intrinsics, state.intrinsics)
+    if given:
+        with raises("shared.npz", "SharedFocalOwn"):
+            load_problem(path)
 
 
 @pytest.mark.parametrize("missing", LAYOUT)

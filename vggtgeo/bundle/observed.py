@@ -67,6 +67,7 @@ def check_connected(observations: Observations, keyframes: int) -> None:
 
     """
     points, lines = np.asarray(observations.point_weight) > 0, np.asarray(observations.line_weight) > 0
+    # Edges without a match of positive weight connect nothing.
     used = np.concatenate([observations.point_edge[points], observations.line_edge[lines]]).astype(int)
     pairs = observations.edges[np.unique(used)]
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(keyframes, keyframes))

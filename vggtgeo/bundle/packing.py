@@ -162,6 +162,7 @@ def pack(
     problem = _of_type(problem, dtype)
     check_observed(problem)
     offset = jnp.zeros((index.shape[0], size.points, 2), dtype) if problem.pixel_terms else None
+    # Empty slots get a positive depth: residuals may divide by it or take its logarithm.
     depths = _per_slot(index, inverse_depth, 1.0, dtype)
     if observations.segment is not None:
         present = _per_slot(index, np.ones(len(observations.host)), 0.0, dtype)

@@ -179,6 +179,7 @@ def save_solution(path: Path, state: State, index: SlotIndex) -> None:
 
 def _package_terms() -> list[type]:
     """Return the classes of terms in `bundle/terms/`, so that a new file there is all that a new residual needs."""
+    # Found by listing the folder: a list here would be forgotten by the author of a new term.
     names = [f"{term_package.__name__}.{found.name}" for found in pkgutil.iter_modules(term_package.__path__)]
     kinds = [kind for name in names for kind in vars(import_module(name)).values() if isinstance(kind, type)]
     return [kind for kind in kinds if issubclass(kind, AbstractTerm) and kind.__module__ in names]

@@ -96,6 +96,7 @@ def _staying(leaving: Any, keyframes: int) -> Int[Array, " m"]:
 def _extrapolated(poses: Float[Array, "n 7"]) -> Float[Array, "7"]:
     last = jaxlie.SE3(poses[-1])
     moved = lie.relative(jaxlie.SE3(poses[-2]), last) @ last
+    # Rounding moves products of unit quaternions away from unit length, and a scan repeats this many times.
     return lie.cast(moved.normalize(), poses.dtype).wxyz_xyz
 
 

@@ -82,6 +82,7 @@ class Camera:
         """
         check_sides(width, height)
         focal = 0.5 * max(width * pixel_aspect, height) / math.tan(0.5 * GUESSED_FIELD_OF_VIEW)
+        # Pixel (0, 0) is the centre of a pixel, so this is the middle of the image.
         centre = 0.5 * (width - 1), 0.5 * (height - 1)
         return cls((focal / pixel_aspect, focal, *centre), width, height, known=False)
 

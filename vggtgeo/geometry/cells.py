@@ -16,6 +16,7 @@ def cell_numbers(cells: np.ndarray) -> np.ndarray:
     if not len(cells):
         return np.zeros(0, np.int64)
     low = cells.min(axis=0)
+    # As Python's integers: differences and products of int64 may overflow.
     width, depth, height = (int(size) + 1 for size in cells.max(axis=0).astype(object) - low.astype(object))
     if width * depth * height > _LARGEST:
         x, y, z = (_ranks(column) for column in cells.T)

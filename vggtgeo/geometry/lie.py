@@ -35,6 +35,7 @@ def exp(tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
     tiny = squared < 1e-3
     safe = jnp.where(tiny, 1.0, squared)
     angle = jnp.sqrt(safe)
+    # `(1 - cos a) / a^2` and `(a - sin a) / a^3` cancel for small angles: by their series there.
     first = jnp.where(tiny, 1 / 2 - squared / 24 + squared**2 / 720, (1 - jnp.cos(angle)) / safe)
     second = jnp.where(tiny, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - jnp.sin(angle)) / (safe * angle))
     turned = jnp.cross(w, v)

@@ -74,6 +74,7 @@ class Mesh:
         path = path_of("path", path)
         try:
             head = check_head(path)
+            # With a known length of the lists plyfile reads all faces at once, not one by one.
             data = PlyData.read(os.fspath(path), known_list_len={"face": {"vertex_indices": 3}})
             check_end(path, head, data)
             vertices, faces = data["vertex"].data, _triangles(data["face"].data["vertex_indices"])

@@ -54,6 +54,7 @@ def epipolar_distance(
     lever = np.linalg.norm(lines[:, :2], axis=1)
     off = np.abs((lines * rays(np.asarray(pixels_j, np.float64), intrinsics)).sum(1))
     focal = float(intrinsics[0])
+    # Without translation every pixel is consistent with every other.
     return np.where(lever < 1e-9, 0.0, off / np.maximum(lever, 1e-12) * focal)
 
 

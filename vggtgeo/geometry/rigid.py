@@ -73,6 +73,7 @@ def triangulate(
     turned = pinhole.rays(pixels, intrinsics) @ relative[:3, :3].T
     seen = pinhole.rays(targets, intrinsics)
     lever = cross(relative[:3, 3], seen)
+    # Zero without parallax: the ray is then along the baseline.
     information = (lever**2).sum(1)
     value = -(lever * cross(turned, seen)).sum(1) / np.maximum(information, 1e-18)
     return value, information * float(intrinsics[0]) ** 2

@@ -64,6 +64,7 @@ def _depth_by(other: PosedDepth, own: PosedDepth, depth: np.ndarray, rays: np.nd
 
     The relative depth error is taken over from the other view: its ray through the point is nearly the same.
     """
+    # The product in double precision first: in single, positions far from the origin would lose the small difference.
     relative = (other.pose @ np.linalg.inv(own.pose)).astype(np.float32)
     local = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
     flat = local.reshape(-1, 3)

@@ -44,6 +44,7 @@ def rendered_depth(pose: np.ndarray, intrinsics: np.ndarray, views: Sequence[Pos
         rows, columns = np.nonzero(np.isfinite(depth_map.depth) & (depth_map.confidence >= MIN_CONFIDENCE))
         pixels = np.column_stack([columns, rows]).astype(np.float32)
         local = pinhole.rays(pixels, view.intrinsics) * depth_map.depth[rows, columns, None]
+        # Relative motions are small: single precision is enough however far the world's origin is.
         relative = (pose @ rigid.invert(view.pose)).astype(np.float32)
         local = local @ relative[:3, :3].T + relative[:3, 3]
         inside, rows, columns = pinhole.visible(local, intrinsics, (height, width))

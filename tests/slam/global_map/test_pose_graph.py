@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, solve_pose_graph
-from vggtgeo.slam.global_map.unit_graph import UnitRatio, solve_units
+from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 
 LAPS, KEYFRAMES = 2, 60
@@ -99,8 +99,8 @@ def test_large_drift_comes_back_and_false_loops_do_no_harm(seed: int, false: flo
         assert before[1] > 15.0, before
     assert after[0] < 0.8, f"{before[0]:.2f} m -> {after[0]:.2f} m"
     assert after[1] < 5.0, f"{before[1]:.1f} deg -> {after[1]:.1f} deg"
-    assert not np.any(found.believed & ~right)
-    assert np.mean(found.believed[right]) > 0.9
+    assert not np.any(found.accepted & ~right)
+    assert np.mean(found.accepted[right]) > 0.9
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -112,8 +112,8 @@ def test_units_that_drift_are_brought_back(seed: int) -> None:
     ratios = []
     for second in range(60, 120, 2):
         ratio = true[second] / true[second - 60] * np.exp(rng.normal(0, 0.02))
-        ratios.append(UnitRatio(second - 60, second, float(ratio if rng.random() > 0.3 else rng.uniform(0.3, 3.0))))
-    found = solve_units(120, motions, ratios)
+        ratios.append(ScaleRatio(second - 60, second, float(ratio if rng.random() > 0.3 else rng.uniform(0.3, 3.0))))
+    found = solve_scales(120, motions, ratios)
     off = np.abs(np.log(found[60:] / found[:60]) - np.log(true[60:] / true[:60]))
     assert off.max() < 0.08, off.max()
     assert abs(np.log(true[60] / true[0])) > 0.3
@@ -124,8 +124,8 @@ def test_a_guessed_length_takes_the_jump_of_the_scale() -> None:
     there and nowhere else, to 5 %. Oracle: the jump that was made.
     """
     motions = [replace(_tracked(number), by_rays=number == 30) for number in range(1, 60)]
-    loops = [UnitRatio(first, first + 40, 1.0 / 3.0) for first in (5, 8, 11)]
-    found = solve_units(60, motions, loops)
+    loops = [ScaleRatio(first, first + 40, 1.0 / 3.0) for first in (5, 8, 11)]
+    found = solve_scales(60, motions, loops)
     np.testing.assert_allclose(found, np.where(np.arange(60) < 30, 1.0, 1.0 / 3.0), rtol=0.05)
 
 

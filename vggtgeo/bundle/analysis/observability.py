@@ -110,6 +110,7 @@ def observability(problem: Problem, state: State) -> Observability:
 def _observability_jit(problem: Problem, state: State) -> Observability:
     systems, everything, coordinates = _linearise_each(problem, state)
     combined = lambda keep: reduce(_combine(systems, keep, problem.fraction))
+    # One after the other: all matrices at once would take `2 k + 1` times the memory.
     spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), _selections(len(systems), state))
     found = _found(problem, state, systems, everything, coordinates, spectra)
     return unless(is_finite(everything), found)
@@ -180,6 +181,7 @@ def _edge_parallax(problem: Problem, state: State) -> Float[Array, " e"]:
         residual, slope = jax.jvp(residuals, (depth,), (jnp.ones_like(depth),))  # each residual depends on one depth
         pull = term.weights * term.kernel.weight(term.weights * jnp.sum(residual**2, 0))
         own = depth[problem.edges.row, term.first_slot : term.first_slot + pull.shape[1]]
+        # `V d^2` is 1 / (relative variance of the depth), so it has no unit and compares near and far landmarks.
         largest = jnp.maximum(largest, jnp.max(pull * jnp.sum(slope**2, 0) * own**2, 1, initial=0.0))
         seen = seen | jnp.any(term.present(), 1)
     return jnp.where(seen, largest, jnp.inf)

@@ -371,6 +371,7 @@ def lost_shares(found: Observability) -> dict[str, dict[str, float]]:
     names = found.direction_names()
     along, without = np.asarray(found.whole.along[0], float), np.asarray(found.without.along, float)
     shares = 1 - without / np.where(along > 0, along, 1.0)
+    # A part of the terms has at most the information of all, up to rounding.
     shares = np.where(along > 0, np.clip(shares, 0.0, 1.0), 0.0)
     single = np.asarray(found.free)[: lie.TANGENT * found.keyframes]
     present = np.nonzero(np.concatenate([np.any(np.asarray(found.common) != 0, 1), single]))[0]

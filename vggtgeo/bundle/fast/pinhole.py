@@ -84,6 +84,7 @@ def row(edge: OneEdge, at: Projection, a: Array, b: Array) -> list[Array]:
     fx, fy = edge.intrinsics[:2]
     rotation, translation = edge.rotation, edge.translation
     g0, g1 = a * fx * at.inverse_z, b * fy * at.inverse_z
+    # At its bound `Y_z` is constant, so it has no derivative.
     g2 = -(g0 * at.x + g1 * at.y) * at.in_front
     y0, y1, y2 = at.point
     c0 = g0 * rotation[0, 0] + g1 * rotation[1, 0] + g2 * rotation[2, 0]

@@ -83,5 +83,6 @@ class MarginalPrior(DenseTerm):
         by_pose = jnp.einsum("cnb,nbd->cnd", by_pose, blocks).reshape(len(self.root), -1)
         jacobian = jnp.concatenate([by_pose, self.root[:, -size:]], 1)
         residual = self.residual(poses, parameters)
+        # The reweighted model has first derivatives only, so a linear residual gives it exactly.
         linear = lambda step: residual + jacobian @ step
         return local_model(self, self.weights, linear, len(self.offset), correction, exact)

@@ -69,6 +69,7 @@ class PoseTerm(AbstractTerm):
         """Return the residual of one observation as a function of `(xi, parameters of the keyframe's camera)`."""
 
         def function(step: Array) -> Array:
+            # The step is zero in value, so this cheaper form has the derivatives of `move`.
             pose = lie.move_at_zero(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
             camera = cameras.of(touched[0], step[lie.TANGENT :])
             return check_residual(self, self.holding(data).residual(pose, camera))

@@ -44,6 +44,7 @@ class SlotTerm(AbstractTerm):
         """Return first and second derivatives of the energy; for a prepared term."""
         ones = jnp.ones_like(inverse_depth)
         if exact:
+            # Each gradient depends on its own depth only, so one product with ones is the whole diagonal.
             return jax.jvp(self._gradient, (inverse_depth,), (ones,))
         residual, slope = jax.jvp(self.residuals, (inverse_depth,), (ones,))
         rows, pull = reweighted_rows(self.kernel, self.weights, residual, slope[None], correction)

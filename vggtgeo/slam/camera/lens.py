@@ -164,5 +164,5 @@ def _pair(pair: Pair, lens: Camera) -> Pair:
 
 
 def undistorted_pixels(pixels: Float[np.ndarray, "*m 2"], lens: Camera) -> Float[np.ndarray, "*m 2"]:
-    """The undistorted pixels, of the type that they had."""
+    """Return the undistorted pixels, in their own dtype."""
     return lens.undistorted(pixels).astype(pixels.dtype)

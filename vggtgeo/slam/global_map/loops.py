@@ -43,8 +43,8 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     label, known = piece_of(slam.map), {pair.key for pair in slam.map.pairs}
     proposed = list(dict.fromkeys([*_by_estimate(slam, settings, known), *_by_appearance(slam, settings, known)]))
     found = _verified(slam, proposed, label, roles)
-    before, (straight, believed) = slam, straightened(slam, found)
-    slam = replace(straight, map=replace(straight.map, pairs=(*slam.map.pairs, *(loop.pair for loop in believed))))
+    before, (straight, accepted) = slam, straightened(slam, found)
+    slam = replace(straight, map=replace(straight.map, pairs=(*slam.map.pairs, *(loop.pair for loop in accepted))))
     if straight is before:
         return slam
     known |= {loop.pair.key for loop in found}

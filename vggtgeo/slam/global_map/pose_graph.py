@@ -74,14 +74,14 @@ class PoseGraph:
 
 
 @dataclass(frozen=True, eq=False)
-class Untangled:
+class SolvedPoseGraph:
     """Poses after the optimisation, and which loops agree with them, bool [loops]."""
 
     poses: np.ndarray
-    believed: np.ndarray
+    accepted: np.ndarray
 
 
-def solve_pose_graph(graph: PoseGraph) -> Untangled:
+def solve_pose_graph(graph: PoseGraph) -> SolvedPoseGraph:
     """Return the optimised poses; if the solve fails, the initial ones without loops."""
     spread = drift_variance(graph)
     loosened = [replace(motion, information=motion.information / spread) for motion in graph.motions]
@@ -107,8 +107,8 @@ def solve_pose_graph(graph: PoseGraph) -> Untangled:
     solution = solve_graph_jit(problem, initial, solver)
     poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64)[:count])
     if not np.isfinite(poses).all():
-        return Untangled(graph.poses, np.zeros(len(graph.loops), bool))
-    return Untangled(poses, np.array([distance(loop, poses) < BELIEF for loop in graph.loops], bool))
+        return SolvedPoseGraph(graph.poses, np.zeros(len(graph.loops), bool))
+    return SolvedPoseGraph(poses, np.array([distance(loop, poses) < BELIEF for loop in graph.loops], bool))
 
 
 def distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float:

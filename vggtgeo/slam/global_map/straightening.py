@@ -14,7 +14,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, distance, solve_pose_graph
-from vggtgeo.slam.global_map.unit_graph import UnitRatio, solve_units
+from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -23,7 +23,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.tracker import scaled_record
 
-MENDABLE = 20.0
+MAX_LOOP_ERROR = 20.0
 """Median reprojection error of a loop's matches above which a pose graph corrects the map before its adjustment,
 pixels. An adjustment alone corrects 5 cm and 2 degrees, 16 pixels (`tests/slam/test_pipeline.py`)."""
 UNTRACKED = (0.02, np.deg2rad(1.0))
@@ -40,13 +40,13 @@ class Loop:
     ratio: float | None
 
     def agrees(self, slam: Slam) -> bool:
-        """Return whether the adjustment can use the matches: half of them reproject within `MENDABLE`."""
+        """Return whether the adjustment can use the matches: half of them reproject within `MAX_LOOP_ERROR`."""
         first, second = (slam.keyframes[number] for number in self.pair.key)
         matches = self.pair.points
         inverse = first.points.inverse_depth[matches.index_i]
         points = rigid.unproject(matches.pixels_i, inverse, first.pose, slam.intrinsics)
         off = np.linalg.norm(rigid.project(points, second.pose, slam.intrinsics) - matches.pixels_j, axis=1)
-        return bool(np.median(np.where(np.isfinite(off), off, np.inf)) < MENDABLE)
+        return bool(np.median(np.where(np.isfinite(off), off, np.inf)) < MAX_LOOP_ERROR)
 
 
 def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
@@ -57,7 +57,7 @@ def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     motions, closing = odometry(slam)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     drifted = [loop for loop in loops if not loop.agrees(slam)]
-    torn = [tie for tie in closing if distance(tie, poses) > BELIEF and _pixels(tie, slam) > MENDABLE]
+    torn = [tie for tie in closing if distance(tie, poses) > BELIEF and _pixels(tie, slam) > MAX_LOOP_ERROR]
     if not drifted and not torn:
         return slam, list(loops)
     measured = (*closing, *(loop.motion for loop in loops))
@@ -71,7 +71,7 @@ def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     units = _units(slam, motions, tuple(compress(loops, sure[len(closing) :])))
     found = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), units))
     true = np.zeros(len(measured), bool)
-    true[sure] = found.believed
+    true[sure] = found.accepted
     dropped = [tie for tie, fits in zip(closing, true[: len(closing)], strict=True) if not fits]
     moved = at_poses(_without(slam, dropped), found.poses, units)
     # A loop that took no part (refused, or alone) is used where the corrected map agrees with it.
@@ -136,8 +136,8 @@ def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[
     """Return the factor on the lengths of each keyframe, float64 [n]; 1 if they are metres or in the recording's unit."""
     if slam.metric or slam.map.recorded_factors:
         return np.ones(len(slam.keyframes))
-    ratios = [UnitRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
-    return solve_units(len(slam.keyframes), motions, ratios)
+    ratios = [ScaleRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
+    return solve_scales(len(slam.keyframes), motions, ratios)
 
 
 def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:

@@ -82,6 +82,7 @@ class RgbdAlignment:
     @in_double_precision
     def align(self, source: RgbdView, target: RgbdView, start: np.ndarray) -> Aligned | None:
         """Return the motion source -> target from `start` float64 [4, 4]; None if the overlap is too small."""
+        # Coarsest first: its basin of convergence is the widest.
         first = max((level for level in range(LEVELS) if self.iterations[level]), default=0)
         noise = tuple(map(np.float32, (self.brightness_noise, self.edge_spread, self.surface_spread)))
         with jax.default_device(_processor()):
@@ -223,6 +224,7 @@ def _aligned(
         count = carry.number + 1
         settled = jnp.abs(change).max() < jnp.where(level == 0, CONVERGED, 10 * CONVERGED)
         ends = settled | (count >= iterations[level]) | (carry.stage == JUDGED)
+        # At this pose the views do not overlap: further steps would follow noise.
         lost = ~(terms.edges.enough | terms.surface.enough)
         return _Carry(
             jnp.where(lost, DONE, jnp.where(ends, carry.stage - 1, carry.stage)),

@@ -135,6 +135,7 @@ def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.n
     known = np.isfinite(depth)
     inverse = _zero_where(~known, 1.0 / depth)
     size = (width // factor, height // factor)
+    # Holes count as zeros in both means, so dividing by the share of known pixels removes them.
     share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     mean, square = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (inverse, inverse * inverse))
     safe = np.maximum(share, 1e-6)

@@ -21,30 +21,30 @@ class Expected(NamedTuple):
 
 
 def switch(default: bool) -> Any:
-    """A setting that is true or false."""
+    """Declare a boolean setting."""
     return _field(default, Expected("true or false", lambda value: isinstance(value, bool)))
 
 
 def whole(default: int, at_least: int, at_most: int = 1_000_000) -> Any:
-    """A setting that is an integer. at_most: arrays have such sizes, and JAX counts in 32 bits."""
+    """Declare an integer setting. at_most: arrays have such sizes, and JAX counts in 32 bits."""
     holds = lambda value: _is_whole(value) and at_least <= value <= at_most
     return _field(default, Expected(f"a whole number from {at_least} to {at_most}", holds))
 
 
 def positive(default: float, at_most: float = math.inf) -> Any:
-    """A setting that is a finite number above 0."""
+    """Declare a setting that is a finite number above 0."""
     words = "a number above 0" if math.isinf(at_most) else f"a number above 0 and at most {at_most:g}"
     return _field(default, Expected(words, lambda value: _is_finite(value) and 0 < value <= at_most))
 
 
 def not_negative(default: float, at_most: float = math.inf) -> Any:
-    """A setting that is a finite number of 0 or more."""
+    """Declare a setting that is a finite number of 0 or more."""
     words = "a number, 0 or more" if math.isinf(at_most) else f"a number from 0 to {at_most:g}"
     return _field(default, Expected(words, lambda value: _is_finite(value) and 0 <= value <= at_most))
 
 
 def one_of(default: str, *others: str) -> Any:
-    """A setting that is one of some words."""
+    """Declare a setting that is one of some words."""
     words = (default, *others)
     return _field(default, Expected(" or ".join((", ".join(words[:-1]), words[-1])), lambda value: value in words))
 

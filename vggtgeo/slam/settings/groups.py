@@ -1,4 +1,4 @@
-"""The pipeline's settings, a group a stage; lengths in metres, angles in radians, pixels where named so."""
+"""Settings of the pipeline by stage; lengths in metres, angles in radians, pixels where stated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vggtgeo.slam.settings.checks import CheckedSettings, Expected, not_negative
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 SEGMENT_SAMPLES = 6
-"""Samples of a segment with two unknowns: more of them measure the same two ends again."""
+"""Samples of a segment with two unknowns: more would observe the same two ends again."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ _KERNEL = "a kernel of a width above 0, such as `cauchy 2.0` (`vggtgeo.kernels.C
 
 
 def is_kernel(value: Any) -> bool:
-    """Whether it is a robust kernel whose width, where it has one, is finite and above 0."""
+    """Return whether it is a robust kernel of positive, finite width, if it has a width."""
     return isinstance(value, AbstractKernel) and 0 < float(getattr(value, "delta", 1.0)) < math.inf
 
 

@@ -69,7 +69,8 @@ CHOICES = {
     role: ("classical", *_OTHERS.get(role, ()), *players(role))
     for role in ("points", "lines", "line_matches", "confidence", "geometry", "depth")
 }
-"""Who may play a role apart from its preset: the caller's own (`classical`), other classical code, networks."""
+"""Choices for each role besides a preset's: the caller's own (`classical`), other classical implementations, networks.
+"""
 _BOUNDED: dict[str, Callable[[Any], Any]] = {
     "points": BoundedPoints,
     "lines": BoundedLines,
@@ -77,7 +78,7 @@ _BOUNDED: dict[str, Callable[[Any], Any]] = {
     "depth": BoundedDepth,
     "confidence": BoundedConfidence,
 }
-"""What checks the answers of a network in each role."""
+"""Checks of the answers of a network in each role."""
 _KINDS: dict[str, Callable[..., Any]] = {
     "alike": DensePointMatcher,
     "letr": LetrDetector,
@@ -89,7 +90,7 @@ _KINDS: dict[str, Callable[..., Any]] = {
 
 
 def _files(roles: Mapping[str, str]) -> tuple[str, ...]:
-    """The registry's names of the networks of some roles, each once."""
+    """Return the registry's names of the networks of some roles, each once."""
     return tuple(dict.fromkeys(file for name in roles.values() for file in files_of(name)))
 
 
@@ -99,7 +100,7 @@ NEEDED = {preset: _files(roles) for preset, roles in PRESETS.items()}
 
 @dataclass(frozen=True, eq=False)
 class Perception:
-    """Role objects and the networks behind them, by their names in the registry; what was refused, by role."""
+    """Role objects and the networks behind them, by their names in the registry; and the rejected answers, by role."""
 
     roles: Roles
     networks: Mapping[str, Session]
@@ -111,7 +112,9 @@ class Perception:
         return [name for name, session in self.networks.items() if session.random_weights]
 
     def facts(self) -> dict[str, Any]:
-        """For the summary: each network's file, hash, weights, device, calls so far; and a warning, if any."""
+        """Return facts for the summary: each network's file, hash, weights, device, calls so far; and a warning, if
+        any.
+        """
         if not self.networks:
             return {}
         described = {
@@ -130,12 +133,12 @@ class Perception:
         return {"networks": described, "refused": refused, **warning}
 
     def warning(self) -> str:
-        """What a user must know before reading any result of random weights."""
+        """Warning about results of random weights."""
         return f"the weights of {', '.join(self.random)} are random: this result means nothing"
 
 
 def _with_others(classical: Roles, parts: Mapping[str, str]) -> Roles:
-    """The caller's roles, with those that other classical code shall play."""
+    """Return the caller's roles, with other classical implementations where chosen."""
     if parts.get("points") == "orb":
         classical = replace(classical, points=OrbMatcher())
     if parts.get("geometry") == "constant-velocity":
@@ -208,7 +211,7 @@ def perception(
 
 
 def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
-    """Who plays each role that the preset or the caller names; InputError for a name that is not there."""
+    """Return the implementation of each role that preset or caller name; raise InputError for an unknown name."""
     if preset not in tuple(PRESETS):  # a list has no hash
         raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(PRESETS)}")
     for role, name in mixed.items():
@@ -221,7 +224,10 @@ def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
 def _players(
     parts: Mapping[str, str], classical: Roles, networks: Mapping[str, Session], cache: Path | None
 ) -> tuple[dict[str, Any], dict[str, Refusals]]:
-    """The role objects of the networks, and what each refuses. One network in two roles answers both from one call."""
+    """Return the role objects of the networks, and their checks.
+
+    One network in two roles answers both from one call.
+    """
     features = {
         name: DinoFeatures(networks[name], _cache(cache)) for name in parts.values() if name.startswith("dinov3")
     }

@@ -87,7 +87,7 @@ class Roles:
     recorded: RecordedPoses | None = None
 
     def __post_init__(self) -> None:
-        """InputError for what plays no role, which would be found in the middle of a run."""
+        """Raise InputError for an object that is not a role, which would fail in the middle of a run."""
         for role, methods in _ASKED.items():
             given = getattr(self, role)
             if not all(callable(getattr(given, method, None)) for method in methods):
@@ -102,13 +102,14 @@ class Roles:
             check_kind(role, getattr(self, role), kind | None, f"a `{kind.__name__}`, or None")
 
     def seeded(self, seed: int) -> Roles:
-        """The same roles, whose robust estimators draw other samples; 0: as they draw them by themselves."""
+        """Return the same roles with other random samples in their robust estimators; 0: the default samples."""
         return in_order(self, SampleOrder(seed))
 
     def tracking_depth(self, sensor_depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray] | None:
-        """What of a frame's own depth is used to track it, metres and relative standard deviation, float32 [H, W].
+        """Return the part of a frame's own depth used for tracking, metres and relative standard deviation, float32 [H,
+        W].
 
-        Jumps are not looked for: the alignment leaves them out. A network's depth costs too much for every frame.
+        Depth edges are not searched: the alignment leaves them out. A network's depth is too slow for every frame.
         """
         if sensor_depth is None or not isinstance(self.depth, SensorDepth):
             return None
@@ -119,12 +120,12 @@ class Roles:
 
     @property
     def follows(self) -> bool:
-        """Whether frames are followed by flow, and described only where that fails."""
+        """Whether frames are tracked by optical flow first, and described only if that fails."""
         return self.flow is not None and self.alignment is not None and isinstance(self.depth, SensorDepth)
 
     @property
     def coarse_points(self) -> PointMatcher:
-        """The matcher without sub-pixel refinement, for poses that an alignment of the whole picture refines anyway."""
+        """The matcher without sub-pixel refinement, for poses that dense alignment refines anyway."""
         points: Any = self.points
         coarse: PointMatcher = points
         if getattr(points, "refinement", None) is not None:
@@ -133,17 +134,17 @@ class Roles:
 
     @property
     def metric(self) -> bool:
-        """Whether a metric depth fixes the scale of the world."""
+        """Whether metric depth fixes the scale of the world."""
         return not isinstance(self.depth, NoDepth)
 
 
 def check_answer(method: str, found: Any, kind: type) -> None:
-    """InputError unless what a method of a role gave, an object of one's own say, is of the kind that it promises."""
+    """Raise InputError unless the result of a role's method, which may be a user's, has the declared type."""
     check_kind(f"{method}(...)", found, kind, f"`{kind.__name__}`, see `vggtgeo.models.roles`")
 
 
 def check_size(method: str, found: Any, image: np.ndarray) -> None:
-    """InputError unless what a method of a role gave has a value for each pixel of the image."""
+    """Raise InputError unless the result of a role's method has a value for each pixel of the image."""
     if np.shape(found) != image.shape[:2]:
         raise InputError(f"`{method}(...)` has the shape {np.shape(found)}; expected {image.shape[:2]}, the image's")
 
@@ -179,7 +180,7 @@ class SlamSettings:
 
     @property
     def padded_samples(self) -> int | None:
-        """Samples of a segment in a problem's padded size; None where samples stand alone."""
+        """Samples of a segment in a problem's padded size; None if each sample has its own inverse depth."""
         return SEGMENT_SAMPLES if self.line.two_ends_lines else None
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Settings as text and back: tables of a TOML file (`[keyframes]`), assignments (`keyframes.min_inliers=20`).
+"""Settings as text: tables of a TOML file (`[keyframes]`), assignments (`keyframes.min_inliers=20`).
 
 A kernel is its name and its numbers, in the order of its fields: `huber 1.5`, `cauchy 2.0`, `square`.
 """
@@ -29,13 +29,13 @@ Tables = Mapping[str, Mapping[str, Any]]
 
 
 def names() -> tuple[str, ...]:
-    """Every setting as `group.field`, in the order of the declaration."""
+    """Return every setting as `group.field`, in the order of the declaration."""
     defaults = SlamSettings()
     return tuple(f"{group}.{entry.name}" for group in GROUPS for entry in dataclasses.fields(getattr(defaults, group)))
 
 
 def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
-    """`settings` with the values of `tables`; all are put in at once, so that they are checked together.
+    """Return `settings` with the values of `tables`, all validated together.
 
     Raises:
         InputError: an unknown setting, or an invalid value.
@@ -53,7 +53,7 @@ def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
 
 
 def parsed(assignment: str) -> Tables:
-    """`group.field=value` as a table; the value as in TOML, or a word without quotes.
+    """Return `group.field=value` as a table; the value as in TOML, or a word without quotes.
 
     Raises:
         InputError: there is no `=`, or the setting is unknown.
@@ -78,12 +78,12 @@ def parsed(assignment: str) -> Tables:
 
 
 def tables_of(settings: SlamSettings) -> dict[str, dict[str, Any]]:
-    """Every value, as `updated` takes them, of types that TOML and JSON know."""
+    """Return every value in the form that `updated` takes, of types that TOML and JSON support."""
     return {group: _plain(getattr(settings, group)) for group in GROUPS}
 
 
 def changed(settings: SlamSettings) -> dict[str, dict[str, Any]]:
-    """The same of the values that are not the defaults."""
+    """Return the values that are not the defaults, in the same form."""
     defaults = tables_of(SlamSettings())
     different = {
         group: {field: value for field, value in values.items() if value != defaults[group][field]}

@@ -110,6 +110,7 @@ def factor_terms(
         MeasuredBaseline: _baselines,
         MeasuredRelativePose: _relative_poses,
     }
+    # A factor with one end outside would need a pose that the problem does not have.
     inside = [factor for factor in factors if all(number in places for number in factor.keyframes)]
     if not metric:
         inside = [f.of_free_length() if isinstance(f, MeasuredRelativePose) else f for f in inside]

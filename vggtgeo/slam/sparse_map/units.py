@@ -32,6 +32,7 @@ def ratio_of_units(
     matches, before, after = matches.select(known), before[known], after[known]
     local = rigid.unproject(matches.pixels_i, before, np.eye(4), intrinsics)
     depth = local @ relative[2, :3] + relative[2, 3]
+    # A point behind the new camera has no depth there: its match is wrong.
     ahead = depth > 0
     if np.count_nonzero(ahead) < MIN_SHARED:
         return None

@@ -65,6 +65,7 @@ class SpaceSegments:
         start, along = _ends_of(keyframe, count)
         fraction = ((samples.pixels - start[segment]) * along[segment]).sum(1) / (along**2).sum(1)[segment]
         total = lambda values: np.bincount(segment[known], values[known], count)
+        # Sums of the normal equations of all lines at once.
         n, t, tt = total(np.ones_like(fraction)), total(fraction), total(fraction**2)
         d, td, s = total(samples.inverse_depth), total(fraction * samples.inverse_depth), total(samples.sigma)
         spread = n * tt - t * t

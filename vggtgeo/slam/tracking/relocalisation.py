@@ -59,6 +59,7 @@ def revisit(given: TrackingInput, current: Track, known: Map, tracker: Tracker, 
     if place is None:
         return None
     near = [known.keyframes[number].place for number in members]
+    # Similarity has no absolute scale: plain rooms resemble each other more than furnished ones.
     usual = np.median([other @ place for other in near if other is not None] or [1.0])
     similarity = [float(k.place @ place) for k in old if k.place is not None]
     best = int(np.argmax(similarity))

@@ -107,6 +107,7 @@ def _without_links(problem: Problem, label: np.ndarray) -> Problem:
 def _labels(problem: Problem, keyframes: int, known: _PriorKnowledge) -> np.ndarray:
     """Return the connected component of each keyframe, int [n], numbered by their first members."""
     ends, equations = _links(problem, keyframes)
+    # Components are merged until nothing changes: two weak links may connect only after their ends were merged.
     label = np.arange(keyframes)
     while True:
         # Enough equations between two components connect them, whatever keyframes they are between.
@@ -139,6 +140,7 @@ def _links(problem: Problem, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
     slots = problem.pixels.shape[1]
     known = np.zeros((problem.num_keyframes, slots), bool)
     for slot_term in problem.slot_terms:
+        # A depth prior determines a landmark without any match.
         known |= np.asarray(slot_term.present())
     source, target = (np.asarray(end) for end in problem.edges.ends)
     rows, seen = np.zeros(len(source)), np.zeros((len(source), slots), bool)

@@ -29,7 +29,7 @@ drift true ratios have residuals as large as false ones."""
 
 
 @dataclass(frozen=True)
-class UnitRatio:
+class ScaleRatio:
     """Factor `ratio` that converts lengths of keyframe `second` to the scale of keyframe `first`."""
 
     first: int
@@ -37,7 +37,7 @@ class UnitRatio:
     ratio: float
 
 
-def solve_units(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios: Sequence[UnitRatio]) -> np.ndarray:
+def solve_scales(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios: Sequence[ScaleRatio]) -> np.ndarray:
     """Return the factor on the lengths of each keyframe, float64 [n]; that of the first is 1."""
     if not ratios:
         return np.ones(keyframes)
