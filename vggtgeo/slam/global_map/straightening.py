@@ -133,7 +133,7 @@ def _graph(
 
 
 def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
-    """Return the factor on the lengths of each keyframe, float64 [n]; 1 if they are metres or in the recording's unit."""
+    """Return the factor on the lengths of each keyframe, float64 [n]; 1 in metres or in the unit of the recording."""
     if slam.metric or slam.map.recorded_factors:
         return np.ones(len(slam.keyframes))
     ratios = [ScaleRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
