@@ -192,6 +192,16 @@ def test_calibration_with_distortion(tmp_path: Path) -> None:
     assert open_sequence(tmp_path).camera.distortion == (0.1, -0.2, 0.003, -0.004)
 
 
+def test_distortion_in_a_file_beside_the_calibration(tmp_path: Path) -> None:
+    # Proves that `distortion.txt` completes a calibration that has no coefficients of its own. Oracle: the files.
+    tiny.images(tmp_path, calibration=False)
+    tiny.write_calibration(tmp_path, tiny.INTRINSICS)
+    (tmp_path / "distortion.txt").write_text("0.1 -0.2 0.003 -0.004\n")
+    assert open_sequence(tmp_path).camera.distortion == (0.1, -0.2, 0.003, -0.004)
+    tiny.write_calibration(tmp_path, (*tiny.INTRINSICS, 0.05, 0.0, 0.0, 0.0))
+    assert open_sequence(tmp_path).camera.distortion == (0.05, 0.0, 0.0, 0.0)
+
+
 def test_video(tmp_path: Path) -> None:
     # Proves frames, order, times and selection of a video. Oracle: grey levels written (the codec may lose a little).
     file = _video(tmp_path / "clip.avi", [20 * number for number in range(8)])

@@ -31,7 +31,7 @@ ONE_CAMERA = 0.02
 """Maximum relative difference of the focal lengths of one camera; autofocus changes them by less."""
 MAX_BYTES = 100_000
 """Maximum size of a file with a few numbers and comments."""
-CALIBRATION = "calibration.txt"
+CALIBRATION, DISTORTION = "calibration.txt", "distortion.txt"
 FISHEYE = "fisheye"
 """Last word of such a file, after four coefficients of Kannala and Brandt."""
 MATRIX = "camera-intrinsics.txt"
@@ -84,7 +84,8 @@ def is_fisheye(where: str, model: str) -> bool:
 def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
     """Return the camera of a file in `folder`, None without one.
 
-    Files: `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, or `fx fy cx cy k1 k2 k3 k4 fisheye`), else
+    Files: `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, the coefficients also in `distortion.txt`
+    beside it; or `fx fy cx cy k1 k2 k3 k4 fisheye`), else
     `camera-intrinsics.txt` (3 x 3), else JSON of Open3D's and RealSense's recorders, else Record3D's `metadata.json`.
     Raises InputError for an invalid file.
     """
@@ -210,6 +211,10 @@ def _read_calibration(file: Path, width: int, height: int) -> Camera:
     words = _without_comments(file).replace(",", " ").split()
     fisheye = words[-1:] == [FISHEYE]
     numbers = _numbers(" ".join(words[:-1] if fisheye else words))
+    beside = file.with_name(DISTORTION)
+    if len(numbers) == 4 and not fisheye and beside.is_file():
+        with parsing(beside, "k1 k2 p1 p2 [k3 [k4 k5 k6]]"):
+            numbers += _numbers(_without_comments(beside).replace(",", " "))
     return Camera(check_intrinsics(numbers[:4]), width, height, check_distortion(numbers[4:]), fisheye=fisheye)
 
 
