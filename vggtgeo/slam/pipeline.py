@@ -268,7 +268,8 @@ def _insert_and_adjust(
 
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
-            entered = insert_keyframe(slam, keyframe, roles, settings, tied_to=odometry.first)
+            measured = not found.evidence.by_rays
+            entered = insert_keyframe(slam, keyframe, roles, settings, tied_to=odometry.first, length_known=measured)
             entered = _with_odometry(entered, odometry)
             entered = entered if recorded is None else recorded.with_tie(entered)
             entered = constrain_rotation(entered, settings)

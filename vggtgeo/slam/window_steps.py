@@ -12,10 +12,17 @@ from vggtgeo.slam.window.adjustment import CameraPrior
 
 
 def insert_keyframe(
-    slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, tied_to: int | None = None
+    slam: Slam,
+    keyframe: Keyframe,
+    roles: Roles,
+    settings: SlamSettings,
+    tied_to: int | None = None,
+    *,
+    length_known: bool = True,
 ) -> Slam:
     """The state with a keyframe, which was tracked against `tied_to`, in the window and matched to the others."""
-    known, window = sliding_window.enter(slam.map, slam.window, keyframe, slam.intrinsics, roles, settings, tied_to)
+    given = slam.map, slam.window, keyframe, slam.intrinsics, roles, settings, tied_to
+    known, window = sliding_window.enter(*given, length_known=length_known)
     return replace(slam, map=known, window=window)
 
 

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, solve_pose_graph
 from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
@@ -129,5 +130,23 @@ def test_a_guessed_length_takes_the_jump_of_the_scale() -> None:
     np.testing.assert_allclose(found, np.where(np.arange(60) < 30, 1.0, 1.0 / 3.0), rtol=0.05)
 
 
+def test_a_length_within_its_noise_takes_the_jump_of_the_scale() -> None:
+    """The same for a motion whose length was measured, but to half of itself only: a turn with few known depths."""
+    poor = np.diag([1.0 / 0.15**2] * 3 + [1e6] * 3)
+    motions = [_tracked(number) for number in range(1, 60)]
+    motions[29] = replace(motions[29], information=poor)
+    loops = [ScaleRatio(first, first + 40, 1.0 / 3.0) for first in (5, 8, 11)]
+    found = solve_scales(60, motions, loops)
+    np.testing.assert_allclose(found, np.where(np.arange(60) < 30, 1.0, 1.0 / 3.0), rtol=0.05)
+
+
+def test_a_ratio_counts_by_its_error() -> None:
+    """Of two ratios that differ by 0.2, the one with a tenth of the error decides; oracle: the weighted mean."""
+    motions = [_tracked(number) for number in range(1, 60)]
+    found = solve_scales(60, motions, [ScaleRatio(5, 45, 1.0, 0.03), ScaleRatio(5, 45, float(np.exp(0.2)), 0.3)])
+    assert abs(np.log(found[45] / found[5])) < 0.02
+
+
 def _tracked(number: int) -> MeasuredRelativePose:
-    return MeasuredRelativePose(number - 1, number, np.eye(4), np.eye(6))
+    """A step of 0.3, known to a thousandth of it."""
+    return MeasuredRelativePose(number - 1, number, exponential(np.r_[0.3, np.zeros(5)]), 1e7 * np.eye(6))

@@ -18,7 +18,7 @@ from vggtgeo.slam.global_map.loops import verify
 from vggtgeo.slam.global_map.straightening import Loop
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.units import scaled_motion
+from vggtgeo.slam.sparse_map.units import MAX_SCALE_ERROR, scaled_motion
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import pieces_by_size
 from vggtgeo.slam.threads import map_in_threads
@@ -52,7 +52,7 @@ def _joined(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Ro
     proposed = _look_alike(slam.keyframes, main, other)
     alone = not can_search(slam.keyframes[other[0]].features)
     found = [loop for loop in map_in_threads(verified, proposed, alone=alone) if loop is not None]
-    loops = [loop for loop in found if loop.ratio is not None]
+    loops = [loop for loop in found if loop.scale is not None and loop.scale.error < MAX_SCALE_ERROR]
     best: tuple[Slam, list[Loop]] | None = None
     for loop in loops:
         trial = _moved(slam, loop, set(other))
@@ -96,7 +96,7 @@ def _look_alike(
 def _moved(slam: Slam, loop: Loop, other: set[int]) -> Slam:
     """The state with the submap of keyframes `other` where a loop says that it is, in the unit of the rest."""
     first, second = loop.pair.key
-    ratio = loop.ratio or 1.0
+    ratio = 1.0 if loop.scale is None else loop.scale.ratio
     if first in other:
         # The loop is in the unit of its first keyframe, which changes.
         ratio = 1.0 / ratio

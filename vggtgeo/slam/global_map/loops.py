@@ -13,13 +13,14 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import inverse_information
 from vggtgeo.models.classical import can_search, pose_information
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
+from vggtgeo.slam.global_map.scale_graph import ScaleRatio
 from vggtgeo.slam.global_map.straightening import Loop, straightened
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.covisibility import Pair, overlap, some_points
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.units import ratio_of_units
+from vggtgeo.slam.sparse_map.units import measured_ratio
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.track import PIXEL_SIGMA
@@ -29,6 +30,8 @@ MIN_VISIBLE, MAX_TURN = 0.4, np.deg2rad(40)
 MIN_INLIERS = 50
 """Minimum number of PnP inliers of a loop (exclusive): keyframes far apart in time have no predicted pose for a check.
 """
+MAX_RATIO_ERROR = 0.3
+"""Largest standard error of the logarithm of a measured scale ratio: larger ones are not normally distributed."""
 FLOOR = (0.02, np.deg2rad(0.5))
 """Systematic error of a verified pose, metres and radians: all its depths are those of one keyframe and share its
 error."""
@@ -135,5 +138,6 @@ def verify(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarr
     # Covariances add: matching noise, and what all matches share.
     floor = np.diag(np.repeat(FLOOR, 3) ** 2)
     information = np.linalg.inv(inverse_information(information) + floor)
-    ratio = ratio_of_units(first, second, agreed.select(agreed.index_j >= 0), relative, intrinsics)
-    return Loop(pair, MeasuredRelativePose(*pair.key, relative, information), ratio)
+    ratio, error = measured_ratio(first, second, agreed.select(agreed.index_j >= 0), relative, intrinsics)
+    scale = ScaleRatio(*pair.key, ratio, error) if error < MAX_RATIO_ERROR else None
+    return Loop(pair, MeasuredRelativePose(*pair.key, relative, information), scale)

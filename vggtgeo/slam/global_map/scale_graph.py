@@ -21,8 +21,8 @@ DRIFT = 0.01
 """Standard deviation of the change of scale from one keyframe to the next."""
 GUESSED = STEP_GROWTH
 """The same if the length of the motion between them was taken from the motion so far."""
-RATIO = 0.03
-"""Standard deviation of the logarithm of a measured ratio."""
+MIN_RATIO_ERROR = 0.03
+"""Smallest standard deviation of the logarithm of a measured ratio: what its points have in common."""
 WIDTHS = (1024.0, 256.0, 64.0, 16.0, 4.0, 2.5, 2.5, 2.5)
 """Widths of the Cauchy kernel on ratios, one reweighting each, in standard deviations: graduated, since after a large
 drift true ratios have residuals as large as false ones."""
@@ -30,11 +30,14 @@ drift true ratios have residuals as large as false ones."""
 
 @dataclass(frozen=True)
 class ScaleRatio:
-    """Factor `ratio` that converts lengths of keyframe `second` to the scale of keyframe `first`."""
+    """Factor `ratio` that converts lengths of keyframe `second` to the scale of keyframe `first`; error: the standard
+    error of its logarithm.
+    """
 
     first: int
     second: int
     ratio: float
+    error: float = 0.0
 
 
 def solve_scales(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios: Sequence[ScaleRatio]) -> np.ndarray:
@@ -44,8 +47,8 @@ def solve_scales(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios
     ends = [*(motion.keyframes for motion in motions), *((r.first, r.second) for r in ratios)]
     first, second = np.array(ends, int).T
     measured = np.concatenate([np.zeros(len(motions)), np.log([r.ratio for r in ratios])])
-    drifts = [GUESSED if motion.by_rays else DRIFT for motion in motions]
-    sigma = np.array([*drifts, *[RATIO] * len(ratios)])
+    errors = [float(np.hypot(MIN_RATIO_ERROR, ratio.error)) for ratio in ratios]
+    sigma = np.array([*(scale_drift(motion) for motion in motions), *errors])
     rows = np.repeat(np.arange(len(first)), 2)
     shape = (len(first), keyframes)
     logs, weight = np.zeros(keyframes), np.ones(len(first))
@@ -61,3 +64,18 @@ def solve_scales(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios
         # Cauchy's weight, for the measured ratios only: nothing but them contradicts the drift model.
         weight[len(motions) :] = 1.0 / (1.0 + (residual[len(motions) :] / width) ** 2)
     return np.exp(logs)
+
+
+def scale_drift(motion: MeasuredRelativePose) -> float:
+    """Return the standard deviation of the change of scale along a tracked motion.
+
+    Points triangulated by the motion inherit the relative error of its length.
+    """
+    if motion.by_rays:
+        return GUESSED
+    length = float(np.linalg.norm(motion.pose[:3, 3]))
+    if not length > 0:
+        return GUESSED
+    along = motion.pose[:3, 3] / length
+    variance = along @ np.linalg.inv(motion.information)[:3, :3] @ along
+    return float(min(np.hypot(DRIFT, np.sqrt(variance) / length), GUESSED))

@@ -37,7 +37,7 @@ class Loop:
 
     pair: Pair
     motion: MeasuredRelativePose
-    ratio: float | None
+    scale: ScaleRatio | None
 
     def agrees(self, slam: Slam) -> bool:
         """Return whether the adjustment can use the matches: half of them reproject within `MAX_LOOP_ERROR`."""
@@ -136,7 +136,7 @@ def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[
     """Return the factor on the lengths of each keyframe, float64 [n]; 1 in metres or in the unit of the recording."""
     if slam.metric or slam.map.recorded_factors:
         return np.ones(len(slam.keyframes))
-    ratios = [ScaleRatio(*loop.pair.key, loop.ratio) for loop in loops if loop.ratio is not None]
+    ratios = [loop.scale for loop in loops if loop.scale is not None]
     return solve_scales(len(slam.keyframes), motions, ratios)
 
 

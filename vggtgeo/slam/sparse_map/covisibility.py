@@ -64,6 +64,21 @@ def some_points(keyframe: Keyframe, intrinsics: np.ndarray, most: int = 64) -> n
     return rigid.unproject(keyframe.points.pixels[some], inverse[some], keyframe.pose, intrinsics)
 
 
+def points_in_view(keyframe: Keyframe, intrinsics: np.ndarray, most: int = 64) -> np.ndarray:
+    """Return world points of a few slots, spread over the image, float64 `[m, 3]`; none where no depth is known.
+
+    Slots of unknown depth are at the mean inverse depth of the others: in a turn without metric depth only the side of
+    the image that is leaving has depth.
+    """
+    inverse = keyframe.points.inverse_depth
+    known = np.isfinite(inverse)
+    if not known.any():
+        return np.zeros((0, 3))
+    some = np.arange(len(inverse))[:: max(len(inverse) // most, 1)]
+    filled = np.where(known, inverse, np.mean(inverse[known]))
+    return rigid.unproject(keyframe.points.pixels[some], filled[some], keyframe.pose, intrinsics)
+
+
 def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> float:
     """Return the share of world points inside the image of `keyframe`."""
     if not len(points):
@@ -75,14 +90,19 @@ def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> f
     return float(np.mean(inside))
 
 
-def match_keyframes(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarray) -> Pair | None:
+def match_keyframes(
+    first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarray, *, length_known: bool = True
+) -> Pair | None:
     """Match two keyframes with predicted poses; None if they share too little.
+
+    length_known: whether the distance between both is measured. Where it is not, matches with points of known depth are
+    checked by their epipolar distance, too: they are what will measure it.
 
     The overlap is predicted from the points of the first, or of the second if the first has no depth; without any depth
     it is not checked.
     """
     for one, other in ((first, second), (second, first)):
-        seen = some_points(one, intrinsics)
+        seen = points_in_view(one, intrinsics)
         if len(seen):
             if overlap(seen, other, intrinsics) < MIN_OVERLAP:
                 return None
@@ -90,7 +110,7 @@ def match_keyframes(first: Keyframe, second: Keyframe, roles: Roles, intrinsics:
     relative = second.pose @ rigid.invert(first.pose)
     points = roles.points.match(first.features, second.features, None)
     check_answer("points.match", points, PointMatches)
-    points = points.select(_consistent(points, first, relative, intrinsics))
+    points = points.select(_consistent(points, first, relative, intrinsics, length_known))
     view = RelativeView(relative, intrinsics, first.line_depths)
     lines = roles.line_matches.match(first.lines, second.lines, view)
     # Points and lines count together: half of what each alone would need is enough where both are there.
@@ -127,7 +147,9 @@ def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Di
     return forward, backward
 
 
-def _consistent(points: PointMatches, first: Keyframe, relative: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+def _consistent(
+    points: PointMatches, first: Keyframe, relative: np.ndarray, intrinsics: np.ndarray, length_known: bool
+) -> np.ndarray:
     """Return which matches are consistent with the predicted motion, bool [m].
 
     By reprojection where depth is known, else by epipolar distance. Remaining outliers are left to the robust kernel.
@@ -140,4 +162,4 @@ def _consistent(points: PointMatches, first: Keyframe, relative: np.ndarray, int
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
     off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)
     epipolar = pinhole.epipolar_distance(points.pixels_i, points.pixels_j, relative, intrinsics)
-    return np.where(known, off < REPROJECTION_GATE, epipolar < EPIPOLAR_GATE)
+    return np.where(known & length_known, off < REPROJECTION_GATE, epipolar < EPIPOLAR_GATE)

@@ -22,10 +22,18 @@ MAX_SCALE_ERROR = 0.03
 def ratio_of_units(
     old: Keyframe, new: Keyframe, matches: PointMatches, relative: np.ndarray, intrinsics: np.ndarray
 ) -> float | None:
-    """Return the factor that converts lengths of `new` to the scale of `old`; both ends of the matches are key points.
+    """Return the factor of `measured_ratio`; None if its standard error exceeds `MAX_SCALE_ERROR`."""
+    ratio, error = measured_ratio(old, new, matches, relative, intrinsics)
+    return ratio if error < MAX_SCALE_ERROR else None
+
+
+def measured_ratio(
+    old: Keyframe, new: Keyframe, matches: PointMatches, relative: np.ndarray, intrinsics: np.ndarray
+) -> tuple[float, float]:
+    """Return the factor that converts lengths of `new` to the scale of `old`, and the standard error of its logarithm.
 
     The median over key points of known depth in both keyframes of the old depth, transformed to the new camera by
-    `relative`, over the new depth. None if they are too few or inconsistent.
+    `relative`, over the new depth. Both ends of the matches are key points. Infinite error: too few have a depth.
     """
     before, after = old.points.inverse_depth[matches.index_i], new.points.inverse_depth[matches.index_j]
     known = old.points.determined[matches.index_i] & new.points.determined[matches.index_j]
@@ -35,13 +43,13 @@ def ratio_of_units(
     # A point behind the new camera has no depth there: its match is wrong.
     ahead = depth > 0
     if np.count_nonzero(ahead) < MIN_SHARED:
-        return None
+        return 1.0, np.inf
     # Ratios are symmetric in the logarithm: exchanging the keyframes changes the sign only.
     logs = np.log(depth[ahead] * after[ahead])
     middle = float(np.median(logs))
     # Standard error of a median: 1.25 sigma / sqrt(n), sigma from the median absolute deviation.
     error = 1.25 * 1.48 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
-    return float(np.exp(middle)) if error < MAX_SCALE_ERROR else None
+    return float(np.exp(middle)), error
 
 
 def longer(motion: np.ndarray, ratio: float) -> np.ndarray:

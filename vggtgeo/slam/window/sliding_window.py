@@ -147,13 +147,18 @@ def enter(
     roles: Roles,
     settings: SlamSettings,
     tied_to: int | None = None,
+    *,
+    length_known: bool = True,
 ) -> tuple[Map, Window]:
     """Add a keyframe, which was tracked against `tied_to`, to the window and match it to the others.
 
-    The images of those outside the window are compressed.
+    length_known: whether the distance to `tied_to` is measured (`match_keyframes`). The images of those outside the
+    window are compressed.
     """
     window = make_room(window, settings, tied_to)
-    match = lambda number: match_keyframes(known.keyframes[number], keyframe, roles, intrinsics)
+    match = lambda number: match_keyframes(
+        known.keyframes[number], keyframe, roles, intrinsics, length_known=length_known
+    )
     matched = map_in_threads(match, window.members, alone=not can_search(keyframe.features))
     pairs = tuple(pair for pair in matched if pair is not None)
     inside = (*window.members, keyframe.number)
