@@ -24,11 +24,12 @@ def test_depth_on_the_side_that_leaves_does_not_hide_what_both_see() -> None:
 
     Oracle: the true matches.
     """
-    first, second, matches = _turned(np.deg2rad(25.0), np.zeros(3))
+    first, second, matches = _turned(np.deg2rad(25.0), np.array([0.05, 0.0, 0.0]))
     leaving = np.setdiff1d(np.arange(len(first.points.pixels)), matches.index_i)
     inverse = np.full(len(first.points.pixels), np.nan)
     inverse[leaving] = 1.0 / DEPTH
-    first = replace(first, points=replace(first.points, inverse_depth=inverse))
+    deviation = np.where(np.isfinite(inverse), 1e-4, np.nan)
+    first = replace(first, points=replace(first.points, inverse_depth=inverse, deviation=deviation))
     pair = match_keyframes(first, second, _roles(matches), INTRINSICS)
     assert pair is not None
     assert len(pair.points) == len(matches)
