@@ -7,6 +7,7 @@ information of motion lengths about scale, which is small around a loop.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -77,5 +78,5 @@ def scale_drift(motion: MeasuredRelativePose) -> float:
     if not length > 0:
         return GUESSED
     along = motion.pose[:3, 3] / length
-    variance = along @ np.linalg.inv(motion.information)[:3, :3] @ along
-    return float(min(np.hypot(DRIFT, np.sqrt(variance) / length), GUESSED))
+    sigma = float(np.sqrt(along @ np.linalg.inv(motion.information)[:3, :3] @ along))
+    return min(math.hypot(DRIFT, sigma / length), GUESSED)

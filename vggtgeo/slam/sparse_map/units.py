@@ -48,7 +48,7 @@ def measured_ratio(
     logs = np.log(depth[ahead] * after[ahead])
     middle = float(np.median(logs))
     # Standard error of a median: 1.25 sigma / sqrt(n), sigma from the median absolute deviation.
-    error = 1.25 * 1.48 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
+    error = 1.25 * 1.48 * float(np.median(np.abs(logs - middle))) / float(np.sqrt(len(logs)))
     return float(np.exp(middle)), error
 
 
