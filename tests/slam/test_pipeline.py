@@ -32,7 +32,7 @@ from vggtgeo.slam.global_map.global_shape import padded_count, padded_edges, sha
 from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.connected import piece_of
@@ -45,7 +45,7 @@ SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.
 SETTINGS = SlamSettings(
     window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
-    refinement=RefinementSettings(global_adjustment=False),
+    refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
 

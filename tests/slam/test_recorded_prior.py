@@ -23,7 +23,7 @@ from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.connected import piece_of
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -37,7 +37,7 @@ SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
 SETTINGS = SlamSettings(
     window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
-    refinement=RefinementSettings(global_adjustment=False),
+    refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
 DARK = range(16, 26)
@@ -237,7 +237,7 @@ def test_black_frames_are_bridged_without_depth(walk: Walk) -> None:
     """The same where nothing but the recording tells the scale behind the dark."""
     truth = walk[2]
     roles = replace(ROLES, depth=NoDepth(), recorded=RecordedPoses(_disturbed(truth)))
-    slam = finish(_run(walk, roles), roles, replace(SETTINGS, refinement=RefinementSettings(rolling_shutter=False)))
+    slam = finish(_run(walk, roles), roles, replace(SETTINGS, refinement=GlobalMapSettings(rolling_shutter=False)))
     assert piece_of(slam.map).max() == 0
     assert evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse < 0.04
 

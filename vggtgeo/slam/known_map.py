@@ -34,7 +34,7 @@ FEW = 20
 """Number of key points below which this is not checked."""
 SAME_CAMERA = 0.02
 """Largest relative difference of focal lengths and principal point between calibrations of one camera: twice the
-standard deviation of a calibration (`PRIOR` in `camera/calibration.py`)."""
+standard deviation of a calibration (`PRIOR` in `camera/given_camera.py`)."""
 
 
 def as_map(slam: Slam) -> Slam:

@@ -10,8 +10,8 @@ import numpy as np
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
+from vggtgeo.slam.camera.given_camera import RefinedCamera, Solve, keyframe_pairs, refine_given_camera, without_surfaces
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair
 from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
@@ -158,7 +158,7 @@ def _with_its_camera(
     """Return the state after trying to refine a given camera, or to undistort a guessed one."""
     again = _solves(settings)
     if slam.camera.calibrated:
-        found = try_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, again)
+        found = refine_given_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, again)
         return _taken_camera(slam, adjustment, found, settings)
     slam, adjustment, state = _with_its_pixels(slam, adjustment, state, again)
     if slam.camera.lens is not None or not can_undistort(slam.keyframes):
@@ -215,7 +215,7 @@ def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
     )
 
 
-def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, settings: SlamSettings) -> Slam:
+def _taken_camera(slam: Slam, adjustment: Adjustment, found: RefinedCamera | None, settings: SlamSettings) -> Slam:
     """Return the state with a refined camera if it improves the fit or is required, and notes for the user."""
     if found is None:
         return slam
@@ -260,7 +260,7 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
     )
 
 
-def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
+def _lens_note(found: RefinedCamera, shape: tuple[int, int]) -> list[str]:
     """Return a note on a significant distortion that moves the corners of the image beyond the noise of matches."""
     (k1, sigma), focal = found.distortion, float(found.given[0])
     # Displacement of a corner at normalised radius `r`: `f k1 r^3`.

@@ -38,7 +38,7 @@ MOMENT = 0.01
 (uniform: 0.0096 s), and published image times are off by as much. A run cannot observe it: the poses absorb it."""
 CALIBRATION = 0.01
 """Relative standard deviation of the focal length, and so of each rotation since the first pose: that of manufacturers
-and calibration tools (`slam/camera/calibration.py`)."""
+and calibration tools (`slam/camera/given_camera.py`)."""
 CENTRE = 0.014
 """Standard deviation of an unmeasured principal point, in image widths and heights: root mean square of published ones.
 A principal point at the exact middle was not measured; its error rotates all cameras by one unknown angle."""

@@ -29,9 +29,9 @@ from vggtgeo.slam.settings.groups import (
     SEGMENT_SAMPLES,
     CameraSettings,
     DepthSettings,
+    GlobalMapSettings,
     KeyframeSettings,
     LineSettings,
-    RefinementSettings,
     WeightSettings,
     WindowSettings,
 )
@@ -176,7 +176,7 @@ class SlamSettings:
     weights: WeightSettings = field(default_factory=WeightSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
-    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    refinement: GlobalMapSettings = field(default_factory=GlobalMapSettings)
 
     @property
     def padded_samples(self) -> int | None:
