@@ -1,4 +1,4 @@
-"""The bank of simulated runs that the verdict's levels are set on, and validated on.
+"""The bank of simulated runs that the verdict's thresholds are set on, and validated on.
 
     .venv/bin/python benchmarks/verdict_bank.py make [--out runs/verdict-bank] [--count 420] [--jobs 1]
     .venv/bin/python benchmarks/verdict_bank.py judge [--out runs/verdict-bank] [--saved] [--judge MODULE]

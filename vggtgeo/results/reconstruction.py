@@ -48,10 +48,10 @@ from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Finding, Verdict
-from vggtgeo.slam.verdict.input import check_input, check_refusals, check_still_parts
+from vggtgeo.slam.verdict.input_findings import check_input, check_refusals, check_static_overlay
 from vggtgeo.slam.verdict.judge import judge_or_report
-from vggtgeo.slam.verdict.witness import EvidenceRecorder
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
@@ -384,4 +384,4 @@ class StaticOverlaySearch(Callback):
         """Return the findings for the verdict, after the last frame."""
         if not self._searched:
             self._overlay = static_overlay_of(self._images, self._size)
-        return check_still_parts(self._overlay, left_out=self.found is not None)
+        return check_static_overlay(self._overlay, left_out=self.found is not None)

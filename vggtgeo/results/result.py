@@ -50,9 +50,9 @@ from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.verdict.witness import Evidence
 from vggtgeo.slam.window_recorder import WindowRecord
 
 DepthChoice = bool | Literal["every"]
@@ -134,7 +134,7 @@ class Result:
         return frame_uncertainty(self.record.slam) if self.record.slam.keyframes else None
 
     @classmethod
-    def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
+    def of(cls, slam: Slam, evidence: CornerTracks = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
         """Return the result of a state of `vggtgeo.run` or `vggtgeo.finish`.
 
         evidence: frame data of an `EvidenceRecorder`; without it the verdict uses the state alone. truth: ground truth,

@@ -28,8 +28,8 @@ from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import SeenPoints
 from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.judge import aligned
-from vggtgeo.slam.verdict.witness import FrameEvidence
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
 _solve = eqx.filter_jit(vg.solve)
@@ -197,7 +197,7 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
 
 
 def test_corners_of_the_verdict_go_through_the_lens() -> None:
-    # Proves that the witness sees the same camera as the map. Oracle: what it is given, back through the lens.
+    # Proves that the corner tracks show the same camera as the map. Oracle: what it is given, back through the lens.
     slam = undistorted(run_of_room(), LENS)
     seen = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]], np.float32)
     nothing = np.zeros(3, np.float32)

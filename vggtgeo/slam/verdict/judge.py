@@ -12,15 +12,15 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.adjustment import Tracks
 from vggtgeo.slam.verdict.alternatives import explain
 from vggtgeo.slam.verdict.claim import Claim, extent
-from vggtgeo.slam.verdict.decision import findings
+from vggtgeo.slam.verdict.corner_findings import findings
+from vggtgeo.slam.verdict.corner_recorder import CornerTracks, FrameEvidence
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
-from vggtgeo.slam.verdict.levels import MAX_UNKNOWN, NEAREST
-from vggtgeo.slam.verdict.record import check_frozen, check_record
+from vggtgeo.slam.verdict.thresholds import MAX_UNKNOWN, MIN_SENSOR_DEPTH
+from vggtgeo.slam.verdict.tracking_findings import check_frozen, check_record
 from vggtgeo.slam.verdict.windows import linked, thinned, tracks_of, windows
-from vggtgeo.slam.verdict.witness import Evidence, FrameEvidence
 
 
-def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
+def judge(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
     """Judge the state after the last adjustment.
 
     Args:
@@ -39,7 +39,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
 
 
-def judge_or_report(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
+def judge_or_report(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
     """Call `judge`; an error in it becomes a finding, so that the result of a long run is not lost."""
     try:
         return judge(slam, evidence, input_findings)
@@ -75,7 +75,7 @@ def check_unit(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
     if not claim.metric or not len(depths):
         return []
     near, middle = np.quantile(depths, [0.1, 0.5])
-    if near >= NEAREST and PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
+    if near >= MIN_SENSOR_DEPTH and PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
         return []
     text = (
         f"the median depth of the corners is {middle:.2g} m, and a tenth of them is within {near:.2g} m, outside the "
@@ -93,7 +93,7 @@ def tracks_of_windows(slam: Slam, claim: Claim, corners: Sequence[FrameEvidence]
     return [tracks for tracks in found if tracks is not None]
 
 
-def aligned(slam: Slam, claim: Claim, evidence: Evidence) -> Sequence[FrameEvidence] | None:
+def aligned(slam: Slam, claim: Claim, evidence: CornerTracks) -> Sequence[FrameEvidence] | None:
     """The corners of each frame of the run, without the distortion that it estimated; None where some are missing."""
     by_frame = {noted.frame: noted for noted in evidence}
     if any(frame not in by_frame for frame in claim.frames):

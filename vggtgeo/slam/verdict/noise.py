@@ -19,9 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.slam.verdict.adjustment import SIZE, Fit, Noise, reduce, solve
-
-MIN_PIXEL, MIN_DEPTH = 0.05, 0.003
-"""Pixels and relative: below these a simulated recording without noise would find everything significant."""
+from vggtgeo.slam.verdict.thresholds import MIN_PIXEL_NOISE, MIN_RELATIVE_DEPTH_NOISE
 
 
 def with_own_noise(fit: Fit) -> Fit:
@@ -38,7 +36,7 @@ def estimated(fit: Fit) -> Noise:
     known = np.isfinite(tracks.depth)
     shared = residual[known, 2] * np.sqrt(tracks.depths[known])  # the error of a depth is common to its track
     depth = noise.depth * _deviation(shared) if known.any() else noise.depth
-    return Noise(max(float(pixel), MIN_PIXEL), max(depth, MIN_DEPTH))
+    return Noise(max(float(pixel), MIN_PIXEL_NOISE), max(depth, MIN_RELATIVE_DEPTH_NOISE))
 
 
 def _deviation(values: np.ndarray) -> float:

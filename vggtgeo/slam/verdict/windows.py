@@ -9,16 +9,11 @@ import numpy as np
 
 from vggtgeo.slam.verdict.adjustment import Tracks
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.witness import FrameEvidence
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
+from vggtgeo.slam.verdict.thresholds import MIN_COMMON, MIN_FRAMES, MIN_VIEWS
 
 WINDOW = 24
 """Frames that are adjusted together."""
-MIN_VIEWS = 3
-"""Frames of a window that a track is seen in; two of them determine its point."""
-MIN_FRAMES = 4
-"""Frames of a window; in fewer, free poses explain nearly all."""
-MIN_COMMON = 10
-"""Corners that link a frame to the next: twenty numbers for six unknowns."""
 SHARED, MAX_STEP = 0.5, 3
 """The next frame of a window is the farthest one that still shows this share of the corners, at most so many on."""
 

@@ -1,4 +1,4 @@
-"""What the tracker recorded: whether the run started, which frames were lost, how many parts the map has.
+"""Findings about tracking: a run that never started, lost frames, submaps that are not connected, repeated pictures.
 
 A lost stretch of `T` seconds is bridged by assuming a smooth motion. A hand-held camera's acceleration has a standard
 deviation of about `ACCELERATION`, so the middle of a bridge is off by `a T^2 / 8`, the end of a run that is not
@@ -14,10 +14,17 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.claim import Claim, extent
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.finding import Finding, Level, spans
-from vggtgeo.slam.verdict.levels import ACCELERATION, MAX_BRIDGED, MAX_LOST, MIN_TRACKED, SHARE, UNMOVED
-from vggtgeo.slam.verdict.windows import MIN_COMMON
-from vggtgeo.slam.verdict.witness import FrameEvidence
+from vggtgeo.slam.verdict.thresholds import (
+    ACCELERATION,
+    MAX_BRIDGED,
+    MAX_LOST,
+    MAX_PLACE_ERROR_SHARE,
+    MAX_UNMOVED,
+    MIN_COMMON,
+    MIN_TRACKED,
+)
 
 
 def check_record(claim: Claim) -> list[Finding]:
@@ -71,7 +78,7 @@ def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding
     )
     squares = [(last - first + 1) * (claim.times[last] - claim.times[first - 1]) ** 2 / 3 for first, last in stretches]
     off = float(np.median(speeds[~repeated[1:]]) * np.sqrt(sum(squares) / len(claim)))
-    if off <= (MAX_BRIDGED if claim.metric else SHARE * extent(claim.poses[claim.tracked])):
+    if off <= (MAX_BRIDGED if claim.metric else MAX_PLACE_ERROR_SHARE * extent(claim.poses[claim.tracked])):
         return []
     first, last = max(stretches, key=lambda ends: ends[1] - ends[0])
     start, end = int(claim.frames[first]), int(claim.frames[last])
@@ -83,7 +90,7 @@ def _same(before: FrameEvidence, after: FrameEvidence) -> bool:
     """Whether two frames show one picture: most of their corners did not move at all."""
     _, first, second = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
     moved = np.abs(before.pixels[first] - after.pixels[second]).max(1, initial=0.0)
-    return len(first) >= MIN_COMMON and bool(np.median(moved) < UNMOVED)
+    return len(first) >= MIN_COMMON and bool(np.median(moved) < MAX_UNMOVED)
 
 
 def _never_started(claim: Claim) -> str:

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from witness import Walk, walk
+from corner_walk import Walk, walk
 
-from vggtgeo.slam.verdict.record import check_frozen, check_record
+from vggtgeo.slam.verdict.tracking_findings import check_frozen, check_record
 
 
 def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:

@@ -1,4 +1,4 @@
-"""The witness of the verdict: corners followed from image to image, and the measured depth there.
+"""Recorder of the corner tracks with which the verdict tests a run, and of the measured depth at them.
 
 The tracks (Lucas & Kanade, 1981, on images of 320 pixels) are independent of the map, its features and its poses. About
 4 ms a frame (640 x 480), 4 kB a frame.
@@ -32,8 +32,8 @@ from vggtgeo.slam.state import Slam
 
 STRIDE = 8
 """Pixels between the depths that are kept of the last frame."""
-MAX_WAITING = 4
-"""Frames that wait to be looked at; they hold their images."""
+MAX_QUEUED_FRAMES = 4
+"""Maximum number of frames that wait for the recorder's thread; they hold their images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +90,14 @@ class EvidenceRecorder(Callback):
 
     @property
     def frames(self) -> list[FrameEvidence]:
-        """Evidence of each frame so far."""
+        """The corners of each frame so far."""
         while self._waiting:
             self._waiting.popleft().result()
         return self._frames
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         """Follow the corners in a thread of its own, beside the run."""
-        while len(self._waiting) > MAX_WAITING:
+        while len(self._waiting) > MAX_QUEUED_FRAMES:
             self._waiting.popleft().result()
         self._waiting.append(self._pool.submit(self._add, frame))
 
@@ -156,4 +156,5 @@ class EvidenceRecorder(Callback):
         return ~self._left_out[row, column]
 
 
-Evidence = Sequence[FrameEvidence]
+CornerTracks = Sequence[FrameEvidence]
+"""The corners of each frame of a run; equal ids are one track."""

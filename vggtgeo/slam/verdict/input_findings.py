@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.slam.perception.still_parts import StillParts
+from vggtgeo.slam.perception.static_overlay import StaticOverlay
 from vggtgeo.slam.verdict.finding import Finding
-from vggtgeo.slam.verdict.levels import MAX_LOST
+from vggtgeo.slam.verdict.thresholds import MAX_LOST
 
 
 def check_refusals(refusals: Mapping[str, Refusals]) -> tuple[Finding, ...]:
@@ -35,7 +35,7 @@ def check_input(warned: Iterable[Warning | str], frames: int) -> tuple[Finding, 
     return (Finding("input", "degraded", text),)
 
 
-def check_still_parts(seen: StillParts | None, left_out: bool) -> tuple[Finding, ...]:
+def check_static_overlay(seen: StaticOverlay | None, left_out: bool) -> tuple[Finding, ...]:
     """A static part of the picture: whether it was masked, and whether it belongs to the camera beyond doubt."""
     if seen is None or (left_out and seen.sure):
         return ()
