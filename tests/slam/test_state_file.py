@@ -33,7 +33,7 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import STATE, load_state, save_state
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.tracker import SeenPoints, Waiting
+from vggtgeo.slam.tracking.tracker import SeenPoints, UnplacedFrame
 from vggtgeo.slam.window.window import WindowPrior
 
 MIDDLE = 4
@@ -52,7 +52,7 @@ def full(slam: Slam) -> Slam:
     """The state with something in every field that a good run leaves empty."""
     frame = recorded_run().frames[MIDDLE]
     newest = slam.keyframes[-1]
-    waiting = Waiting(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
+    waiting = UnplacedFrame(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
     compressed = (slam.keyframes[0].compressed(), *slam.keyframes[1:])
     slam = settled(slam)
     assert slam.window.solved is not None

@@ -27,7 +27,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.start import (
-    MAX_WAITING,
+    MAX_FRAMES_WITHOUT_POSE,
     begin_again_with_depth,
     start_without_depth,
     without_depth,
@@ -363,7 +363,7 @@ def _missed(
     if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
-    waiting = wait(slam.tracker, frame, features, MAX_WAITING)
+    waiting = wait(slam.tracker, frame, features, MAX_FRAMES_WITHOUT_POSE)
     slam = replace(slam, tracker=replace(slam.tracker, lost=slam.tracker.lost + 1))
     shown = sum(len(other.features) > settings.keyframes.min_inliers for other in waiting)
     patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE

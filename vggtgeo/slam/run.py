@@ -43,7 +43,8 @@ from vggtgeo.slam.tracking.frame_refinement import against_nearest
 
 AHEAD = 3
 """Frames that are prepared before they are needed."""
-Waiting = Callable[[], AbstractContextManager[Any]]
+WaitContext = Callable[[], AbstractContextManager[Any]]
+"""Makes a context that is entered while the run waits for a frame."""
 
 
 def run(
@@ -116,7 +117,7 @@ def run_frames(
     clock: Clock,
     known: Slam | None = None,
     before: Collection[Frame] = (),
-    waiting: Waiting = nullcontext,
+    waiting: WaitContext = nullcontext,
 ) -> Iterator[Slam]:
     """The same over any iterable of frames of one camera, on from a state that is known.
 
@@ -242,7 +243,7 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _described(
-    frames: Iterator[Frame], camera: Camera, roles: Roles, clock: Clock, waiting: Waiting
+    frames: Iterator[Frame], camera: Camera, roles: Roles, clock: Clock, waiting: WaitContext
 ) -> Iterator[tuple[Frame, Description]]:
     """Undistorted frames, prepared in a thread of their own while earlier ones are tracked; where every frame needs its
     key points, with them.

@@ -21,7 +21,7 @@ from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import place_waiting
-from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, Waiting
+from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, UnplacedFrame
 
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
@@ -55,8 +55,8 @@ def lost(walk: tuple[list[Frame], Camera, Trajectory]) -> Slam:
     return replace(slam, map=replace(slam.map, metric=False), tracker=tracker)
 
 
-def _waiting(frame: Frame) -> Waiting:
-    return Waiting(frame.index, frame.timestamp, frame.image, ROLES.points.describe(frame.image))
+def _waiting(frame: Frame) -> UnplacedFrame:
+    return UnplacedFrame(frame.index, frame.timestamp, frame.image, ROLES.points.describe(frame.image))
 
 
 def test_lost_frames_are_placed_by_keyframes_made_of_them(
@@ -89,7 +89,7 @@ def test_frames_that_stay_without_a_pose_are_kept(lost: Slam) -> None:
     """Of the frames that waited, those that the next tracked one does not place are kept, and not more than fit."""
     blank = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     waiting = tuple(
-        Waiting(100 + row, 100.0 + row, blank, ROLES.points.describe(blank)) for row in range(MAX_UNPLACED + 5)
+        UnplacedFrame(100 + row, 100.0 + row, blank, ROLES.points.describe(blank)) for row in range(MAX_UNPLACED + 5)
     )
     tracked = FramePose(300, 300.0, 0, np.eye(4), True, 50)
     tracker = replace(lost.tracker, frames=(*lost.frames, tracked), waiting=waiting, unplaced=())

@@ -20,7 +20,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.map_points import in_view
 from vggtgeo.slam.tracking.relocalisation import record_of, relocalise
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_to, track, track_by_map
-from vggtgeo.slam.tracking.tracker import FramePose, Waiting, frame_pose
+from vggtgeo.slam.tracking.tracker import FramePose, UnplacedFrame, frame_pose
 from vggtgeo.slam.window.window import Window
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
@@ -45,18 +45,18 @@ def place_lost(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     return replace(slam, notes=(*slam.notes, note))
 
 
-def _nearest_first(slam: Slam, waiting: dict[int, Waiting]) -> list[int]:
+def _nearest_first(slam: Slam, waiting: dict[int, UnplacedFrame]) -> list[int]:
     """The frames by how far the next frame with a pose is."""
     placed = np.array([record.frame for record in slam.frames if record.tracked])
     return sorted(waiting, key=lambda frame: int(np.abs(placed - frame).min(initial=np.iinfo(int).max)))
 
 
-def _data(waiting: Waiting) -> FrameData:
+def _data(waiting: UnplacedFrame) -> FrameData:
     frame = Frame(waiting.frame, waiting.timestamp, waiting.image, None, "")
     return FrameData(frame, Description.of(waiting.features), None)
 
 
-def _found(slam: Slam, waiting: Waiting, roles: Roles) -> Track | None:
+def _found(slam: Slam, waiting: UnplacedFrame, roles: Roles) -> Track | None:
     """The frame's pose by a keyframe that looks like it, or near the frame that is next to it in time."""
     given = TrackingInput(_data(waiting), slam.intrinsics, roles)
     certain = relocalise(given, slam.keyframes, slam.tracker)
@@ -77,13 +77,13 @@ def _found(slam: Slam, waiting: Waiting, roles: Roles) -> Track | None:
     return max(accepted, key=lambda found: found.evidence.inliers, default=None)
 
 
-def _beside(slam: Slam, waiting: Waiting) -> FramePose | None:
+def _beside(slam: Slam, waiting: UnplacedFrame) -> FramePose | None:
     """The frame with a pose that is nearest in time."""
     placed = [record for record in slam.frames if record.tracked]
     return min(placed, key=lambda record: abs(record.timestamp - waiting.timestamp), default=None)
 
 
-def _with_frame(slam: Slam, waiting: Waiting, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
+def _with_frame(slam: Slam, waiting: UnplacedFrame, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
     """The state with the frame's pose, and the frame as a keyframe where it sees what others do not."""
     record = record_of(_data(waiting).frame, found)
     if needs_keyframe(found.pose, found.keyframe.pose, found.evidence.inliers, settings.keyframes):
@@ -94,7 +94,7 @@ def _with_frame(slam: Slam, waiting: Waiting, found: Track, roles: Roles, settin
 
 
 def _with_keyframe(
-    slam: Slam, waiting: Waiting, found: Track, record: FramePose, roles: Roles, settings: SlamSettings
+    slam: Slam, waiting: UnplacedFrame, found: Track, record: FramePose, roles: Roles, settings: SlamSettings
 ) -> tuple[Slam, FramePose]:
     """The state with a new keyframe, adjusted in a window of those nearest in time, which stay where they are."""
     number, data, label = len(slam.keyframes), _data(waiting), piece_of(slam.map)
