@@ -30,7 +30,7 @@ from vggtgeo.slam.known_map import as_map, entered, save_map
 from vggtgeo.slam.pending_window import settled
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.judge import judge
 
@@ -135,9 +135,9 @@ def test_the_state_of_a_run_is_a_map(known: Slam) -> None:
 
 
 def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:
-    """Frames that follow are found in the map and extend it: one piece, in its world; oracle: the truth."""
+    """Frames that follow are found in the map and extend it: one submap, in its world; oracle: the truth."""
     slam = run(HALF, known_map=known)
-    assert len(pieces_by_size(slam)) == 1
+    assert len(submaps_by_size(slam)) == 1
     assert [record.tracked for record in slam.frames] == [True] * (FRAMES - HALF)
     assert worst_error(slam) < 0.02
     assert len(slam.keyframes) > len(known.keyframes)

@@ -23,7 +23,7 @@ from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.window_recorder import WindowRecord
 
@@ -149,7 +149,7 @@ def _view(
     scene = map_scene(
         cloud,
         trajectory,
-        pictured([slam.keyframes[number] for number in pieces_by_size(slam)[0]]),
+        pictured([slam.keyframes[number] for number in submaps_by_size(slam)[0]]),
         [float(value) for value in slam.intrinsics],
         mesh=mesh(),
         truth=truth,

@@ -12,7 +12,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.global_map.join_submaps import join_pieces
+from vggtgeo.slam.global_map.join_submaps import join_submaps
 from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe, view_change
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pending_window import begin_window, is_due, settled
@@ -21,7 +21,7 @@ from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import RecordedPrior, recorded_prior
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
@@ -62,7 +62,7 @@ from vggtgeo.slam.tracking.two_view_motion import usual_step
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 LOST_PATIENCE = 10
-"""Frames that show something, but nothing of the map, before a new piece of map begins. Black frames do not count."""
+"""Number of lost frames with texture after which a new submap begins. Black frames do not count."""
 NEIGHBOURS = 3
 """Keyframes before and after an old one that make up the window when the camera comes back to it."""
 
@@ -214,12 +214,12 @@ def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Ro
     # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
     if best.accepted and not data.description.described:
         return best
-    piece = slam.keyframes[slam.map.roots[-1] :]
+    submap = slam.keyframes[slam.map.roots[-1] :]
     if not best.accepted:
         source = view_of(best.keyframe, slam.tracker, slam.intrinsics, roles)
-        joint = track_by_map(given, piece, best.keyframe, source)
+        joint = track_by_map(given, submap, best.keyframe, source)
         return joint if joint.accepted else best
-    return refined_by_map(best, given, piece)
+    return refined_by_map(best, given, submap)
 
 
 def _prior(slam: Slam, frame: Frame, recorded: RecordedPrior | None) -> MotionPrior:
@@ -287,7 +287,7 @@ def _insert_and_adjust(
         return _with_record(begin_window(inserted, lambda: adjusted(" (own thread)")), record)
     slam = adjusted("")
     with clock.measure("relocalise"):
-        return _with_record(join_pieces(slam, data, roles, settings), record)
+        return _with_record(join_submaps(slam, data, roles, settings), record)
 
 
 def _with_record(slam: Slam, record: FramePose) -> Slam:
@@ -322,9 +322,9 @@ def _place_waiting(slam: Slam, roles: Roles) -> Slam:
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     """A window of the keyframes around an old one, held where it is: the camera has come back to it.
 
-    Those of its own piece: the place of another is a guess, by which matches would be found that mean nothing.
+    Only of its own submap: the pose of another one is a guess, so matches predicted from it would be wrong.
     """
-    label = piece_of(slam.map)
+    label = submap_of(slam.map)
     around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
     window = tuple(other for other in around if label[other] == label[number])[-(settings.window.size - 1) :]
     # Without metric depth one held pose leaves the unit free: two hold it.
@@ -348,7 +348,7 @@ def _missed(
     settings: SlamSettings,
     clock: Clock,
 ) -> Slam:
-    """No pose by images: that of the recording, if it is known; else after too many such frames begin a piece of map of
+    """No pose by images: that of the recording, if it is known; else after too many such frames begin a submap of
     its own.
     """
     frame, features = data.frame, data.features
@@ -369,8 +369,8 @@ def _missed(
     patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE
     if not patient and len(features) > settings.keyframes.min_inliers:
         note = (
-            f"a new piece of map begins at frame {frame.index} ({frame.name}): "
-            "nothing ties it to the one before, its place is only a guess"
+            f"a new submap begins at frame {frame.index} ({frame.name}): "
+            "nothing connects it to the one before, its place is only a guess"
         )
         begun = _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
         return _place_waiting(begun, roles) if _started(begun) else begun

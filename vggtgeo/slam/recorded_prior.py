@@ -13,7 +13,7 @@ import numpy as np
 
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.units import longer
 from vggtgeo.slam.state import Slam
@@ -47,7 +47,7 @@ class RecordedPrior:
 
     def with_tie(self, slam: Slam) -> Slam:
         """The state with the recorded motion to its newest keyframe from the one before, if both are in one submap."""
-        label, (before, newest) = piece_of(slam.map), slam.keyframes[-2:]
+        label, (before, newest) = submap_of(slam.map), slam.keyframes[-2:]
         known = any(tie.keyframes == (before.number, newest.number) for tie in slam.map.recorded_factors)
         tie = recorded_tie(self.recorded, before, newest, self.unit)
         if tie is None or known or label[before.number] != label[newest.number]:

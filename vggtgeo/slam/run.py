@@ -38,7 +38,7 @@ from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.tracking.frame_refinement import against_nearest
 
 AHEAD = 3
@@ -170,10 +170,10 @@ def finish(
         return adjust_all(slam, settings)
 
 
-def frame_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
-    """Camera -> world of every frame that has a pose in a piece of the map, by default the one of most frames.
+def frame_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
+    """Camera -> world of every frame that has a pose in a submap, by default the one of most frames.
 
-    A frame without one (lost, or before a start) is left out. Pieces are tied by nothing, so that their poses mean
+    A frame without one (lost, or before a start) is left out. Submaps are not connected, so that their poses mean
     nothing to each other: each has a trajectory of its own.
 
     Example:
@@ -182,20 +182,20 @@ def frame_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
         Trajectory(1 pose, 0.00 s, path 0.00 m)
 
     Raises:
-        InputError: `slam` is no state of a run, or has no such piece.
+        InputError: `slam` is no state of a run, or has no such submap.
 
     """
     check_kind("slam", slam, Slam, "a state of a run, as `vggtgeo.run` yields it")
-    check_whole("piece", piece, most=max(len(pieces_by_size(slam)) - 1, 0) if slam.keyframes else 0)
+    check_whole("submap", submap, most=max(len(submaps_by_size(slam)) - 1, 0) if slam.keyframes else 0)
     times, poses = frame_poses(slam)
-    own: set[int] = set(pieces_by_size(slam)[piece]) if slam.keyframes else set()
+    own: set[int] = set(submaps_by_size(slam)[submap]) if slam.keyframes else set()
     chosen = np.array([record.tracked and record.reference in own for record in slam.frames], bool)
     return Trajectory(times[chosen], rigid.invert(poses[chosen]))
 
 
-def keyframe_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
-    """Camera -> world of the keyframes of a piece of the map, by default the one of most frames."""
-    own = [slam.keyframes[number] for number in pieces_by_size(slam)[piece]] if slam.keyframes else []
+def keyframe_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
+    """Camera -> world of the keyframes of a submap, by default the one of most frames."""
+    own = [slam.keyframes[number] for number in submaps_by_size(slam)[submap]] if slam.keyframes else []
     poses = rigid.invert(np.array([keyframe.pose for keyframe in own]).reshape(-1, 4, 4))
     return Trajectory(np.array([keyframe.timestamp for keyframe in own]), poses)
 

@@ -152,7 +152,7 @@ def test_poses_that_contradict_each_other_are_told_by_what_both_know(run: Record
 
 
 def test_in_a_larger_world_frames_are_placed_as_before(run: RecordedRun) -> None:
-    """A map whose lengths become three times as long, as a piece that joins another one: frames stand where they stood,
+    """Lengths of a map become three times as long, as a submap that joins another one: frames stand where they stood,
     three times as far, and agree with both keyframes as well as they did. Oracle: the poses before.
     """
     slam = run.slam

@@ -20,7 +20,7 @@ def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
     assert [(f.start, f.end, f.local) for f in check_record(lose([7, 8]))] == [(7, 8, True)]
     assert [f.local for f in check_record(lose(np.arange(10, 16)))] == [True, False]
     assert "failed" in {f.level for f in check_record(lose(np.arange(8, 40)))}
-    assert [f.check for f in check_record(replace(healthy.claim, pieces=2))] == ["parts"]
+    assert [f.check for f in check_record(replace(healthy.claim, submaps=2))] == ["submaps"]
 
 
 def test_many_losses_are_one_sentence(healthy: Walk) -> None:

@@ -13,14 +13,14 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import can_search
-from vggtgeo.slam.global_map.join_submaps import scaled_piece
+from vggtgeo.slam.global_map.join_submaps import scale_submap
 from vggtgeo.slam.global_map.loops import verify
 from vggtgeo.slam.global_map.straightening import Loop
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.units import scaled_motion
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.threads import map_in_threads
 
 ALIKE = 2
@@ -34,7 +34,7 @@ def join_at_end(slam: Slam, roles: Roles) -> Slam:
     joined = None if slam.metric else slam
     while joined is not None:
         slam, joined = joined, None
-        main, *others = pieces_by_size(slam) or ((),)
+        main, *others = submaps_by_size(slam) or ((),)
         for other in others:
             joined = _joined(slam, main, other, roles)
             if joined is not None:
@@ -64,7 +64,7 @@ def _joined(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Ro
         return None
     joined, agreeing = best
     note = (
-        f"the piece of map that began at frame {slam.keyframes[other[0]].frame} is joined to the rest at the end: "
+        f"the submap that began at frame {slam.keyframes[other[0]].frame} is joined to the rest at the end: "
         f"{len(agreeing)} pairs of keyframes agree on its place"
     )
     motions = tuple(loop.motion for loop in agreeing if loop.motion.first in main)
@@ -104,7 +104,7 @@ def _moved(slam: Slam, loop: Loop, other: set[int]) -> Slam:
         number, place = first, motion @ slam.keyframes[second].pose
     else:
         number, place = second, loop.motion.pose @ slam.keyframes[first].pose
-    scaled = scaled_piece(slam, ratio, lambda own: own in other)
+    scaled = scale_submap(slam, ratio, lambda own: own in other)
     carried = rigid.invert(scaled.keyframes[number].pose) @ place
     keyframes = tuple(
         replace(keyframe, pose=rigid.orthonormal(keyframe.pose @ carried)) if keyframe.number in other else keyframe

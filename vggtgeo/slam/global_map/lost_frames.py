@@ -14,7 +14,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.keyframe_decision import needs_keyframe
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.map_points import in_view
@@ -68,7 +68,7 @@ def _found(slam: Slam, waiting: UnplacedFrame, roles: Roles) -> Track | None:
     pose = frame_pose(slam.map, beside)
     prior = MotionPrior(pose, np.eye(4), waited=abs(beside.frame - waiting.frame) - 1)
     given = replace(given, prior=prior)
-    label = piece_of(slam.map)
+    label = submap_of(slam.map)
     own = [keyframe for keyframe in slam.keyframes if label[keyframe.number] == label[beside.reference]]
     near = in_view(own, pose)
     tried = [track(given, keyframe, None) for keyframe in near]
@@ -97,7 +97,7 @@ def _with_keyframe(
     slam: Slam, waiting: UnplacedFrame, found: Track, record: FramePose, roles: Roles, settings: SlamSettings
 ) -> tuple[Slam, FramePose]:
     """The state with a new keyframe, adjusted in a window of those nearest in time, which stay where they are."""
-    number, data, label = len(slam.keyframes), _data(waiting), piece_of(slam.map)
+    number, data, label = len(slam.keyframes), _data(waiting), submap_of(slam.map)
     keyframe = make_keyframe(number, data.frame, found.pose, data.description, roles, settings, slam.intrinsics)
     others = [other for other in slam.keyframes if label[other.number] == label[found.keyframe.number]]
     others.sort(key=lambda other: (other is not found.keyframe, abs(other.timestamp - waiting.timestamp)))

@@ -17,7 +17,7 @@ from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.units import longer
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.tracking.recorded_motion import (
     Comparison,
     carried,
@@ -69,7 +69,7 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
     next is then that of the map, or the recorded one where both disagree by more than the recording drifts.
     """
     poses, scales = np.array([keyframe.pose for keyframe in slam.keyframes]), np.ones(len(slam.keyframes))
-    for submap in pieces_by_size(slam):
+    for submap in submaps_by_size(slam):
         if not np.isfinite(units[submap[0]]):
             continue
         numbers = tuple(sorted(submap, key=lambda number: slam.keyframes[number].timestamp))
@@ -112,7 +112,7 @@ def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
     """The state with submaps of a known unit placed by the recorded motion from the nearest keyframe of the largest
     submap, or of those joined to it before.
     """
-    main, *others = [set(numbers) for numbers in pieces_by_size(slam) if np.isfinite(units[numbers[0]])]
+    main, *others = [set(numbers) for numbers in submaps_by_size(slam) if np.isfinite(units[numbers[0]])]
     for other in others:
         pairs = product((slam.keyframes[number] for number in main), (slam.keyframes[number] for number in other))
         near, own = min(pairs, key=lambda pair: abs(pair[0].timestamp - pair[1].timestamp))

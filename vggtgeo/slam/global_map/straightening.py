@@ -15,7 +15,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, distance, solve_pose_graph
 from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion
@@ -126,7 +126,7 @@ def _graph(
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])
     whole = replace(slam, map=replace(slam.map, factors=(*slam.map.factors, *loops)))
-    label = piece_of(whole.map)
+    label = submap_of(whole.map)
     held = np.zeros(len(poses), bool)
     held[np.unique(label, return_index=True)[1]] = True
     return PoseGraph(start, scaled_motions, scaled_loops, held)

@@ -25,7 +25,7 @@ from scipy.special import logsumexp
 from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import GeometryResult
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map
@@ -100,7 +100,7 @@ def recorded_ties(recorded: RecordedPoses, known: Map, units: np.ndarray) -> lis
     """Those between keyframes that follow each other in time, in one submap. units: of the recording at each keyframe,
     float64 [n], NaN = not known.
     """
-    label = piece_of(known)
+    label = submap_of(known)
     placed = [keyframe for keyframe in known.keyframes if np.isfinite(units[keyframe.number])]
     placed.sort(key=lambda keyframe: keyframe.timestamp)
     ties = [
@@ -150,7 +150,7 @@ class _Record:
     @classmethod
     def of(cls, recorded: RecordedPoses, known: Map) -> _Record | None:
         """Of the record so far; None where the recording tells none of its motions."""
-        label, rows = np.zeros(len(known.keyframes), int) if known.metric else piece_of(known), []
+        label, rows = np.zeros(len(known.keyframes), int) if known.metric else submap_of(known), []
         for factor in known.odometry_factors:
             first, second = (known.keyframes[number] for number in factor.keyframes)
             motion = recorded.motion(first.timestamp, second.timestamp)

@@ -11,7 +11,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA, Readout
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,7 @@ class Claim:
     """The claim of a run.
 
     frames: int [n]. times: float64 [n], s. poses: float64 [n, 4, 4], world -> camera. tracked: bool [n]. intrinsics:
-    fx, fy, cx, cy, pixels. metric: lengths are metres. pieces: number of parts of the map. started: there was a map.
+    fx, fy, cx, cy, pixels. metric: lengths are metres. submaps: their number. started: there was a map.
     in_known_map: the run began in the map of an earlier one. guessed: the camera is unknown, and too little was seen to
     estimate it. readout: of the rolling shutter that the last adjustment found.
     """
@@ -30,7 +30,7 @@ class Claim:
     tracked: np.ndarray
     intrinsics: np.ndarray
     metric: bool
-    pieces: int = 1
+    submaps: int = 1
     started: bool = True
     in_known_map: bool = False
     guessed: bool = False
@@ -47,7 +47,7 @@ class Claim:
             tracked=np.array([record.tracked for record in slam.frames], bool),
             intrinsics=np.asarray(slam.intrinsics, np.float64),
             metric=slam.metric,
-            pieces=max(len(pieces_by_size(slam)), 1),
+            submaps=max(len(submaps_by_size(slam)), 1),
             started=any(np.isfinite(keyframe.points.inverse_depth).any() for keyframe in slam.keyframes),
             in_known_map=any(keyframe.frame < 0 for keyframe in slam.keyframes),
             guessed=not (slam.camera.calibrated or slam.camera.self_calibrated)

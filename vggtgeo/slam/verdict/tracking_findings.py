@@ -28,7 +28,7 @@ from vggtgeo.slam.verdict.thresholds import (
 
 
 def check_record(claim: Claim) -> list[Finding]:
-    """Lost frames, parts of the map, a run that never started."""
+    """Check for lost frames, unconnected submaps, and a run that never started."""
     if not len(claim):
         return []
     if not claim.started or (len(claim) > 2 and np.count_nonzero(claim.tracked) <= 1):
@@ -40,12 +40,12 @@ def check_record(claim: Claim) -> list[Finding]:
         text = "the camera is unknown, and too little was seen to estimate it; pass `--intrinsics`"
         found.append(Finding("camera", "degraded", text))
     found += _lost(claim)
-    if claim.pieces > 1:
+    if claim.submaps > 1:
         text = (
-            f"the map is in {claim.pieces} parts that are not connected; trajectory.txt and map.ply hold the one with "
+            f"the map has {claim.submaps} submaps that are not connected; trajectory.txt and map.ply hold the one with "
             "most frames, trajectory-2.txt the next"
         )
-        found.append(Finding("parts", "degraded", text))
+        found.append(Finding("submaps", "degraded", text))
     return found
 
 
