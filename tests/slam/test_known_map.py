@@ -27,7 +27,7 @@ from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.known_map import as_map, entered, save_map
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
 from vggtgeo.slam.submaps import submaps_by_size
@@ -48,7 +48,7 @@ def run(start: int = 0, end: int | None = None, seed: int = 0, **options: Any) -
     given = {"roles": ROLES, "settings": SETTINGS, **options}
     frames = sequence(seed) if given["roles"].metric else without_depth(sequence(seed))
     *_, slam = vg.run(frames, **given, start=start, end=end)
-    return settled(slam)
+    return merge_pending_window(slam)
 
 
 @cache

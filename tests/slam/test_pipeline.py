@@ -30,7 +30,7 @@ from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.global_shape import padded_count, padded_edges, shape_for
 from vggtgeo.slam.global_map.loops import close_loops
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -57,7 +57,7 @@ def room() -> tuple[list[Frame], Camera, object]:
 
 
 def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES, settings: SlamSettings = SETTINGS) -> Slam:
-    return settled(list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1])
+    return merge_pending_window(list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1])
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +248,7 @@ def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
     motion[:3, 3] = 2.0, 0.5, -2.0
     count = len(tracked.keyframes)
     closed = close_loops(_visited_twice(tracked, motion), ROLES, settings)
-    assert any("straightened the map" in note for note in closed.notes), closed.notes
+    assert any("corrected the drift" in note for note in closed.notes), closed.notes
     assert sum(pair.first < count <= pair.second for pair in closed.map.pairs) >= 3
     for slam, bound in ((closed, 0.10), (adjust_all(closed, settings), 0.005)):
         poses = np.array([keyframe.pose for keyframe in slam.keyframes])

@@ -19,7 +19,7 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
@@ -64,7 +64,7 @@ def _run(walk: Walk, roles: Roles) -> Slam:
     frames, camera, _ = walk
     if not roles.metric:
         frames = [replace(frame, depth=None) for frame in frames]
-    return settled(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
+    return merge_pending_window(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
 
 
 def _disturbed(truth: Trajectory, drift: float = 0.02, scale: float = 1.05) -> Trajectory:

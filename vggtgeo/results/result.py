@@ -47,7 +47,7 @@ from vggtgeo.results.summary import (
 from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
@@ -141,7 +141,7 @@ class Result:
         camera -> world. dense: source of the dense depth, as in `vggtgeo.reconstruct`.
         """
         check_kind("slam", slam, Slam, "a state of `vggtgeo.run`")
-        slam = settled(slam)
+        slam = merge_pending_window(slam)
         verdict, built = judge(slam, evidence), dense_map(slam, dense)
         count = len(built.cloud)
         report = compare_with_truth(slam, truth)

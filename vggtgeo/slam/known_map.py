@@ -21,7 +21,7 @@ from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
@@ -39,7 +39,7 @@ standard deviation of a calibration (`PRIOR` in `camera/given_camera.py`)."""
 
 def as_map(slam: Slam) -> Slam:
     """Return the map of a run's state."""
-    slam = settled(slam)
+    slam = merge_pending_window(slam)
     count = len(slam.keyframes)
     keyframes = tuple(
         replace(

@@ -15,7 +15,7 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.join_submaps import join_submaps
 from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe, view_change
 from vggtgeo.slam.manhattan import constrain_rotation
-from vggtgeo.slam.pending_window import begin_window, is_due, settled
+from vggtgeo.slam.pending_window import begin_window, is_due, merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.precision import in_double_precision
@@ -36,11 +36,11 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
 from vggtgeo.slam.tracking.relocalisation import (
+    close_loop_while_tracking,
     frame_data,
     place_waiting,
     record_of,
     relocalise,
-    revisit,
     view_of,
     wait,
 )
@@ -79,7 +79,7 @@ def step(
     """Take one frame (undistorted) into the state; its key points are found if they are needed."""
     clock = clock or Clock()
     if is_due(slam):
-        slam = _settled(slam, clock)
+        slam = _merge_pending_window(slam, clock)
     if not slam.metric:
         roles = without_depth(roles)
     if not slam.keyframes:
@@ -107,9 +107,9 @@ def step(
     return _place_waiting(slam, roles) if was_lost else slam
 
 
-def _settled(slam: Slam, clock: Clock) -> Slam:
+def _merge_pending_window(slam: Slam, clock: Clock) -> Slam:
     with clock.measure("wait for the window"):
-        return settled(slam)
+        return merge_pending_window(slam)
 
 
 def _started(slam: Slam) -> bool:
@@ -156,11 +156,11 @@ def _track(
         unknown_place = _in_known_map(slam) and slam.tracker.reference is None
         found = None if unknown_place else _find(slam, data, recorded, roles, settings)
     if slam.pending is not None and (found is None or not found.accepted):
-        slam = _settled(slam, clock)
+        slam = _merge_pending_window(slam, clock)
         with clock.measure("track"):
             found = _find(slam, data, recorded, roles, settings)
     if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
-        slam = _settled(slam, clock)
+        slam = _merge_pending_window(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if (slam.tracker.lost or not slam.metric) and (found is None or not found.accepted):
         with clock.measure("relocalise"):
@@ -396,7 +396,7 @@ def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settin
             again = None  # drift may have put another keyframe there
     if again is None:
         given = TrackingInput(data, slam.intrinsics, roles)
-        again = revisit(given, found, slam.map, slam.tracker, slam.window.members)
+        again = close_loop_while_tracking(given, found, slam.map, slam.tracker, slam.window.members)
     if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
         return slam, found
     near = again.keyframe

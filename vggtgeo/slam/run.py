@@ -31,7 +31,7 @@ from vggtgeo.slam.global_map.lost_frames import place_lost
 from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.made_ahead import made_ahead
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
@@ -155,7 +155,7 @@ def finish(
 
     """
     check_kind("slam", slam, Slam, "the state that `vggtgeo.run` yields")
-    slam, roles, settings = settled(slam), roles or default_roles(slam.metric), settings or SlamSettings()
+    slam, roles, settings = merge_pending_window(slam), roles or default_roles(slam.metric), settings or SlamSettings()
     fixed = settings.keyframes.localise_only or not settings.refinement.global_adjustment
     if fixed or len(slam.keyframes) < 3:
         return slam

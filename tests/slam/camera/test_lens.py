@@ -24,7 +24,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
 from vggtgeo.slam.global_map.global_adjustment import _taken_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import SeenPoints
 from vggtgeo.slam.verdict.claim import Claim
@@ -121,7 +121,7 @@ def test_few_keyframes_tell_no_lens() -> None:
 
 def test_a_lens_that_does_not_pay_is_not_taken() -> None:
     # Proves that the state stays where matches do not ask for a lens, or it folds the image. Oracle: the state.
-    slam = settled(recorded_run().states[-1])
+    slam = merge_pending_window(recorded_run().states[-1])
     assert slam.window.solved is not None
     adjustment, state = slam.window.solved
     left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
@@ -151,7 +151,7 @@ LENS = Camera((140.0, 140.0, 80.0, 58.0), 160, 120, (-0.2, 0.03, 0.0, 0.0), know
 @cache
 def run_of_room() -> Slam:
     *_, slam = vg.run(vg.simulate("room", 6, size=(160, 120), rate=10.0), ROLES, SETTINGS)
-    return settled(slam)
+    return merge_pending_window(slam)
 
 
 def redrawn(pixels: np.ndarray) -> np.ndarray:

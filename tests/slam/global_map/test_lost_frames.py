@@ -15,7 +15,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.lost_frames import place_lost
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -47,7 +47,7 @@ def walk() -> tuple[list[Frame], Camera, Trajectory]:
 def lost(walk: tuple[list[Frame], Camera, Trajectory]) -> Slam:
     """A map of the first frames whose scale is free, and all later frames without a pose."""
     frames, camera, _ = walk
-    slam = settled(list(run_frames(iter(frames[:KNOWN]), camera, ROLES, SETTINGS, Clock()))[-1])
+    slam = merge_pending_window(list(run_frames(iter(frames[:KNOWN]), camera, ROLES, SETTINGS, Clock()))[-1])
     last = slam.frames[-1]
     later = [replace(last, frame=frame.index, timestamp=frame.timestamp, tracked=False) for frame in frames[KNOWN:]]
     unplaced = tuple(_waiting(frame) for frame in frames[KNOWN:])

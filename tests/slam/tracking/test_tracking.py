@@ -22,7 +22,7 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.join_at_end import join_at_end
 from vggtgeo.slam.global_map.join_submaps import join_submaps, scale_submap
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
@@ -58,7 +58,7 @@ def room() -> Room:
 
 
 def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES) -> Slam:
-    return settled(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
+    return merge_pending_window(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
 
 
 def _black(frame: Frame) -> Frame:

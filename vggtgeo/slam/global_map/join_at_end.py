@@ -13,9 +13,9 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import can_search
+from vggtgeo.slam.global_map.drift_correction import Loop
 from vggtgeo.slam.global_map.join_submaps import scale_submap
 from vggtgeo.slam.global_map.loops import verify
-from vggtgeo.slam.global_map.straightening import Loop
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.units import scaled_motion

@@ -1,6 +1,6 @@
-"""Frames without a pose, tried again when all is known: against every keyframe, also those that came after them.
+"""Placement of lost frames without depth, at the end of a run: against every keyframe, also later ones.
 
-Only in maps of free scale. A frame that sees much of what no keyframe shows becomes a keyframe; its matches give depth
+A frame that sees much of what no keyframe shows becomes a keyframe; its matches give depth
 to points that place further frames. This is repeated until no frame is placed any more.
 """
 

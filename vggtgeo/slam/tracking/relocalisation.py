@@ -39,7 +39,9 @@ def relocalise(
     return None
 
 
-def revisit(given: TrackingInput, current: Track, known: Map, tracker: Tracker, members: Sequence[int]) -> Track | None:
+def close_loop_while_tracking(
+    given: TrackingInput, current: Track, known: Map, tracker: Tracker, members: Sequence[int]
+) -> Track | None:
     """Return the frame's pose by an old keyframe of the same place, whatever the drift: a loop closed during the run.
 
     Tracking continues from there, and the last adjustment distributes the error of the loop. At most one keyframe is
