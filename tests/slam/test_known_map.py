@@ -172,7 +172,7 @@ def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     assert not any(record.tracked for record in slam.frames)
     assert len(slam.tracker.waiting) == 6
     assert "0 of 6 frames were found in the known map" in judge(slam).reasons[0]
-    assert not Claim.of(first_half()).in_known_map
+    assert not Claim.of(first_half()).began_in_known_map
 
 
 def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.join_submaps import join_submaps
-from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe, view_change
+from vggtgeo.slam.keyframe_decision import becomes_keyframe, track_by_old_keyframe, view_change
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pending_window import begin_window, is_due, merge_pending_window
 from vggtgeo.slam.perception.description import Description
@@ -36,7 +36,6 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
 from vggtgeo.slam.tracking.relocalisation import (
-    close_loop_while_tracking,
     frame_data,
     place_waiting,
     record_of,
@@ -51,7 +50,6 @@ from vggtgeo.slam.tracking.track import (
     TrackingInput,
     moved_with,
     refined_by_map,
-    tie_between,
     tie_to,
     track,
     track_by_map,
@@ -84,7 +82,7 @@ def step(
         roles = without_depth(roles)
     if not slam.keyframes:
         return _first(slam, frame, description.features, roles, settings)
-    if not _in_known_map(slam) and not _started(slam):
+    if not _only_localises(slam) and not _started(slam):
         with clock.measure("start"):
             features = description.features
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
@@ -93,12 +91,14 @@ def step(
     recorded = recorded_prior(slam, roles)
     slam, data, found = _track(slam, frame, description, recorded, roles, settings, clock)
     if found is None or not found.accepted:
-        return _missed(slam, data, Evidence() if found is None else found.evidence, recorded, roles, settings, clock)
+        return _handle_lost_frame(
+            slam, data, Evidence() if found is None else found.evidence, recorded, roles, settings, clock
+        )
     was_lost = bool(slam.tracker.lost)
     slam = _moved(slam, frame, found)
 
-    slam, found, becomes_keyframe = _decide(slam, data, found, roles, settings, clock)
-    if becomes_keyframe:
+    slam, found, inserts = _decide(slam, data, found, roles, settings, clock)
+    if inserts:
         slam = _insert_and_adjust(slam, data, found, recorded, roles, settings, clock)
     else:
         slam = _refer_to(slam, found.keyframe, roles)
@@ -119,8 +119,11 @@ def _started(slam: Slam) -> bool:
     )
 
 
-def _in_known_map(slam: Slam) -> bool:
-    """Whether there is a map that no frame has been tracked in so far, or none that became a keyframe."""
+def _only_localises(slam: Slam) -> bool:
+    """Return whether this run still only localises in a map of an earlier run.
+
+    None of its own frames has become a keyframe.
+    """
     return not slam.window.members
 
 
@@ -153,13 +156,13 @@ def _track(
     with clock.measure("track"):
         data = _with_lines(frame_data(frame, description, slam.intrinsics, roles, slam.metric), roles, settings)
         # In a map of another run the place of the first frame is unknown: it is searched by appearance alone.
-        unknown_place = _in_known_map(slam) and slam.tracker.reference is None
+        unknown_place = _only_localises(slam) and slam.tracker.reference is None
         found = None if unknown_place else _find(slam, data, recorded, roles, settings)
     if slam.pending is not None and (found is None or not found.accepted):
         slam = _merge_pending_window(slam, clock)
         with clock.measure("track"):
             found = _find(slam, data, recorded, roles, settings)
-    if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
+    if slam.pending is not None and found is not None and becomes_keyframe(found, settings.keyframes):
         slam = _merge_pending_window(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if (slam.tracker.lost or not slam.metric) and (found is None or not found.accepted):
@@ -188,12 +191,15 @@ def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
 def _decide(
     slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
 ) -> tuple[Slam, Track, bool]:
-    """Whether a tracked frame becomes a keyframe; not where an old one shows it as well, which is then its keyframe."""
-    if _needs_keyframe(found, settings):
+    """Decide whether a tracked frame becomes a keyframe.
+
+    It does not where an old keyframe shows it as well; that one is then its keyframe.
+    """
+    if becomes_keyframe(found, settings.keyframes):
         with clock.measure("track"):
-            tied, found = _seen_before(slam, data, found, roles, settings)
+            tied, found = track_by_old_keyframe(slam, data, found, roles, settings)
             slam = slam if settings.keyframes.localise_only else tied
-    return slam, found, not settings.keyframes.localise_only and _needs_keyframe(found, settings)
+    return slam, found, not settings.keyframes.localise_only and becomes_keyframe(found, settings.keyframes)
 
 
 def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Roles, settings: SlamSettings) -> Track:
@@ -334,12 +340,12 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:
     note = f"found again at frame {frame.index} ({frame.name}), {slam.tracker.lost} frames after tracking was lost"
-    if _in_known_map(slam) and slam.tracker.reference is None:
+    if _only_localises(slam) and slam.tracker.reference is None:
         note = f"frame {frame.index} ({frame.name}) is the first that was found in the map"
     return replace(slam, notes=(*slam.notes, note))
 
 
-def _missed(
+def _handle_lost_frame(
     slam: Slam,
     data: FrameData,
     evidence: Evidence,
@@ -348,9 +354,7 @@ def _missed(
     settings: SlamSettings,
     clock: Clock,
 ) -> Slam:
-    """No pose by images: that of the recording, if it is known; else after too many such frames begin a submap of
-    its own.
-    """
+    """Give a frame that images do not place its recorded pose, if known; else let it wait, or begin a submap at it."""
     frame, features = data.frame, data.features
     carried = None if recorded is None else recorded.carried(slam, frame.timestamp)
     if carried is not None:
@@ -377,34 +381,3 @@ def _missed(
     reference, relative = (slam.frames[-1].reference, slam.frames[-1].relative) if slam.frames else (0, np.eye(4))
     record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, evidence)
     return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record), waiting=waiting))
-
-
-def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
-    """The frame by an old keyframe that stands where it does, if there is one that shows it as well as the present one:
-    the map grows with space, not with time.
-
-    What the two keyframes know of each other by this frame ties them.
-    """
-    others = (keyframe for keyframe in slam.keyframes if keyframe.number != found.keyframe.number)
-    near = nearest_keyframe(found.pose, others, settings.keyframes)
-    again = None
-    if near is not None:
-        prior = MotionPrior(found.pose, slam.tracker.velocity)
-        given = TrackingInput(data, slam.intrinsics, roles, prior)
-        again = track(given, near, view_of(near, slam.tracker, slam.intrinsics, roles))
-        if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
-            again = None  # drift may have put another keyframe there
-    if again is None:
-        given = TrackingInput(data, slam.intrinsics, roles)
-        again = close_loop_while_tracking(given, found, slam.map, slam.tracker, slam.window.members)
-    if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
-        return slam, found
-    near = again.keyframe
-    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):
-        return slam, again
-    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie_between(found, again)))), again
-
-
-def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
-    own, reference = found.pose, found.keyframe.pose
-    return found.evidence.by_rays or needs_keyframe(own, reference, found.evidence.inliers, settings.keyframes)

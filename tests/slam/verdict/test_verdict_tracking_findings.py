@@ -47,14 +47,14 @@ def test_a_single_frame_is_no_run(healthy: Walk) -> None:
         **{name: getattr(healthy.claim, name)[:count] for name in ("frames", "times", "poses", "tracked")},
     )
     assert [f.level for f in check_record(first(1))] == ["degraded"]
-    assert not check_record(replace(first(1), in_known_map=True))
+    assert not check_record(replace(first(1), began_in_known_map=True))
     assert not check_record(first(2))
 
 
 def test_a_run_that_is_found_nowhere_in_a_map_says_so(healthy: Walk) -> None:
     """In a known map the reason is that no frame, or one alone, was found there; oracle: the sentence."""
     for found in (0, 1):
-        claim = replace(healthy.claim, tracked=np.arange(40) < found, in_known_map=True)
+        claim = replace(healthy.claim, tracked=np.arange(40) < found, began_in_known_map=True)
         (finding,) = check_record(claim)
         assert finding.level == "failed"
         assert finding.text.startswith(f"{found} of 40 frames were found in the known map")

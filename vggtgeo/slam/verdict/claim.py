@@ -20,8 +20,8 @@ class Claim:
 
     frames: int [n]. times: float64 [n], s. poses: float64 [n, 4, 4], world -> camera. tracked: bool [n]. intrinsics:
     fx, fy, cx, cy, pixels. metric: lengths are metres. submaps: their number. started: there was a map.
-    in_known_map: the run began in the map of an earlier one. guessed: the camera is unknown, and too little was seen to
-    estimate it. readout: of the rolling shutter that the last adjustment found.
+    began_in_known_map: the run began in the map of an earlier one. guessed: the camera is unknown, and too little was
+    seen to estimate it. readout: of the rolling shutter that the last adjustment found.
     """
 
     frames: np.ndarray
@@ -32,7 +32,7 @@ class Claim:
     metric: bool
     submaps: int = 1
     started: bool = True
-    in_known_map: bool = False
+    began_in_known_map: bool = False
     guessed: bool = False
     readout: Readout | None = None
 
@@ -49,7 +49,7 @@ class Claim:
             metric=slam.metric,
             submaps=max(len(submaps_by_size(slam)), 1),
             started=any(np.isfinite(keyframe.points.inverse_depth).any() for keyframe in slam.keyframes),
-            in_known_map=any(keyframe.frame < 0 for keyframe in slam.keyframes),
+            began_in_known_map=any(keyframe.frame < 0 for keyframe in slam.keyframes),
             guessed=not (slam.camera.calibrated or slam.camera.self_calibrated)
             and len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA,
             readout=slam.camera.readout,

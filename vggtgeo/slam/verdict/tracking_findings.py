@@ -34,7 +34,7 @@ def check_record(claim: Claim) -> list[Finding]:
     if not claim.started or (len(claim) > 2 and np.count_nonzero(claim.tracked) <= 1):
         return [Finding("start", "failed", _never_started(claim))]
     found = []
-    if len(claim) == 1 and not claim.in_known_map:
+    if len(claim) == 1 and not claim.began_in_known_map:
         found.append(Finding("start", "degraded", "the run has one frame: nothing can confirm its pose and its map"))
     if claim.guessed:
         text = "the camera is unknown, and too little was seen to estimate it; pass `--intrinsics`"
@@ -94,7 +94,7 @@ def _same(before: FrameEvidence, after: FrameEvidence) -> bool:
 
 
 def _never_started(claim: Claim) -> str:
-    if not claim.in_known_map:
+    if not claim.began_in_known_map:
         return "the map was never started: not enough parallax or texture; the poses are meaningless"
     found, count = np.count_nonzero(claim.tracked), len(claim)
     return (
