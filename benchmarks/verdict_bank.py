@@ -340,8 +340,8 @@ def read(path: Path) -> Any:
         kept = _Unpickler(file).load()
     for keyframe in kept.keyframes if isinstance(kept, Slam) else ():
         for slots in (keyframe.points, keyframe.samples):
-            if not hasattr(slots, "deviation"):
-                object.__setattr__(slots, "deviation", np.full(slots.inverse_depth.shape, np.nan))
+            if not hasattr(slots, "estimate_sigma"):
+                object.__setattr__(slots, "estimate_sigma", np.full(slots.inverse_depth.shape, np.nan))
     return kept
 
 

@@ -179,12 +179,12 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
             (host.points.pixels[edge.slots] - slam.intrinsics[2:]) / slam.intrinsics[:2], np.ones(len(edge.slots))
         ]
         turned = target.pose @ rigid.invert(host.pose)
-        inverse = host.points.prior[edge.slots]
+        inverse = host.points.prior_mean[edge.slots]
         there = inverse / (ray @ turned[2, :3] + turned[2, 3] * inverse)
         return replace(edge, pixels=rolled_pixels(edge.pixels, there, edge.target))
 
     keyframes = tuple(
-        replace(k, points=replace(k.points, pixels=rolled_pixels(k.points.pixels, k.points.prior, k.number)))
+        replace(k, points=replace(k.points, pixels=rolled_pixels(k.points.pixels, k.points.prior_mean, k.number)))
         for k in slam.keyframes
     )
     seen = replace(slam, map=replace(slam.map, keyframes=keyframes))

@@ -131,7 +131,7 @@ def keyframe_pairs(
     chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MAX_PAIRS).astype(int))
     for edge in (edges[row] for row in chosen if row < len(edges)):
         host, target = by_number[edge.host], by_number[edge.target]
-        inverse = (host.points.prior if known.metric else host.points.inverse_depth)[edge.slots]
+        inverse = (host.points.prior_mean if known.metric else host.points.inverse_depth)[edge.slots]
         seen = np.isfinite(inverse) & (inverse > 0)
         before, after = host.points.pixels[edge.slots[seen]], edge.pixels[seen]
         if len(before) < MIN_MATCHES or np.median(np.linalg.norm(after - before, axis=1)) < MIN_FLOW:

@@ -113,7 +113,7 @@ class Roles:
         """
         if sensor_depth is None or not isinstance(self.depth, SensorDepth):
             return None
-        near, far = self.depth.nearest, self.depth.farthest
+        near, far = self.depth.min_depth, self.depth.max_depth
         with np.errstate(invalid="ignore"):
             depth = np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.float32(np.nan))
         return depth, self.depth.noise(depth)
