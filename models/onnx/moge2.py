@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import least_squares
 from vggtgeo.models.checks import check_fields, check_image
-from vggtgeo.models.classical.depth import no_depth
+from vggtgeo.models.classical.sensor_depth import no_depth
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import MOGE2
 from vggtgeo.models.onnx.fit import Fit

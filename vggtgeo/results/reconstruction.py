@@ -160,7 +160,7 @@ def reconstruct(
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
         with loop.checkpoint_writer(checkpoints, identity) as writer:
             tracked = loop.track(writer)
-            slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
+            slam, interrupted = _finish_unless_interrupted(tracked, perception.roles, settings, hooks, stop)
         summary_facts = {
             **perception.facts(),
             **(facts or {}),
@@ -324,10 +324,10 @@ def _perception(
     return replace(found, roles=found.roles.seeded(seed)) if seed else found
 
 
-def _adjust(
+def _finish_unless_interrupted(
     tracked: Tracked, roles: Roles, settings: SlamSettings, hooks: RunCallbacks, stop: Interruption
 ) -> tuple[Slam, bool]:
-    """The state after the last adjustment, and whether Ctrl-C ended the run, which skips it."""
+    """Run the last adjustment, unless Ctrl-C ended the run; return the state, and whether it did."""
     hooks.each("on_adjust", tracked.slam)
     if tracked.interrupted:
         return tracked.slam, True
