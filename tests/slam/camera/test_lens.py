@@ -22,7 +22,7 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
-from vggtgeo.slam.global_map.global_adjustment import _taken_lens, undistorted
+from vggtgeo.slam.global_map.global_adjustment import _apply_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
@@ -126,7 +126,7 @@ def test_a_lens_that_does_not_pay_is_not_taken() -> None:
     adjustment, state = slam.window.solved
     left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
     for found in (None, left_out, replace(left_out, warp=float("inf"))):
-        assert _taken_lens(slam, adjustment, found) is slam
+        assert _apply_lens(slam, adjustment, found) is slam
 
 
 def test_a_lens_that_folds_the_image_is_none() -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from vggtgeo.solvers.arrow import reduce
+from vggtgeo.solvers.arrow import dense_schur_complement
 
 from vggtgeo.bundle.linearise import free_coordinates, linearise
 from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit
@@ -34,7 +34,7 @@ SOLVE = eqx.filter_jit(solve)
 @eqx.filter_jit
 def _information(problem: Problem, state: State) -> tuple[jnp.ndarray, jnp.ndarray]:
     """Of the poses, landmarks eliminated; and which coordinates are free."""
-    reduced = reduce(linearise(prepared(problem), state))
+    reduced = dense_schur_complement(linearise(prepared(problem), state))
     return reduced.hessian - reduced.schur, free_coordinates(problem)
 
 
