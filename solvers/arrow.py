@@ -75,7 +75,7 @@ class EdgeGraph(eqx.Module):
         return jnp.arange(len(self.of_host)) if self.host is None else self.host
 
     def ends(self) -> Int[Array, "e 2"]:
-        """Nodes of each edge in the order of its local coordinates: target, host."""
+        """Return the nodes of each edge in the order of its local coordinates: target, host."""
         return jnp.stack([self.target, self.source], 1)
 
     def seen(self, nodes: Int[Array, "*t m"], size: int) -> Int[Array, "*t p"] | None:

@@ -86,7 +86,7 @@ class NoDepth:
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        """NaN everywhere, whatever the sensor says."""
+        """Return NaN everywhere, whatever the sensor says."""
         check_image("image", image)
         return no_depth(image.shape[:2])
 
@@ -117,7 +117,7 @@ def _relative_jump(depth: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _without_border(values: np.ndarray, width: int, axis: int) -> np.ndarray:
-    """`values` with 0 along the two borders of `axis`, where `np.roll` has wrapped around."""
+    """Set `values` to 0 along the two borders of `axis`, where `np.roll` has wrapped around."""
     inside = np.zeros(values.shape[axis], dtype=bool)
     inside[width:-width] = True
     return values * (inside[:, None] if axis == 0 else inside[None, :])

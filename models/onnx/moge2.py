@@ -71,7 +71,7 @@ class MogeDepth:
 def recover_focal_shift(
     points: np.ndarray, keep: np.ndarray, intrinsics: Sequence[float] | None = None
 ) -> tuple[float, float]:
-    """(f, s), in pixels and in the points' unit, that minimise sum |f (x, y) / (z + s) - (u, v)|^2.
+    """Return (f, s), pixels and the points' unit, that minimise sum |f (x, y) / (z + s) - (u, v)|^2.
 
     (u, v) is the pixel from the centre of the image; for a given s the best f is a ratio of two sums (variable
     projection), so the search is over s alone, by Levenberg-Marquardt on at most 64 x 64 points. With `intrinsics`
@@ -114,6 +114,6 @@ def _away_from_zero(values: np.ndarray) -> np.ndarray:
 
 
 def _thin(length: int) -> np.ndarray:
-    """At most 64 indices spread evenly over `length`."""
+    """Return at most 64 indices spread evenly over `length`."""
     count = min(length, _GRID)
     return ((np.arange(count) + 0.5) * length / count).astype(np.int64)

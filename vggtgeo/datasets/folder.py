@@ -219,7 +219,7 @@ class FolderSequence:
         return read
 
     def _read_depth(self, file: FrameFile) -> np.ndarray | None:
-        """None if there is no depth, or, with a warning, if it cannot be used."""
+        """Read the depth of a frame; None if there is none, or, with a warning, if it cannot be used."""
         if file.depth is None:
             return None
         try:

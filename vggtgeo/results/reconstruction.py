@@ -258,8 +258,9 @@ def _conclude(
 
 
 def _first_state(known: Slam | None, source: Source, settings: SlamSettings, roles: Roles) -> Slam | None:
-    """The state before the first frame in a known map; raise InputError if it is missing, or has another camera or
-    matcher.
+    """Return the state before the first frame in a known map.
+
+    Raise InputError if it is missing, or has another camera or matcher.
     """
     if known is not None:
         if source.has_depth and not known.metric:

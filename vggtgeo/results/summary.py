@@ -93,7 +93,7 @@ def summarise(
 
 
 def _pose_sigma(slam: Slam) -> dict[str, Any]:
-    """Median and largest standard deviation of the poses of the largest submap; empty if unknown."""
+    """Return median and largest standard deviation of the poses of the largest submap; empty if unknown."""
     sigma = frame_uncertainty(slam) if slam.keyframes else None
     if sigma is None or not np.isfinite(sigma.translation).any():
         return {}

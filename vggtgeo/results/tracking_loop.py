@@ -143,7 +143,7 @@ class TrackingLoop:
         return Tracked(slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began))
 
     def _frames(self, writer: CheckpointWriter | None) -> tuple[list[Frame], Iterator[Frame]]:
-        """The last two frames of the resumed run, if any, and the frames that are left."""
+        """Return the last two frames of the resumed run, if any, and the frames that are left."""
         start, end, stride = self.selection
         if self.before is None or writer is None:
             return [], iter(self.source.frames.frames(start, end, stride))

@@ -71,8 +71,9 @@ def save_map(path: str | os.PathLike[str], slam: Slam) -> None:
 
 @in_double_precision
 def load_map(path: str | os.PathLike[str]) -> Slam:
-    """The map that `vggtgeo run --save-map` or `Result.save_map` wrote, for `known_map` of `vggtgeo.run` and
-    `vggtgeo.reconstruct`.
+    """Load the map that `vggtgeo run --save-map` or `Result.save_map` wrote.
+
+    Pass it as `known_map` to `vggtgeo.run` or `vggtgeo.reconstruct`.
 
     Raises:
         InputError: the file is missing, damaged, of a version that is not known, or no map.

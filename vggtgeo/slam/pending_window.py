@@ -32,7 +32,7 @@ def begin_window(slam: Slam, adjusted: Callable[[], Slam]) -> Slam:
 
 
 def is_due(slam: Slam) -> bool:
-    """Whether the next frame is to be tracked in the adjusted map."""
+    """Return whether the next frame is to be tracked in the adjusted map."""
     return slam.pending is not None and len(slam.frames) >= slam.pending.due
 
 

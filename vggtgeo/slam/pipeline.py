@@ -113,7 +113,7 @@ def _merge_pending_window(slam: Slam, clock: Clock) -> Slam:
 
 
 def _started(slam: Slam) -> bool:
-    """Whether there is a map to track in. A later keyframe may well be without depth: its neighbours have some."""
+    """Return whether there is a map to track in; a later keyframe may lack depth, since its neighbours have some."""
     return len(slam.window.members) > 1 or bool(
         np.any(np.isfinite(slam.keyframes[slam.window.members[-1]].points.inverse_depth))
     )
@@ -149,7 +149,7 @@ def _track(
     settings: SlamSettings,
     clock: Clock,
 ) -> tuple[Slam, FrameData, Track | None]:
-    """The frame and its pose by the map, and the state that the pose belongs to.
+    """Track a frame in the map; return the state that the pose belongs to, the frame's data and the track.
 
     A pending window is taken up first where the frame has no pose, or becomes a keyframe.
     """
@@ -179,7 +179,7 @@ def _track(
 
 
 def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
-    """The state with the motion to a tracked frame, which is unknown after tracking was lost."""
+    """Set the motion to a tracked frame; it is unknown after tracking was lost."""
     if slam.tracker.lost:
         slam = _noted_found(slam, frame)
         velocity = np.eye(4)
@@ -203,7 +203,7 @@ def _decide(
 
 
 def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Roles, settings: SlamSettings) -> Track:
-    """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
+    """Track a frame against the reference, or against another keyframe that sees more of it."""
     prior = _prior(slam, data.frame, recorded)
     first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
     others = [number for number in reversed(slam.window.members) if number != first][:2]
@@ -229,7 +229,7 @@ def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Ro
 
 
 def _prior(slam: Slam, frame: Frame, recorded: RecordedPrior | None) -> MotionPrior:
-    """Where a frame is, as recorded, or if the camera goes on as it did."""
+    """Predict a frame's pose from the recording, or by constant velocity."""
     step = None if recorded is None else recorded.step(slam, frame.timestamp)
     velocity = slam.tracker.velocity if step is None else step
     predicted = rigid.orthonormal(velocity @ slam.last_pose)
@@ -237,7 +237,7 @@ def _prior(slam: Slam, frame: Frame, recorded: RecordedPrior | None) -> MotionPr
 
 
 def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameData:
-    """The data with a way to its segments."""
+    """Add a function that detects the frame's segments."""
     return replace(data, find_lines=lambda: find_lines(data.frame.image, roles, settings))
 
 
@@ -254,7 +254,7 @@ def _insert_and_adjust(
     settings: SlamSettings,
     clock: Clock,
 ) -> Slam:
-    """The state with the frame as a keyframe, whose window is matched and adjusted.
+    """Insert the frame as a keyframe, match it and adjust the window.
 
     Beside tracking where the keyframe's own depth places the next frames, and where there is one submap only.
     """
@@ -301,8 +301,9 @@ def _with_record(slam: Slam, record: FramePose) -> Slam:
 
 
 def _with_odometry(slam: Slam, odometry: MeasuredRelativePose) -> Slam:
-    """The state with an odometry factor, and a pair of its keyframes, if without a match: so the last adjustment
-    aligns the surfaces of both.
+    """Add an odometry factor, and a pair without a match if its keyframes have none.
+
+    So the last adjustment aligns the surfaces of both.
     """
     known = replace(slam.map, factors=(*slam.map.factors, odometry))
     if all(pair.key != odometry.keyframes for pair in known.pairs):
@@ -326,7 +327,7 @@ def _place_waiting(slam: Slam, roles: Roles) -> Slam:
 
 
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
-    """A window of the keyframes around an old one, held where it is: the camera has come back to it.
+    """Return a window of the keyframes around an old one, which is fixed: the camera has come back to it.
 
     Only of its own submap: the pose of another one is a guess, so matches predicted from it would be wrong.
     """

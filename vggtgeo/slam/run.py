@@ -95,7 +95,7 @@ def run(
 
 
 def check_run_arguments(roles: Any, settings: Any, camera: Any, known_map: Any) -> None:
-    """Raises InputError for one that is something else, a table in the place of settings, say."""
+    """Raise InputError for an argument of another type, for example a table instead of settings."""
     check_kind("roles", roles, Roles | None, "`vggtgeo.Roles`, or None for the classical ones")
     check_kind("settings", settings, SlamSettings | None, "`vggtgeo.SlamSettings`, or None")
     check_kind(
@@ -105,7 +105,7 @@ def check_run_arguments(roles: Any, settings: Any, camera: Any, known_map: Any) 
 
 
 def default_roles(has_depth: bool) -> Roles:
-    """The classical roles, for frames with or without depth."""
+    """Return the classical roles, for frames with or without depth."""
     return Roles() if has_depth else Roles(depth=NoDepth())
 
 
@@ -119,7 +119,7 @@ def run_frames(
     before: Collection[Frame] = (),
     waiting: WaitContext = nullcontext,
 ) -> Iterator[Slam]:
-    """The same over any iterable of frames of one camera, on from a state that is known.
+    """As `run`, for an iterable of frames; continue from the state `known`, or begin a new map if it is None.
 
     before: the last frames of that state, of which the run that goes on asks whether the next depth image is new.
     waiting: entered while a frame is waited for.
@@ -171,7 +171,7 @@ def finish(
 
 
 def frame_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
-    """Camera -> world of every frame that has a pose in a submap, by default the one of most frames.
+    """Return camera -> world of every frame that has a pose in a submap, by default the largest one.
 
     A frame without one (lost, or before a start) is left out. Submaps are not connected, so that their poses mean
     nothing to each other: each has a trajectory of its own.
@@ -194,14 +194,14 @@ def frame_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
 
 
 def keyframe_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
-    """Camera -> world of the keyframes of a submap, by default the one of most frames."""
+    """Return camera -> world of the keyframes of a submap, by default the largest one."""
     own = [slam.keyframes[number] for number in submaps_by_size(slam)[submap]] if slam.keyframes else []
     poses = rigid.invert(np.array([keyframe.pose for keyframe in own]).reshape(-1, 4, 4))
     return Trajectory(np.array([keyframe.timestamp for keyframe in own]), poses)
 
 
 def in_order(frames: Iterable[Frame], camera: Camera, last: float = -math.inf) -> Iterator[Frame]:
-    """The frames that are frames of this camera, and later than those before: a pose is found again by its time."""
+    """Yield the frames that fit this camera and are later than those before: a pose is found again by its time."""
     for frame in frames:
         check_frame(frame, camera)
         if frame.timestamp <= last:
@@ -245,8 +245,9 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 def _described(
     frames: Iterator[Frame], camera: Camera, roles: Roles, clock: Clock, waiting: WaitContext
 ) -> Iterator[tuple[Frame, Description]]:
-    """Undistorted frames, prepared in a thread of their own while earlier ones are tracked; where every frame needs its
-    key points, with them.
+    """Yield undistorted frames, prepared in a thread while earlier ones are tracked.
+
+    With key points if every frame needs them.
     """
     undistorter, intrinsics = camera.undistorter(), np.array(camera.intrinsics, np.float64)
 

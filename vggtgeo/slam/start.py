@@ -115,7 +115,7 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
 
 
 def _two_views(slam: Slam, frame: Frame, features: Features, roles: Roles) -> tuple[Keyframe, PointMatches, StartGuess]:
-    """The first keyframe, its matches with the frame, and the estimated motion and structure of both."""
+    """Return the first keyframe, its matches with the frame, and the estimated motion and structure of both."""
     first = slam.keyframes[slam.window.members[-1]]
     matches = roles.points.match(first.features, features)
     guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics, (first.image, frame.image))

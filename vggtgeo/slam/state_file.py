@@ -91,7 +91,7 @@ def save_state(path: str | os.PathLike[str], slam: Slam) -> None:
 
 @in_double_precision
 def load_state(path: str | os.PathLike[str]) -> Slam:
-    """The state that `save_state` wrote, bit by bit.
+    """Load the state that `save_state` wrote, bit by bit.
 
     Raises:
         InputError: the file is missing, damaged, of a version that is not known, or holds no state.

@@ -14,13 +14,13 @@ from vggtgeo.slam.window.adjustment import CameraPrior
 def insert_keyframe(
     slam: Slam, keyframe: Keyframe, roles: Roles, settings: SlamSettings, tied_to: int | None = None
 ) -> Slam:
-    """The state with a keyframe, which was tracked against `tied_to`, in the window and matched to the others."""
+    """Insert a keyframe, which was tracked against `tied_to`, into the window and match it to the others."""
     known, window = sliding_window.enter(slam.map, slam.window, keyframe, slam.intrinsics, roles, settings, tied_to)
     return replace(slam, map=known, window=window)
 
 
 def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
-    """The state after its window was bundle-adjusted."""
+    """Adjust the window of the state."""
     found = sliding_window.adjust(slam.map, slam.window, slam.intrinsics, camera_prior(slam), settings)
     return replace(
         slam,
@@ -32,6 +32,6 @@ def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
 
 
 def camera_prior(slam: Slam) -> CameraPrior:
-    """The prior of the intrinsics in the window."""
+    """Return the prior of the intrinsics in the window."""
     sigma = slam.camera.window_sigma(len(slam.keyframes))
     return CameraPrior(slam.camera.given, sigma)

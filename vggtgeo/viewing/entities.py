@@ -249,7 +249,7 @@ def log_iteration(stream: Any, row: int, energy: float, record: IterationRecord 
 
 
 def _centres(poses: Any) -> np.ndarray:
-    """Camera centres, [n, 3], of poses world -> camera, [n, 7]."""
+    """Return the camera centres, [n, 3], of poses world -> camera, [n, 7]."""
     return rigid.invert(rigid.to_matrix(np.asarray(poses, np.float64)))[:, :3, 3]
 
 

@@ -43,7 +43,7 @@ def join_at_end(slam: Slam, roles: Roles) -> Slam:
 
 
 def _joined(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Roles) -> Slam | None:
-    """The state with the submap `other` moved to where it belongs in `main`; None where that is not known."""
+    """Move the submap `other` to its place in `main`, and return the state; None if that place is unknown."""
 
     def verified(pair: tuple[int, int]) -> Loop | None:
         first, second = (slam.keyframes[number] for number in pair)
@@ -81,7 +81,7 @@ def _joined(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Ro
 def _look_alike(
     keyframes: tuple[Keyframe, ...], main: tuple[int, ...], other: tuple[int, ...]
 ) -> list[tuple[int, int]]:
-    """Pairs of keyframes of two submaps, the earlier first, that look most alike."""
+    """Return pairs of keyframes of two submaps, the earlier first, that look most alike."""
     described = lambda numbers: [number for number in numbers if keyframes[number].place is not None]
     ours, theirs = described(main), described(other)
     if not ours or not theirs:
@@ -94,7 +94,7 @@ def _look_alike(
 
 
 def _moved(slam: Slam, loop: Loop, other: set[int]) -> Slam:
-    """The state with the submap of keyframes `other` where a loop says that it is, in the unit of the rest."""
+    """Move the submap of keyframes `other` to where a loop places it, in the scale of the rest."""
     first, second = loop.pair.key
     ratio = loop.ratio or 1.0
     if first in other:

@@ -46,7 +46,7 @@ def place_lost(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
 
 
 def _nearest_first(slam: Slam, waiting: dict[int, UnplacedFrame]) -> list[int]:
-    """The frames by how far the next frame with a pose is."""
+    """Sort the frames by the distance in time to the next frame with a pose."""
     placed = np.array([record.frame for record in slam.frames if record.tracked])
     return sorted(waiting, key=lambda frame: int(np.abs(placed - frame).min(initial=np.iinfo(int).max)))
 
@@ -57,7 +57,7 @@ def _data(waiting: UnplacedFrame) -> FrameData:
 
 
 def _found(slam: Slam, waiting: UnplacedFrame, roles: Roles) -> Track | None:
-    """The frame's pose by a keyframe that looks like it, or near the frame that is next to it in time."""
+    """Track a frame by a keyframe that looks like it, or near the frame that is next to it in time."""
     given = TrackingInput(_data(waiting), slam.intrinsics, roles)
     certain = relocalise(given, slam.keyframes, slam.tracker)
     if certain is not None:
@@ -78,13 +78,13 @@ def _found(slam: Slam, waiting: UnplacedFrame, roles: Roles) -> Track | None:
 
 
 def _beside(slam: Slam, waiting: UnplacedFrame) -> FramePose | None:
-    """The frame with a pose that is nearest in time."""
+    """Return the frame with a pose that is nearest in time."""
     placed = [record for record in slam.frames if record.tracked]
     return min(placed, key=lambda record: abs(record.timestamp - waiting.timestamp), default=None)
 
 
 def _with_frame(slam: Slam, waiting: UnplacedFrame, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
-    """The state with the frame's pose, and the frame as a keyframe where it sees what others do not."""
+    """Add the frame's pose, and the frame as a keyframe if it sees what others do not."""
     record = record_of(_data(waiting).frame, found)
     if needs_keyframe(found.pose, found.keyframe.pose, found.evidence.inliers, settings.keyframes):
         slam, record = _with_keyframe(slam, waiting, found, record, roles, settings)
@@ -96,7 +96,7 @@ def _with_frame(slam: Slam, waiting: UnplacedFrame, found: Track, roles: Roles, 
 def _with_keyframe(
     slam: Slam, waiting: UnplacedFrame, found: Track, record: FramePose, roles: Roles, settings: SlamSettings
 ) -> tuple[Slam, FramePose]:
-    """The state with a new keyframe, adjusted in a window of those nearest in time, which stay where they are."""
+    """Add a keyframe, adjusted in a window of those nearest in time, which are fixed."""
     number, data, label = len(slam.keyframes), _data(waiting), submap_of(slam.map)
     keyframe = make_keyframe(number, data.frame, found.pose, data.description, roles, settings, slam.intrinsics)
     others = [other for other in slam.keyframes if label[other.number] == label[found.keyframe.number]]

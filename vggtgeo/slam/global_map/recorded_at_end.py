@@ -35,8 +35,9 @@ AROUND = 5
 
 
 def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
-    """The state before its last adjustment, with all recorded motions between keyframes; without any where the images
-    do not agree with them.
+    """Add all recorded motions between keyframes before the last adjustment, if the images agree with them.
+
+    Without agreement none is added.
 
     A map of free scale gets the unit of the recording. Submaps, and frames that no image has placed, are joined to the
     rest by the recorded motions.
@@ -57,13 +58,13 @@ def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
 
 
 def _with_ties(slam: Slam, ties: list[MeasuredRelativePose]) -> Slam:
-    """The state with these recorded motions and no others."""
+    """Replace the recorded motions of the state."""
     factors = [factor for factor in slam.map.factors if not getattr(factor, "recorded", False)]
     return replace(slam, map=replace(slam.map, factors=(*factors, *ties)))
 
 
 def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
-    """The state with lengths in the unit of the recording, in submaps where it is known at all.
+    """Scale lengths to the unit of the recording, in submaps where it is known.
 
     Scale drifts from keyframe to keyframe: each has the unit that the motions around it tell. The way from one to the
     next is then that of the map, or the recorded one where both disagree by more than the recording drifts.
@@ -93,8 +94,10 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
 def _local_units(
     slam: Slam, ties: list[MeasuredRelativePose | None], numbers: tuple[int, ...], usual: float
 ) -> np.ndarray:
-    """What a unit of the recording is at each keyframe of a submap: the median over the motions around it of the ratio
-    of lengths, weighted by the recorded length; `usual` where no motion tells.
+    """Return the length of a unit of the recording at each keyframe of a submap.
+
+    It is the median of the ratio of lengths over the motions around it, weighted by the recorded length; `usual`
+    without any.
     """
     places = rigid.centres(np.array([slam.keyframes[number].pose for number in numbers]))
     lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
@@ -109,8 +112,9 @@ def _local_units(
 
 
 def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
-    """The state with submaps of a known unit placed by the recorded motion from the nearest keyframe of the largest
-    submap, or of those joined to it before.
+    """Place submaps of known unit by the recorded motion from the nearest keyframe of the largest submap.
+
+    Submaps that were joined to it before count as part of it.
     """
     main, *others = [set(numbers) for numbers in submaps_by_size(slam) if np.isfinite(units[numbers[0]])]
     for other in others:
@@ -140,7 +144,7 @@ def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
 
 
 def _with_carried_frames(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
-    """The state with each frame that no image has placed, carried on from the frame before."""
+    """Place each frame that no image has placed by the recorded motion from the frame before."""
     frames: list[FramePose] = []
     last: FramePose | None = None
     for record in slam.frames:
@@ -159,7 +163,7 @@ def _by_recording(record: FramePose, found: Track) -> FramePose:
 
 
 def _alone(slam: Slam, tie: MeasuredRelativePose) -> bool:
-    """Whether nothing else ties the later keyframe of a recorded motion to an earlier one."""
+    """Return whether no other factor connects the later keyframe of a recorded motion to an earlier one."""
     earlier = [pair.first for pair in slam.map.pairs if pair.second == tie.second and len(pair.points)]
     tracked = [other.first for other in slam.map.odometry_factors if other.second == tie.second]
     return not any(number < tie.second for number in (*earlier, *tracked))

@@ -98,7 +98,7 @@ class Tracker:
 
 
 def given_up(tracker: Tracker, frames: Iterable[UnplacedFrame]) -> tuple[UnplacedFrame, ...]:
-    """The unplaced frames with these."""
+    """Append frames to the unplaced ones, of which the last `MAX_UNPLACED` are kept."""
     return (*tracker.unplaced, *frames)[-MAX_UNPLACED:]
 
 

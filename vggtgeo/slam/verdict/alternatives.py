@@ -80,7 +80,7 @@ class Added:
 
     @property
     def significant(self) -> bool:
-        """By its robust covariance (Wald)."""
+        """Whether the estimate is significant by its robust covariance (Wald)."""
         wald = float(self.estimate @ np.linalg.pinv(self.covariance, hermitian=True) @ self.estimate)
         return wald > float(chi2.isf(SIGNIFICANCE, len(self.estimate)))
 
@@ -100,12 +100,12 @@ class Explanation:
 
     @property
     def tracks(self) -> Tracks:
-        """That the first motion explains."""
+        """The tracks that the first motion explains."""
         return self.best.tracks
 
 
 def explain(tracks: Tracks) -> Explanation:
-    """The preferred explanation of the tracks of a window."""
+    """Return the preferred explanation of the tracks of a window."""
     noise = Noise(START.pixel * max(tracks.size) / 320.0, START.depth)
     held = solve(tracks, start_of(tracks), noise, poses_free=False, iterations=4)
     free = with_own_noise(solve(tracks, held.unknowns, noise))
@@ -121,7 +121,7 @@ def explain(tracks: Tracks) -> Explanation:
 
 
 def _selected(fit: Fit) -> tuple[Fit, Added | None]:
-    """The fit with the alternative that is significant, and that; the same fit and None where there is none."""
+    """Return the fit with the significant alternative, and that alternative; else the same fit and None."""
     around = scores(fit)
     chance = lambda one: float(chi2.isf(SIGNIFICANCE, one.columns.shape[1]))
     known = [one for one in TABLE if fit.tracks.with_depth or not one.needs_depth]
@@ -136,14 +136,15 @@ def _selected(fit: Fit) -> tuple[Fit, Added | None]:
 
 
 def _outliers(fit: Fit) -> np.ndarray:
-    """Tracks that a fit does not explain, bool [t]."""
+    """Return the tracks that a fit does not explain, bool [t]."""
     sums = fit.tracks.sums(np.column_stack([fit.linear.weight[:, 0], np.ones(len(fit.tracks.frame))]))
     return np.asarray(sums[:, 0] < MIN_INLIER_WEIGHT * sums[:, 1])
 
 
 def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
-    """Tracks, bool [t], that one other motion explains, of those that contradict the first; none where there is no such
-    motion. Depth has no say: it may be that of either.
+    """Return the tracks, bool [t], of those that contradict the first motion, that one other motion explains.
+
+    All false if there is no such motion. Depth is ignored: it may be that of either motion.
     """
     own = replace(fit.tracks, depth=np.full(len(fit.tracks.depth), np.nan)).subset(outliers)
     still = np.tile(own.poses[:1], (len(own.poses), 1, 1))
@@ -162,8 +163,9 @@ def _fit_from_afar(tracks: Tracks, noise: Noise) -> Fit:
 
 
 def _predicts(motion: Fit) -> bool:
-    """Whether the motion, fitted to one half of the tracks, explains most of the other: few tracks have free poses that
-    fit them, whatever they do.
+    """Return whether the motion, fitted to one half of the tracks, explains most of the other half.
+
+    Free poses fit few tracks in any case.
     """
     half = np.arange(len(motion.tracks.first)) % 2 == 0
     first = solve(*motion.part(half))

@@ -38,7 +38,7 @@ class Claim:
 
     @classmethod
     def of(cls, slam: Slam) -> Self:
-        """The claim of a state."""
+        """Return the claim of a state."""
         times, poses = frame_poses(slam)
         return cls(
             frames=np.array([record.frame for record in slam.frames], int),
@@ -60,5 +60,5 @@ class Claim:
 
 
 def extent(poses: np.ndarray) -> float:
-    """RMS distance of the places from their mean, of poses world -> camera [n, 4, 4]."""
+    """Return the RMS distance of the places from their mean, of poses world -> camera [n, 4, 4]."""
     return float(np.sqrt(np.sum(rigid.centres(poses).var(0))))

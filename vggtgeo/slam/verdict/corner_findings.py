@@ -64,7 +64,7 @@ class Contradiction:
 
 
 def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contradiction | None:
-    """What the explanation of a window contradicts; None where it is what the run claims.
+    """Return how the explanation of a window contradicts the run; None if it does not.
 
     stated: standard deviation of the places that the run itself states, as a share of their extent.
     """
@@ -88,7 +88,7 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
 
 
 def findings(claim: Claim, explanations: Sequence[Explanation], stated: float = 0.0) -> list[Finding]:
-    """One finding a cause, the largest consequence first; then those that do not matter, of the level "good".
+    """Return one finding a cause, the largest consequence first; then those of no consequence, of level "good".
 
     stated: as in `contradiction`.
     """

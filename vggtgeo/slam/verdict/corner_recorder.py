@@ -51,7 +51,7 @@ class FrameEvidence:
     depth: np.ndarray
 
     def through(self, lens: Camera) -> FrameEvidence:
-        """The same corners without the distortion of `lens`."""
+        """Return the same corners without the distortion of `lens`."""
         return replace(self, pixels=lens.undistorted(self.pixels).astype(np.float32))
 
 
@@ -102,7 +102,7 @@ class EvidenceRecorder(Callback):
         self._waiting.append(self._pool.submit(self._add, frame))
 
     def so_far(self) -> tuple[object, ...]:
-        """State to resume from."""
+        """Return the state to resume from."""
         return tuple(self.frames), self._image, self._depth, self._ids, self._pixels, self._next
 
     def on_resume(self, so_far: Any, slam: Slam) -> None:
@@ -136,7 +136,7 @@ class EvidenceRecorder(Callback):
         self._frames.append(FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth))
 
     def _read(self, depth: np.ndarray | None, grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Depths at pixels; NaN where the image repeats that of another picture: the run does not use it either."""
+        """Return depths at pixels; NaN if the image repeats that of another picture: the run does not use it either."""
         some = slice(STRIDE // 2, None, STRIDE)
         before, self._depth = self._depth, None if depth is None else depth[some, some].copy()
         if before is None or self._depth is None or not np.array_equal(before, self._depth, equal_nan=True):
@@ -149,7 +149,7 @@ class EvidenceRecorder(Callback):
         return depth[row, column].astype(np.float32)
 
     def _of_the_world(self, pixels: np.ndarray) -> np.ndarray:
-        """Which corners of the small image may be followed."""
+        """Return which corners of the small image may be followed."""
         if self._left_out is None:
             return np.ones(len(pixels), bool)
         column, row = np.clip(np.rint(pixels), 0, np.array(self._left_out.shape[::-1]) - 1).astype(int).T

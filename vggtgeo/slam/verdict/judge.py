@@ -51,14 +51,14 @@ def judge_or_report(slam: Slam, evidence: CornerTracks = (), input_findings: tup
 
 
 def stated_share(claim: Claim, known: PoseUncertainty | None) -> float:
-    """Median standard deviation of the places, as the run states it, over their spread; 0 where it is unknown."""
+    """Return the median standard deviation of the places, as the run states it, over their spread; 0 if unknown."""
     if known is None or not np.isfinite(known.translation).any():
         return 0.0
     return float(np.nanmedian(known.translation)) / max(extent(claim.poses[claim.tracked]), 1e-12)
 
 
 def check_extent(claim: Claim, share: float) -> list[Finding]:
-    """Whether a path without depth is longer than its stated error. share: as `stated_share` returns it."""
+    """Check whether a path without depth is longer than its stated error. share: as `stated_share` returns it."""
     if claim.metric or share < MAX_UNKNOWN:
         return []
     text = (
@@ -69,7 +69,7 @@ def check_extent(claim: Claim, share: float) -> list[Finding]:
 
 
 def check_unit(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
-    """Whether measured depths are in the range of sensors for rooms: images alone cannot tell a wrong unit."""
+    """Check that measured depths are in the range of sensors for rooms: images alone cannot show a wrong unit."""
     depths = np.concatenate([frame.depth for frame in corners])
     depths = depths[np.isfinite(depths)]
     if not claim.metric or not len(depths):
@@ -85,7 +85,7 @@ def check_unit(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
 
 
 def tracks_of_windows(slam: Slam, claim: Claim, corners: Sequence[FrameEvidence]) -> list[Tracks]:
-    """The corner tracks of each window."""
+    """Return the corner tracks of each window."""
     height, width = slam.keyframes[0].size
     stretches = linked(corners, claim.tracked)
     rows = (rows for stretch in stretches for rows in windows(thinned(corners, stretch)))
@@ -94,7 +94,7 @@ def tracks_of_windows(slam: Slam, claim: Claim, corners: Sequence[FrameEvidence]
 
 
 def aligned(slam: Slam, claim: Claim, evidence: CornerTracks) -> Sequence[FrameEvidence] | None:
-    """The corners of each frame of the run, without the distortion that it estimated; None where some are missing."""
+    """Return the corners of each frame of the run, undistorted as it estimated; None if some are missing."""
     by_frame = {noted.frame: noted for noted in evidence}
     if any(frame not in by_frame for frame in claim.frames):
         return None

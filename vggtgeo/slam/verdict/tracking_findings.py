@@ -64,7 +64,7 @@ def _lost(claim: Claim) -> list[Finding]:
 
 
 def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
-    """Pictures that were shown again while the camera moved on, at its usual speed.
+    """Check for pictures that were repeated while the camera moved on, at its usual speed.
 
     Where a camera is at rest, the noise of a new picture still moves its corners a little: all of them in the very
     same place have no likelihood but that of the same picture.
@@ -87,7 +87,7 @@ def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding
 
 
 def _same(before: FrameEvidence, after: FrameEvidence) -> bool:
-    """Whether two frames show one picture: most of their corners did not move at all."""
+    """Return whether two frames show one picture: most of their corners did not move at all."""
     _, first, second = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
     moved = np.abs(before.pixels[first] - after.pixels[second]).max(1, initial=0.0)
     return len(first) >= MIN_COMMON and bool(np.median(moved) < MAX_UNMOVED)
@@ -104,7 +104,7 @@ def _never_started(claim: Claim) -> str:
 
 
 def bridging_error(claim: Claim) -> float:
-    """Metres, RMS over all frames, that the lost ones may be off."""
+    """Return the error that lost frames may have, metres, RMS over all frames."""
     squares = 0.0
     for first, last in spans(~claim.tracked):
         before, after = max(first - 1, 0), min(last + 1, len(claim) - 1)

@@ -19,12 +19,12 @@ SHARED, MAX_STEP = 0.5, 3
 
 
 def common(first: FrameEvidence, second: FrameEvidence) -> int:
-    """How many tracks both frames saw."""
+    """Count the tracks that both frames saw."""
     return len(np.intersect1d(first.ids, second.ids, assume_unique=True))
 
 
 def linked(evidence: Sequence[FrameEvidence], tracked: np.ndarray) -> list[np.ndarray]:
-    """Stretches of tracked frames, each linked to the next by corners: rows, increasing."""
+    """Split tracked frames into stretches, each linked to the next frame by corners: rows, increasing."""
     rows = np.flatnonzero(tracked)
     if not len(rows):
         return []
@@ -37,7 +37,7 @@ def linked(evidence: Sequence[FrameEvidence], tracked: np.ndarray) -> list[np.nd
 
 
 def thinned(evidence: Sequence[FrameEvidence], rows: np.ndarray) -> np.ndarray:
-    """The frames of a stretch between which corners move enough to tell, first and last included."""
+    """Select the frames of a stretch between which corners move enough, first and last included."""
     chosen, place = [0], 0
     while place < len(rows) - 1:
         here = evidence[rows[place]]
@@ -52,7 +52,7 @@ def thinned(evidence: Sequence[FrameEvidence], rows: np.ndarray) -> np.ndarray:
 
 
 def windows(rows: np.ndarray) -> list[np.ndarray]:
-    """Windows of at most `WINDOW` of these rows, evenly spread, that overlap by a third at least."""
+    """Return windows of at most `WINDOW` of these rows, evenly spread, that overlap by a third at least."""
     last = max(len(rows) - WINDOW, 0)
     starts = np.linspace(0, last, int(np.ceil(last / (WINDOW * 2 / 3))) + 1).astype(int)
     return [rows[start : start + WINDOW] for start in starts]
@@ -61,7 +61,7 @@ def windows(rows: np.ndarray) -> list[np.ndarray]:
 def tracks_of(
     claim: Claim, evidence: Sequence[FrameEvidence], rows: np.ndarray, size: tuple[int, int]
 ) -> Tracks | None:
-    """The tracks that at least `MIN_VIEWS` of these frames see; None where there are none, or few frames.
+    """Return the tracks that at least `MIN_VIEWS` of these frames see; None without any, or for few frames.
 
     rows: int [f], increasing, of tracked frames.
     """
@@ -96,7 +96,7 @@ def tracks_of(
 
 
 def _velocities(evidence: Sequence[FrameEvidence], row: int) -> np.ndarray:
-    """Pixels a second of the corners of a frame, from the frames before and after."""
+    """Return the velocity of a frame's corners from the frames before and after, pixels a second."""
     here = evidence[row]
     moved, seconds = np.zeros(here.pixels.shape), np.zeros(len(here.ids))
     for other, sign in ((row - 1, -1.0), (row + 1, 1.0)):
