@@ -14,7 +14,7 @@ from vggtgeo.benchmark.inputs import DegradedWalk
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation.degradations import Degradation, Recording
-from vggtgeo.slam.verdict.witness import Evidence
+from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 
 
 def degraded_clips(
@@ -48,7 +48,7 @@ def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> t
     return result, truth[alignment]["rmse"] if truth else float("nan")
 
 
-def evidence(sequence: SequenceView) -> Evidence:
+def evidence(sequence: SequenceView) -> CornerTracks:
     """What the verdict looks at, of each frame."""
     recorder = vg.callbacks.EvidenceRecorder(sequence.camera)
     with warnings.catch_warnings():

@@ -22,8 +22,8 @@ import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, in_bands_of_light, with_images
 from vggtgeo.slam.perception.followed_corners import common_to_rows
-from vggtgeo.slam.verdict.windows import MIN_COMMON
-from vggtgeo.slam.verdict.witness import FrameEvidence
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
+from vggtgeo.slam.verdict.thresholds import MIN_COMMON
 
 AGREE = 3.0
 """Pixels."""

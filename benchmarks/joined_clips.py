@@ -36,7 +36,7 @@ def main() -> None:
     errors = (f"{100 * summary['truth'][key]['rmse']:.2f}" for key in ("ate_se3_m", "ate_sim3_m"))
     tracked = f"{summary['frames_tracked']}/{summary['frames']}"
     print("| clips | tracked | parts | ATE SE(3), cm | ATE Sim(3), cm | verdict |\n" + "|---" * 6 + "|")
-    print(f"| {name} | {tracked} | {len(summary['pieces'])} | {' | '.join(errors)} | {result.verdict.level} |")
+    print(f"| {name} | {tracked} | {len(summary['submaps'])} | {' | '.join(errors)} | {result.verdict.level} |")
 
 
 def joined(clips: list[Path]) -> Recording:

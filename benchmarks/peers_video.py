@@ -1,4 +1,4 @@
-"""Videos without depth, ours and COLMAP's: who places how many frames, in how many pieces, how well, and how fast?
+"""Videos without depth, ours and COLMAP's: who places how many frames, in how many submaps, how well, and how fast?
 
     .venv/bin/python benchmarks/peers_video.py ../shared/data/balcony ../shared/data/building-walk [--stride 2]
         [--mapping incremental global] [--seeds 0 1] [--frames 0 302] [--no-ours] [--unknown-camera]
@@ -7,7 +7,7 @@ COLMAP (the extra with pycolmap) gets the frames that ours gets, the same camera
 gets one), pairs of frames up to 10 apart, and for each frame the 10 others, farther apart, that look most like it by
 our global descriptor. Its options are its defaults. Matches are made once a clip, and every seed maps them again.
 
-A row a run: frames in the largest piece and in all; pieces; ATE of the largest piece after Sim(3) in cm, or in
+A row a run: frames in the largest submap and in all; submaps; ATE of the largest submap after Sim(3) in cm, or in
 hundredths of the truth's unit, and in % of its path; seconds. Below, for each two runs of COLMAP, how far they are
 apart, likewise.
 """
@@ -35,7 +35,7 @@ from vggtgeo.evaluation.association import associate
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 
 NEIGHBOURS, ALIKE = 10, 10
 """Frames before and after one, and others, that it is matched with."""
@@ -43,10 +43,10 @@ NEIGHBOURS, ALIKE = 10, 10
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run of one system: the trajectory of each piece, the largest first, and its seconds."""
+    """One run of one system: the trajectory of each submap, the largest first, and its seconds."""
 
     name: str
-    pieces: list[Trajectory]
+    submaps: list[Trajectory]
     seconds: float
 
 
@@ -55,7 +55,7 @@ def main() -> None:
     options = _options()
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR
     jax.config.update("jax_enable_x64", True)
-    print("| clip | run | largest piece | all | pieces | ATE Sim(3), cm | % of the path | s |\n" + "|---" * 8 + "|")
+    print("| clip | run | largest submap | all | submaps | ATE Sim(3), cm | % of the path | s |\n" + "|---" * 8 + "|")
     for path in options.clips:
         sequence = open_sequence(path)
         first, past = options.frames
@@ -71,7 +71,7 @@ def main() -> None:
                 theirs.append(run)
                 print(_row(path.name, run, truth, len(frames)), flush=True)
         for one, other in combinations(theirs, 2):
-            apart, share = _error(one.pieces[0], other.pieces[0])
+            apart, share = _error(one.submaps[0], other.submaps[0])
             print(f"\n{path.name}: {one.name} and {other.name} are {apart:.2f} apart, {share:.2f} % of the path\n")
 
 
@@ -80,8 +80,8 @@ def _ours(frames: list[Frame], sequence: Sequence, seed: int, unknown: bool) -> 
     camera = None if unknown else sequence.camera
     roles = default_roles(False).seeded(seed)
     slam = finish(deque(run(frames, roles, camera=camera), maxlen=1).pop(), roles)
-    pieces = [frame_trajectory(slam, piece) for piece in range(len(pieces_by_size(slam)))]
-    return Run(f"ours, seed {seed}", pieces, time.monotonic() - began)
+    submaps = [frame_trajectory(slam, submap) for submap in range(len(submaps_by_size(slam)))]
+    return Run(f"ours, seed {seed}", submaps, time.monotonic() - began)
 
 
 def _colmap(frames: list[Frame], sequence: Sequence, folder: Path, options: argparse.Namespace) -> list[Run]:
@@ -109,9 +109,9 @@ def _colmap(frames: list[Frame], sequence: Sequence, folder: Path, options: argp
         for seed in options.seeds:
             began = time.monotonic()
             models = _mapped(mapping, database, images, folder / f"{mapping}{seed}", seed, not options.unknown_camera)
-            pieces = [_trajectory(model, frames) for model in models.values()]
-            pieces.sort(key=len, reverse=True)
-            runs.append(Run(f"COLMAP {mapping}, seed {seed}", pieces, shared + time.monotonic() - began))
+            submaps = [_trajectory(model, frames) for model in models.values()]
+            submaps.sort(key=len, reverse=True)
+            runs.append(Run(f"COLMAP {mapping}, seed {seed}", submaps, shared + time.monotonic() - began))
     return runs
 
 
@@ -168,10 +168,10 @@ def _trajectory(model: pycolmap.Reconstruction, frames: list[Frame]) -> Trajecto
 
 
 def _row(clip: str, run: Run, truth: Trajectory, frames: int) -> str:
-    if not run.pieces:
+    if not run.submaps:
         return f"| {clip} | {run.name} | 0 of {frames} | 0 | 0 | | | {run.seconds:.0f} |"
-    error, share = _error(run.pieces[0], truth)
-    counts = f"{len(run.pieces[0])} of {frames} | {sum(map(len, run.pieces))} | {len(run.pieces)}"
+    error, share = _error(run.submaps[0], truth)
+    counts = f"{len(run.submaps[0])} of {frames} | {sum(map(len, run.submaps))} | {len(run.submaps)}"
     return f"| {clip} | {run.name} | {counts} | {error:.2f} | {share:.2f} | {run.seconds:.0f} |"
 
 

@@ -6,7 +6,7 @@ phone's poses are, and with poses of another recording.
 
 own: the truth in another world, with 2 % of the path drift, 1 degree a minute, and 5 % too long. other: the poses of
 another clip at the times of this one. evidence: logarithm of the ratio of likelihoods. ATE after Sim(3), cm, over the
-frames that have a pose in the largest piece. lengths: of the map, over the true ones.
+frames that have a pose in the largest submap. lengths: of the map, over the true ones.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 
 DRIFT, TURN, SCALE = 0.02, np.deg2rad(1.0) / 60.0, 1.05
 
@@ -45,7 +45,7 @@ def main() -> None:
     priors = {"none": None, "own": RecordedPoses(disturbed(truth))}
     if options.other is not None:
         priors["other"] = RecordedPoses(_at_times(open_sequence(options.other).ground_truth(), truth.timestamps))
-    print("| prior | evidence | frames | pieces | ATE Sim(3), cm | lengths | keyframes | s |\n" + "|---" * 8 + "|")
+    print("| prior | evidence | frames | submaps | ATE Sim(3), cm | lengths | keyframes | s |\n" + "|---" * 8 + "|")
     for name in options.priors:
         roles = replace(default_roles(options.depth).seeded(options.seed), recorded=priors[name])
         began = time.monotonic()
@@ -55,7 +55,7 @@ def main() -> None:
         evidence = "" if found is None else f"{found['evidence']:.1f}{', used' if found['used'] else ''}"
         estimate = frame_trajectory(slam)
         error = absolute_error(*associate(estimate, truth), "sim3")
-        counts = f"{len(estimate)} of {len(slam.frames)} | {len(pieces_by_size(slam))}"
+        counts = f"{len(estimate)} of {len(slam.frames)} | {len(submaps_by_size(slam))}"
         seconds = time.monotonic() - began
         figures = f"{100 * error.statistics.rmse:.2f} | {1 / error.alignment.scale:.3f}"
         print(f"| {name} | {evidence} | {counts} | {figures} | {len(slam.keyframes)} | {seconds:.0f} |", flush=True)

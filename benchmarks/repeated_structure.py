@@ -22,7 +22,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.simulation.sequence import SyntheticSequence
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.connected import loop_edges
@@ -49,7 +49,7 @@ def main() -> None:
 def _row(seed: int, returns: bool, sections: int) -> str:
     sequence, settings = repeated_corridor(seed, sections, returns=returns), SlamSettings()
     roles, truth = default_roles(has_depth=True), sequence.ground_truth()
-    before = settled(list(run_frames(sequence.frames(), sequence.camera, roles, settings, Clock()))[-1])
+    before = merge_pending_window(list(run_frames(sequence.frames(), sequence.camera, roles, settings, Clock()))[-1])
     after = finish(before, roles, settings)
     loops, false = _loops(after, sequence, settings.window.size)
     level = judge(after).level

@@ -25,7 +25,7 @@ COLUMNS = ("cm, without", "cm", "verdict", "found, ms", "shift, px", "reasons")
 
 def cells(sequence: SequenceView) -> Iterator[str]:
     """The error without the search and with it, and what was found."""
-    never = vg.SlamSettings(refinement=vg.settings.RefinementSettings(rolling_shutter=False))
+    never = vg.SlamSettings(refinement=vg.settings.GlobalMapSettings(rolling_shutter=False))
     yield f"{100 * judged(sequence, never)[1]:.1f}"
     result, error = judged(sequence)
     yield from (f"{100 * error:.1f}", result.verdict.level)

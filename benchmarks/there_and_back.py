@@ -4,7 +4,7 @@
 
 Keyframes should grow with space, not with time: on the way back few are new. `--gap N` covers the lens for N frames in
 the middle of the clip (black images without depth), `--rgb-only` leaves depth out; `--away A B` cuts frames A to B out
-of the way there, so that the camera finds itself elsewhere and begins a piece of map of its own; the way back joins it.
+of the way there, so that the camera finds itself elsewhere and begins a new submap; the way back joins it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 
 
 def main() -> None:
-    """Run and print keyframes, pieces and errors, of the way there and of both."""
+    """Run and print keyframes, submaps and errors, of the way there and of both."""
     options = _options()
     piece = Piece.of(options.path, options.frames, depth=not options.rgb_only)
     frames = piece.frames
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def _print(name: str, slam: Slam, truth: Trajectory) -> None:
-    sizes = [len(piece) for piece in pieces_by_size(slam)]
+    sizes = [len(submap) for submap in submaps_by_size(slam)]
     found = evaluate_trajectory(frame_trajectory(slam), truth)
     errors = 100 * found.se3.statistics.rmse, 100 * found.sim3.statistics.rmse
     tracked = sum(record.tracked for record in slam.frames)

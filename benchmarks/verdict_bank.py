@@ -1,4 +1,4 @@
-"""The bank of simulated runs that the verdict's levels are set on, and validated on.
+"""The bank of simulated runs that the verdict's thresholds are set on, and validated on.
 
     .venv/bin/python benchmarks/verdict_bank.py make [--out runs/verdict-bank] [--count 420] [--jobs 1]
     .venv/bin/python benchmarks/verdict_bank.py judge [--out runs/verdict-bank] [--saved] [--judge MODULE]
@@ -340,8 +340,8 @@ def read(path: Path) -> Any:
         kept = _Unpickler(file).load()
     for keyframe in kept.keyframes if isinstance(kept, Slam) else ():
         for slots in (keyframe.points, keyframe.samples):
-            if not hasattr(slots, "deviation"):
-                object.__setattr__(slots, "deviation", np.full(slots.inverse_depth.shape, np.nan))
+            if not hasattr(slots, "estimate_sigma"):
+                object.__setattr__(slots, "estimate_sigma", np.full(slots.inverse_depth.shape, np.nan))
     return kept
 
 

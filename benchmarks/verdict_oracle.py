@@ -1,4 +1,4 @@
-"""What the verdict cannot see: whether the true fault explains the witness better than the run does.
+"""What the verdict cannot see: whether the true fault explains the corner tracks better than the run does.
 
     .venv/bin/python benchmarks/verdict_oracle.py RUN... [--out runs/verdict-bank]
 
@@ -9,7 +9,7 @@ The runs are those that `verdict_bank.py judge --verbose` prints. For each, a ta
   both with 5 cm (without depth with 6 % of the extent).
 - gain of the fault: minus twice the log likelihood ratio of an adjustment with the true parameters of the planted
   fault, poses free, against one without any fault, with as many observations as count as one. Nothing is estimated
-  for it. Below 28 it is chance at the verdict's level, 10^-6: nothing in the witness shows the fault.
+  for it. Below 28 it is chance at the verdict's level, 10^-6: nothing in the corner tracks shows the fault.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ class PointMatcher(Protocol):
         ...
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """Geometrically verified matches from view i to view j.
+        """Return geometrically verified matches from view i to view j.
 
         predicted: float [M_i, 2], where each key point of i is expected in j, NaN where unknown; a hint that an
         implementation may ignore.
@@ -261,7 +261,7 @@ class DenseConfidence(Protocol):
     """Estimates how well pixels of an image can be localised."""
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
-        """Omega, float32 [H, W] in [0, 1], of `image` (uint8 [H, W, 3])."""
+        """Return Omega, float32 [H, W] in [0, 1], of `image` (uint8 [H, W, 3])."""
         ...
 
 
@@ -429,5 +429,5 @@ class WindowGeometry(Protocol):
     """Estimates all views of a window at once, from their images."""
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
-        """Poses, intrinsics (found if None), depth and confidence of `images` (uint8 [H, W, 3], one size)."""
+        """Return poses, intrinsics (found if None), depth and confidence of `images` (uint8 [H, W, 3], one size)."""
         ...

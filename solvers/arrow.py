@@ -18,7 +18,25 @@ two ends. Its local coordinates are then `(eta, u_j, u_i)`, `b + 2 v` for any nu
     P_e = [-A_e  I  .; . . E_j; . . E_i],
 
 so that ends of one group are added. A host's cross terms have the rows `(eta of each edge, u of each edge's target, u
-of the host)`. Below, `p` is the number of rows of a host for shared coordinates: `q`, or `v (k + 1)` in groups.
+of the host)`.
+
+Sizes in the shapes below:
+
+| | |
+|---|---|
+| `n`, `b` | nodes, coordinates of a node |
+| `q` | shared coordinates, all together; `o = q + 1` with the gradient |
+| `v` | shared coordinates of one group; a node has only those of its group |
+| `c = n b + q` | dense coordinates |
+| `h`, `s` | rows of landmarks, landmarks of a row |
+| `e`, `k` | edges, edges of a row (padded) |
+| `p` | shared coordinates that a row has: `q`, or `v (k + 1)` in groups |
+| `m` of `gram` | `b + q + 1`, or `b + 2 v + 1`: local coordinates of an edge and the gradient |
+| `r = b k + p + 2` | rows of `cross`: relative and shared coordinates, gradient and curvature of the landmarks |
+| `t = b k + p + 1` of a product | the same without the curvature |
+| `g` of `gauge` | directions that may be flat |
+| `g`, `q` of segments | segments of a row, samples of a segment |
+| `m`, `l` of factors | factors, local coordinates of a factor: `2 b + q`, or `2 b + v` |
 
 Levenberg-Marquardt damping multiplies the diagonal: `V (1 + l)`, `H + l diag(H)`. Hence the Schur complement at damping
 `l` is the undamped one divided by `1 + l`: a rejected step costs a factorisation and a back-substitution only.
@@ -57,7 +75,7 @@ class EdgeGraph(eqx.Module):
         return jnp.arange(len(self.of_host)) if self.host is None else self.host
 
     def ends(self) -> Int[Array, "e 2"]:
-        """Nodes of each edge in the order of its local coordinates: target, host."""
+        """Return the nodes of each edge in the order of its local coordinates: target, host."""
         return jnp.stack([self.target, self.source], 1)
 
     def seen(self, nodes: Int[Array, "*t m"], size: int) -> Int[Array, "*t p"] | None:
@@ -227,12 +245,12 @@ def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "h s"]:
     return jnp.where(determined, 1 / jnp.where(determined, system.landmark_hessian, 1.0), 0.0)
 
 
-def reduce(system: ArrowSystem) -> Reduced:
+def dense_schur_complement(system: ArrowSystem) -> Reduced:
     """Assemble the dense Hessian and the undamped Schur complement in node coordinates.
 
     Cost: one product of `[r, s]` with its transpose a row, the rest is small matrices.
     """
-    schur, schur_gradient = _dense(assemble_hosts(system, host_products(system), DenseLayout()))
+    schur, schur_gradient = _dense(assemble_hosts(system, schur_products_of_hosts(system), DenseLayout()))
     hessian, gradient = _dense(assemble_edges(system, DenseLayout()))
     # The prior is on the last dense coordinates.
     outside = len(gradient) - len(system.prior_hessian)
@@ -244,7 +262,7 @@ def reduce(system: ArrowSystem) -> Reduced:
     )
 
 
-def host_products(system: ArrowSystem) -> Float[Array, "h t t"]:
+def schur_products_of_hosts(system: ArrowSystem) -> Float[Array, "h t t"]:
     """Return `C V^-1 C'` of each row in relative coordinates; `t = b k + p + 1`, the gradient comes last."""
     inverse = inverse_landmark_hessian(system)
     # A loop over rows is twice as fast on a CPU as one batched product (the scaled rows stay in the cache).

@@ -30,7 +30,7 @@ from vggtgeo.solvers.arrow import (
     add_prior_blocks,
     assemble_edges,
     assemble_hosts,
-    host_products,
+    schur_products_of_hosts,
 )
 
 
@@ -155,7 +155,7 @@ def assemble_bands(system: ArrowSystem, layout: BandLayout) -> tuple[BandMatrix,
     border = jnp.where(near[:, None, None], system.gram[:, :block, block:], 0.0)
     near_system = eqx.tree_at(lambda s: s.gram, system, system.gram.at[:, :block, block:].set(border))
     hessian = add_prior_blocks(assemble_edges(near_system, layout), system, layout)
-    products = jnp.where(_kept(system, near), host_products(system), 0.0)
+    products = jnp.where(_kept(system, near), schur_products_of_hosts(system), 0.0)
     return _band(hessian, layout), _band(assemble_hosts(system, products, layout), layout)
 
 

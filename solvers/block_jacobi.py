@@ -16,7 +16,7 @@ from vggtgeo.solvers.arrow import (
     assemble_edges,
     assemble_hosts,
     dense_gradient,
-    host_products,
+    schur_products_of_hosts,
 )
 from vggtgeo.solvers.flat_directions import at_least
 
@@ -52,7 +52,7 @@ def prepare_blocks(system: ArrowSystem) -> JacobiBlocks:
     """Assemble both sets of blocks."""
     _, diagonal = dense_gradient(system)
     hessian = add_prior_blocks(assemble_edges(system, DiagonalLayout()), system, DiagonalLayout())
-    schur = assemble_hosts(system, host_products(system), DiagonalLayout())
+    schur = assemble_hosts(system, schur_products_of_hosts(system), DiagonalLayout())
     return JacobiBlocks(_diagonal(hessian), _diagonal(schur), at_least(diagonal))
 
 

@@ -19,7 +19,7 @@ from vggtgeo.solvers.arrow import (
     add_prior_blocks,
     assemble_edges,
     assemble_hosts,
-    host_products,
+    schur_products_of_hosts,
 )
 
 
@@ -69,6 +69,6 @@ def reduced_blocks(system: ArrowSystem, layout: SparseLayout) -> Blocks:
     The prior must be on the shared coordinates only: one that couples all nodes is not sparse.
     """
     hessian = add_prior_blocks(assemble_edges(system, layout), system, layout)
-    schur = assemble_hosts(system, host_products(system), layout)
+    schur = assemble_hosts(system, schur_products_of_hosts(system), layout)
     reduced: Blocks = jax.tree.map(lambda whole, taken: whole - taken, hessian, schur)
     return reduced

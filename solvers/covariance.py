@@ -6,7 +6,8 @@ With `S = H - W V^-1 W'` and residuals of unit variance, the inverse of the whol
     landmarks   V^-1 + V^-1 W' S^-1 W V^-1              the diagonal only: [n, s]
 
 and the second needs, per host, the covariance of its relative coordinates `(eta of each edge, shared)`, which is
-`J S^-1 J'` with small `J`, and one product of that with the host's cross terms: `r^2 s` operations a host, as `reduce`.
+`J S^-1 J'` with small `J`, and one product of that with the host's cross terms: `r^2 s` operations a
+host, as `dense_schur_complement`.
 
 The linear solver computes the blocks of `S^-1`: by eigenvectors of the dense matrix, by a selected inverse of the band,
 or column by column. A coordinate with a component along an undetermined direction, and a landmark coupled to one, have

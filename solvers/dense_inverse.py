@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Float, Int
-from vggtgeo.solvers.arrow import ArrowSystem, reduce
+from vggtgeo.solvers.arrow import ArrowSystem, dense_schur_complement
 from vggtgeo.solvers.flat_directions import free_gauge, gauge_stiffness
 from vggtgeo.solvers.local_inverse import LocalInverse, balance, local_coordinates, rank_tolerance, visible
 
 
 def dense_inverse(system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
     """Return the inverse over the free coordinates, conditional on flat gauge directions; without NaN."""
-    free, reduced = system.free, reduce(system)
+    free, reduced = system.free, dense_schur_complement(system)
     scale = balance(system, jnp.diagonal(reduced.hessian))
     stiffness, directions = gauge_stiffness(system, reduced), free_gauge(system)
     matrix = reduced.hessian - reduced.schur + (directions * stiffness) @ directions.T

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, Reduced, back_substitute, reduce
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, Reduced, back_substitute, dense_schur_complement
 from vggtgeo.solvers.dense_inverse import dense_inverse
 from vggtgeo.solvers.flat_directions import at_least, gauge_stiffness
 from vggtgeo.solvers.local_inverse import LocalInverse
@@ -81,7 +81,7 @@ class DenseCholesky(AbstractReducedSolver[_Prepared]):
     """Dense Cholesky: `c^3 / 3` operations, for windows (c < 1000)."""
 
     def prepare(self, system: ArrowSystem) -> _Prepared:
-        reduced = reduce(system)
+        reduced = dense_schur_complement(system)
         diagonal = damping_diagonal(jnp.diagonal(reduced.hessian), system.free)
         return _Prepared(reduced, diagonal, gauge_stiffness(system, reduced))
 
@@ -99,7 +99,7 @@ class DenseCholesky(AbstractReducedSolver[_Prepared]):
         return step, predicted_decrease(system, prepared.reduced.gradient, prepared.diagonal, step, damping)
 
     def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> LuFactor:
-        reduced = reduce(system)
+        reduced = dense_schur_complement(system)
         matrix = reduced.hessian - reduced.schur
         matrix = matrix + (system.gauge * gauge_stiffness(system, reduced)) @ system.gauge.T
         both = system.free[:, None] & system.free[None, :]

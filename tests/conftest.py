@@ -122,7 +122,7 @@ def shared_cases() -> Path:
 @pytest.fixture(scope="session")
 def healthy() -> Any:
     """A synthetic walk in which the verdict finds nothing."""
-    from witness import walk  # after the hook above
+    from corner_walk import walk  # after the hook above
 
     return walk(40)
 

@@ -19,7 +19,7 @@ LONGEST_CELL = 25
 WINDOW = "size=6, point_slots=160, line_slots=64)"
 SMALL_WINDOW = (
     "size=4, point_slots=96, line_slots=48, window_iterations=8), "
-    "refinement=vg.settings.RefinementSettings(global_adjustment=False)"
+    "refinement=vg.settings.GlobalMapSettings(global_adjustment=False)"
 )
 QUICK = ("solve",)
 # What the shorter run replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.

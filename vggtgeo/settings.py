@@ -2,8 +2,8 @@
 
 from vggtgeo.slam.settings.groups import CameraSettings as CameraSettings
 from vggtgeo.slam.settings.groups import DepthSettings as DepthSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings as GlobalMapSettings
 from vggtgeo.slam.settings.groups import KeyframeSettings as KeyframeSettings
 from vggtgeo.slam.settings.groups import LineSettings as LineSettings
-from vggtgeo.slam.settings.groups import RefinementSettings as RefinementSettings
 from vggtgeo.slam.settings.groups import WeightSettings as WeightSettings
 from vggtgeo.slam.settings.groups import WindowSettings as WindowSettings

@@ -1,6 +1,5 @@
 """Classical implementations of the five perception roles: OpenCV and numpy, no weights."""
 
-from vggtgeo.models.classical.depth import NoDepth, SensorDepth
 from vggtgeo.models.classical.flow import PatchFlow
 from vggtgeo.models.classical.guided_search import can_search, search_around, search_near, search_tree
 from vggtgeo.models.classical.line_geometry import line_coefficients, sample_segments, segment_depths
@@ -10,6 +9,7 @@ from vggtgeo.models.classical.pixel_matcher import OrbMatcher, SiftMatcher, matc
 from vggtgeo.models.classical.place import place_vector
 from vggtgeo.models.classical.pnp import ConstantVelocity, PnpGeometry, pose_information
 from vggtgeo.models.classical.sample_order import SampleOrder, in_order
+from vggtgeo.models.classical.sensor_depth import NoDepth, SensorDepth
 from vggtgeo.models.classical.structure_tensor import StructureTensor
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.two_view import TwoViewStart

@@ -76,7 +76,7 @@ def _near(moved: np.ndarray, ends_j: np.ndarray, distance: float, overlap: float
 
 
 def _common_part(first: np.ndarray, second: np.ndarray, length: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Common part of [0, length_j] and the intervals `first` to `second` [L_i, L_j], relative to the shorter one."""
+    """Return the common part of [0, length_j] and intervals `first` to `second` [L_i, L_j], over the shorter one."""
     common = np.minimum(np.maximum(first, second), length) - np.maximum(np.minimum(first, second), 0.0)
     return common / np.maximum(np.minimum(length[None, :], own[:, None]), 1.0)
 

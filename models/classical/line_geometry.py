@@ -10,7 +10,7 @@ from vggtgeo.models.checks import check_array
 
 
 def line_coefficients(endpoints: np.ndarray) -> np.ndarray:
-    """(a, b, c), float64 [L, 3], with a x + b y + c = 0 on the line and a^2 + b^2 = 1.
+    """Return (a, b, c), float64 [L, 3], with a x + b y + c = 0 on the line and a^2 + b^2 = 1.
 
     endpoints: float [L, 2, 2] = (segment, end, xy). a x + b y + c is then the signed distance of a pixel, positive
     to the right of the direction from end 0 to end 1 as the image shows it. Raises `ValueError` for ends that coincide.

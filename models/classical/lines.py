@@ -37,7 +37,7 @@ class BandLineMatcher:
         check_fields(self, bands="[2, inf)", width=f"[{self.bands // 2}, inf)", ratio="(0, 1]")
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
-        """Band descriptors float32 [L, 8 * bands], of unit length, of `segments` in `image`."""
+        """Return band descriptors float32 [L, 8 * bands], of unit length, of `segments` in `image`."""
         check_image("image", image)
         if not len(segments):
             return LineFeatures(segments, np.zeros((0, 8 * self.bands), np.float32))

@@ -132,7 +132,7 @@ class OrbMatcher(PixelMatcher):
 
 
 def _signs(bits: np.ndarray) -> np.ndarray:
-    """256 bits as a unit vector of signs, so that an inner product s is a Hamming distance: 128 (1 - s)."""
+    """Return 256 bits as a unit vector of signs, so that an inner product s is a Hamming distance: 128 (1 - s)."""
     return (np.unpackbits(bits, axis=1).astype(np.float32) * 2.0 - 1.0) / 16.0
 
 
@@ -173,13 +173,13 @@ class SiftMatcher(PixelMatcher):
 
 
 def _root(vectors: np.ndarray) -> np.ndarray:
-    """RootSIFT: the square root of L1-normalised histograms has unit length and compares by Hellinger's kernel."""
+    """Return RootSIFT: square roots of L1-normalised histograms have unit length and compare by Hellinger's kernel."""
     total = np.maximum(vectors.sum(axis=1, keepdims=True), 1e-7)
     return np.sqrt(vectors / total)
 
 
 def _shrunk(gray: np.ndarray, area: int) -> tuple[np.ndarray, np.ndarray]:
-    """`gray` with at most about `area` pixels, and how many of its own pixels a new one spans, float [2] (x, y)."""
+    """Shrink `gray` to about `area` pixels; return it and how many of its pixels a new one spans, float [2] (x, y)."""
     scale = np.sqrt(area / gray.size)
     if scale >= 1.0:
         return gray, np.ones(2)

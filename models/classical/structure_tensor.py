@@ -29,7 +29,7 @@ class StructureTensor:
         check_fields(self, sigma="(0, inf)", noise="(0, inf)", edges="[0, inf)")
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
-        """Omega, float32 [H, W] in [0, 1], of `image` (uint8 [H, W, 3])."""
+        """Return Omega, float32 [H, W] in [0, 1], of `image` (uint8 [H, W, 3])."""
         check_image("image", image)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         # Scharr's 3 x 3 derivative sums to 32 for a ramp of one grey level a pixel.

@@ -119,7 +119,7 @@ def _by_warp(across: np.ndarray, down: np.ndarray) -> np.ndarray:
 
 
 def _normal_equations(across: np.ndarray, down: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """[n, 6, 6]: products of the six derivatives, in the order of `_by_warp`, summed over the patch."""
+    """Return the products of the six derivatives, in the order of `_by_warp`, summed over the patch, [n, 6, 6]."""
     first, second = np.triu_indices(3)
     of_both = offsets[:, first] * offsets[:, second]
     place = np.empty((3, 3), int)
@@ -134,7 +134,7 @@ def _side(radius: int) -> np.ndarray:
 
 
 def _grid(radius: int) -> np.ndarray:
-    """Offsets of a patch's pixels, float32 [P, 2]."""
+    """Return the offsets of a patch's pixels, float32 [P, 2]."""
     return np.stack(np.meshgrid(_side(radius), _side(radius)), axis=-1).reshape(-1, 2)
 
 

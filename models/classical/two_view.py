@@ -173,8 +173,9 @@ def _triangulate(
 
 
 def parallax(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Angles, radians, float64 [n], between the rays to points [n, 3] (first camera) from the first camera and from the
-    second, whose pose is first -> second.
+    """Return the angles between the rays to points [n, 3] from two cameras, radians, float64 [n].
+
+    Points are in the first camera; the pose of the second is first -> second.
     """
     second = points - (-pose[:3, :3].T @ pose[:3, 3])
     cosine = (points * second).sum(axis=1) / (np.linalg.norm(points, axis=1) * np.linalg.norm(second, axis=1))

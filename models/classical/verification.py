@@ -76,7 +76,7 @@ class EpipolarVerifier:
 
 
 def _adds_nothing(epipolar: np.ndarray, homography: np.ndarray) -> bool:
-    """Whether, of the matches that the homography leaves, the epipolar geometry explains no more than chance would.
+    """Return whether epipolar geometry explains no more than chance of the matches that the homography leaves.
 
     A wrong match lies within 2 px of a line across a 300 pixel image with a probability of about 3 %.
     """

@@ -22,7 +22,7 @@ from vggtgeo.models.exporters.request import load
 
 @contextmanager
 def attention_replaced(make: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Iterator[None]:
-    """In the block, `make` of torch's own attention stands in its place."""
+    """Replace torch's own attention by `make` of it, in the block."""
     functional = load("torch").nn.functional
     original = functional.scaled_dot_product_attention
     functional.scaled_dot_product_attention = make(original)
@@ -33,7 +33,7 @@ def attention_replaced(make: Callable[[Callable[..., Any]], Callable[..., Any]])
 
 
 def in_parts(queries: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """For `attention_replaced`: the same sums, for so many queries at a time.
+    """Compute the same sums, for so many queries at a time; for `attention_replaced`.
 
     onnxruntime holds the weights of all pairs of tokens at once: of VGGT's 10 views of 392 x 518 pixels 7 GB a layer.
     A query's answer depends on no other query.
@@ -72,7 +72,7 @@ def fix_positions(rope: Any, positions: np.ndarray, head_size: int, base: float)
 
 
 def angle_tables(positions: np.ndarray, head_size: int, base: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cosines and sines, float32 [P, head_size] each, of the tokens at `positions`, int [P, 2]."""
+    """Return cosines and sines, float32 [P, head_size] each, of the tokens at `positions`, int [P, 2]."""
     half = head_size // 2
     frequencies = 1.0 / base ** (np.arange(0, half, 2) / half)
     angles = positions[:, :, None] * frequencies
@@ -81,7 +81,7 @@ def angle_tables(positions: np.ndarray, head_size: int, base: float) -> tuple[np
 
 
 def grid(rows: int, columns: int) -> np.ndarray:
-    """(row, column) of each patch, int [rows columns, 2], row by row."""
+    """Return (row, column) of each patch, int [rows columns, 2], row by row."""
     return np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1).reshape(-1, 2)
 
 

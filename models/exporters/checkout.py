@@ -52,7 +52,7 @@ class Checkout:
 
     @contextlib.contextmanager
     def importable(self, source: Path) -> Iterator[None]:
-        """While the block runs, `packages` are imported from the checkout and from nowhere else."""
+        """Import `packages` from the checkout and from nowhere else, in the block."""
         root = self.root(source)
         search_path = list(sys.path)
         _forget(self.packages)
@@ -68,7 +68,7 @@ class Checkout:
             sys.path[:] = search_path
 
     def revision(self, source: Path) -> str:
-        """`repository@commit` of the checkout, the commit `unknown` outside git."""
+        """Return `repository@commit` of the checkout, the commit `unknown` outside git."""
         try:
             command = ["git", "-C", str(source), "rev-parse", "HEAD"]
             commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
@@ -89,7 +89,7 @@ def import_from(source: Path, module: str, hint: str) -> Any:
 
 @contextlib.contextmanager
 def stand_in(name: str, **attributes: Any) -> Iterator[None]:
-    """While the block runs, `import name` gives an empty module with `attributes`, where it is not installed.
+    """Let `import name` give an empty module with `attributes` in the block, if it is not installed.
 
     For packages that the published code imports at the top and does not need for the forward pass.
     """

@@ -66,14 +66,14 @@ def _last_attention(block: Any, tokens: Any, rope: Any) -> Any:
 
 
 def _attention(query: Any, key: Any) -> Any:
-    """softmax(q k^T / sqrt(size)) of the prefix tokens' queries, [1, heads, 5, tokens]."""
+    """Return softmax(q k^T / sqrt(size)) of the prefix tokens' queries, [1, heads, 5, tokens]."""
     prefix = query[:, :, :PREFIX].float()
     return (prefix @ key.float().transpose(-2, -1) * query.shape[-1] ** -0.5).softmax(dim=-1)
 
 
 @contextmanager
 def _recorded_attention() -> Iterator[list[tuple[Any, Any]]]:
-    """Collects the queries and keys of every attention that the published code computes in the block."""
+    """Collect the queries and keys of every attention that the published code computes in the block."""
     recorded: list[tuple[Any, Any]] = []
 
     def recording(original: Callable[..., Any]) -> Callable[..., Any]:

@@ -225,7 +225,7 @@ def _compare(who: str, found: Mapping[str, np.ndarray], wanted: Mapping[str, np.
 
 
 def difference(found: np.ndarray, reference: np.ndarray) -> float:
-    """max |found - reference| / max |reference|; NaN if any value is."""
+    """Return max |found - reference| / max |reference|; NaN if any value is."""
     return float(np.abs(found - reference).max() / np.abs(reference).max())
 
 
@@ -276,7 +276,7 @@ def _move(folder: Path, output: Path) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's and the published code's warnings: the comparisons that follow decide."""
+    """Silence the exporter's and the published code's warnings: the comparisons that follow decide."""
     previous = logging.root.manager.disable
     logging.disable(logging.ERROR)
     try:

@@ -61,7 +61,7 @@ def _arguments(request: Request) -> list[str]:
 
 @contextmanager
 def _stand_ins(request: Request) -> Iterator[None]:
-    """What LETR imports: a torchvision with one backbone, and a class of torch under its old name."""
+    """Provide what LETR imports: a torchvision with one backbone, and a class of torch under its old name."""
     linear = load("torch").nn.modules.linear
 
     def backbone(norm_layer: Any, **_options: Any) -> Any:

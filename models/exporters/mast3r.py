@@ -69,7 +69,10 @@ def build_encoder(request: Request) -> Graph:
 
 
 def build_decoder(request: Request) -> Graph:
-    """Features of two images to points, descriptors and confidences of both; the example's are of random images."""
+    """Build the decoder: features of two images to points, descriptors and confidences of both.
+
+    The example's features are of random images.
+    """
     torch = load("torch")
     network = _network(request)
     images = torch.from_numpy(request.random_images(-1.0, 1.0, 2)).split(1)

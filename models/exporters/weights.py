@@ -105,7 +105,7 @@ def liven(module: Any) -> None:
 
 
 def identity(checkpoint: Path | None) -> str:
-    """`random`, or `sha256:` and the digest of the checkpoint."""
+    """Return `random`, or `sha256:` and the digest of the checkpoint."""
     if checkpoint is None:
         return "random"
     with open(checkpoint, "rb") as handle:

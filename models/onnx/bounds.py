@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
-from vggtgeo.models.classical.depth import no_depth
+from vggtgeo.models.classical.sensor_depth import no_depth
 from vggtgeo.models.onnx.session import NetworkValueError
 from vggtgeo.models.roles import (
     DenseConfidence,

@@ -39,7 +39,7 @@ class Patches:
     extra: int = 0
 
     def count(self, height: int, width: int) -> int:
-        """Tokens of an image of `height` x `width` pixels."""
+        """Return the number of tokens of an image of `height` x `width` pixels."""
         return self.extra + (height // self.size) * (width // self.size)
 
     def __str__(self) -> str:

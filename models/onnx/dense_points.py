@@ -57,7 +57,7 @@ class DensePointMatcher(PixelMatcher):
 
 
 def peaks(scores: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Local maxima of a map float [H, W] that are above `least`: float64 [M, 2] (x, y), and their values float64 [M].
+    """Return local maxima of a map float [H, W] above `least`: float64 [M, 2] (x, y), and their values float64 [M].
 
     The place between pixels is the top of the parabolas through a maximum and its neighbours in each direction; where
     there is none, on a plateau or along a ridge, is no key point.

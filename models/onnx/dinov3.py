@@ -52,7 +52,7 @@ class DinoFeatures:
     cache: OutputCache = field(default_factory=MemoryCache)
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
-        """Omega, float32 [H, W] in [0, 1), of `image` (uint8 [H, W, 3])."""
+        """Return Omega, float32 [H, W] in [0, 1), of `image` (uint8 [H, W, 3])."""
         outputs, fit = self._outputs(image)
         rows, columns = (side // DINOV3.multiple for side in fit.network_size)
         omega = saliency(outputs["attention"]).reshape(rows, columns)

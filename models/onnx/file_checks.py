@@ -126,7 +126,7 @@ def _present(contract: Contract, inputs: Signatures, outputs: Signatures) -> Ite
 
 
 def _sizes(contract: Contract, pairs: Sequence[tuple[Tensor, Signature]]) -> list[str]:
-    """Fixed sizes, letters that must agree, multiples, and numbers of tokens, in this order."""
+    """Return fixed sizes, letters that must agree, multiples, and numbers of tokens, in this order."""
     wrong, letters = [], dict[str, tuple[int, str]]()
     for tensor, have in pairs:
         for expected, size in zip(tensor.shape, have.shape, strict=True):

@@ -106,7 +106,7 @@ class Mast3rMatcher:
         return {"targets": targets.astype(np.int32), "gap": gap, "certainty": certainty}
 
     def _encode(self, view: Mast3rView) -> DeviceArray:
-        """Encoder features of an image, which stay on the device for the next pairs."""
+        """Return the encoder features of an image, which stay on the device for the next pairs."""
         key = key_of((), (), (view.image,))
         if key not in self._encoded:
             image = MAST3R_ENCODER.normalisation.apply(view.fit.resize(view.image))[None]
@@ -157,7 +157,7 @@ def corners(image: np.ndarray, spacing: int, least: float) -> tuple[np.ndarray, 
 
 
 def confidence_of(certainty: np.ndarray) -> np.ndarray:
-    """c / (1 + c) in [0, 1) of the network's certainty c > 0."""
+    """Return c / (1 + c) in [0, 1) of the network's certainty c > 0."""
     positive = np.maximum(np.asarray(certainty, np.float64), 0.0)
     return positive / (1.0 + positive)
 

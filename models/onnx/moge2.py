@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import least_squares
 from vggtgeo.models.checks import check_fields, check_image
-from vggtgeo.models.classical.depth import no_depth
+from vggtgeo.models.classical.sensor_depth import no_depth
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import MOGE2
 from vggtgeo.models.onnx.fit import Fit
@@ -71,7 +71,7 @@ class MogeDepth:
 def recover_focal_shift(
     points: np.ndarray, keep: np.ndarray, intrinsics: Sequence[float] | None = None
 ) -> tuple[float, float]:
-    """(f, s), in pixels and in the points' unit, that minimise sum |f (x, y) / (z + s) - (u, v)|^2.
+    """Return (f, s), pixels and the points' unit, that minimise sum |f (x, y) / (z + s) - (u, v)|^2.
 
     (u, v) is the pixel from the centre of the image; for a given s the best f is a ratio of two sums (variable
     projection), so the search is over s alone, by Levenberg-Marquardt on at most 64 x 64 points. With `intrinsics`
@@ -114,6 +114,6 @@ def _away_from_zero(values: np.ndarray) -> np.ndarray:
 
 
 def _thin(length: int) -> np.ndarray:
-    """At most 64 indices spread evenly over `length`."""
+    """Return at most 64 indices spread evenly over `length`."""
     count = min(length, _GRID)
     return ((np.arange(count) + 0.5) * length / count).astype(np.int64)

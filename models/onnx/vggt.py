@@ -33,7 +33,7 @@ class VggtWindow:
         return self.session.inputs["images"].shape[0]
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
-        """Poses, shared intrinsics, depth and confidence of `images`; see `WindowGeometry.window`.
+        """Return poses, shared intrinsics, depth and confidence of `images`; see `WindowGeometry.window`.
 
         Given intrinsics are handed back. A view whose quaternion has no length, or whose translation is not finite or
         beyond all scenes, is not found.
@@ -127,5 +127,5 @@ def robust_mean(values: np.ndarray, reach: float = 3.0) -> float:
 
 
 def confidence_of(certainty: np.ndarray) -> np.ndarray:
-    """1 - 1 / c in [0, 1): the network's c >= 1 multiplies the error in its loss, so the error goes like 1 / c."""
+    """Return 1 - 1 / c in [0, 1): the loss multiplies the error by the network's c >= 1, so the error is like 1 / c."""
     return (1.0 - 1.0 / np.maximum(certainty, 1.0)).astype(np.float32)

@@ -42,7 +42,7 @@ class SimulatedMoge:
     def estimate(
         self, image: np.ndarray, sensor_depth: np.ndarray | None = None, intrinsics: Sequence[float] | None = None
     ) -> DepthEstimate:
-        """Simulated depth of `image`; the sensor's depth is not looked at."""
+        """Return simulated depth of `image`; the sensor's depth is not used."""
         index = self.oracle.index_of(image)
         depth = self.oracle.depth(index)
         sigma = self.error * (1 + self.weak * weakness(self.oracle, index))
@@ -81,7 +81,7 @@ class SimulatedDino:
         check_settings(self, noise=0, floor=0, share=0, reach=1e-3, blind=0, patch=1)
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
-        """Simulated Omega of `image`, float32 [H, W] in [0, 1]."""
+        """Return simulated Omega of `image`, float32 [H, W] in [0, 1]."""
         index = self.oracle.index_of(image)
         strength = 1.0 - weakness(self.oracle, index)
         height, width = strength.shape
@@ -136,7 +136,7 @@ class SmoothField:
 
 
 def weakness(oracle: Oracle, index: int) -> np.ndarray:
-    """Lack of texture around each pixel, float32 [H, W] in [0, 1]: 1 on a plain wall, 0 from a strength of 0.25."""
+    """Return the lack of texture, float32 [H, W] in [0, 1]: 1 on a plain wall, 0 from a strength of 0.25."""
     texture = oracle.texture(index).astype(np.float32)
     around = cv2.GaussianBlur(texture, (0, 0), max(1.0, texture.shape[1] / 53))
     return np.clip(1.0 - around / _FULL_TEXTURE, 0.0, 1.0)
@@ -189,7 +189,7 @@ class SimulatedMast3r:
         )
 
     def describe(self, image: np.ndarray) -> Features:
-        """Simulated key points of `image`; the descriptor is the frame's number."""
+        """Return simulated key points of `image`; the descriptor is the frame's number."""
         index = self.oracle.index_of(image)
         rng = stream(self.seed, "mast3r", index)
         texture = self.oracle.texture(index)[::2, ::2]
@@ -201,7 +201,7 @@ class SimulatedMast3r:
         return Features(np.clip(pixels, 0, [width - 1, height - 1]), texture.ravel()[chosen], index)
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """Simulated matches from view i to view j; `index_j` is -1: targets are no key points."""
+        """Return simulated matches from view i to view j; `index_j` is -1: targets are no key points."""
         index_i, index_j = int(features_i.descriptors), int(features_j.descriptors)
         rng = stream(self.seed, "mast3r", index_i, index_j)
         pixels = features_i.pixels
@@ -246,7 +246,7 @@ class SimulatedLetr:
         check_settings(self, across=0, along=0, found=0, half=0, false=0, shortest=0)
 
     def detect(self, image: np.ndarray) -> Segments:
-        """Simulated segments of `image`, best first."""
+        """Return simulated segments of `image`, best first."""
         index = self.oracle.index_of(image)
         rng = stream(self.seed, "letr", index)
         edges = self.oracle.edges(index)
@@ -304,7 +304,7 @@ class Oracle(Protocol):
         ...
 
     def timestamp(self, index: int) -> float:
-        """Seconds."""
+        """Return the time, seconds."""
         ...
 
     def pose(self, index: int) -> np.ndarray:
@@ -324,7 +324,7 @@ class Oracle(Protocol):
         ...
 
     def edges(self, index: int) -> Any:
-        """`VisibleSegments` of the frame."""
+        """Return the `VisibleSegments` of the frame."""
         ...
 
     def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -50,7 +50,7 @@ class SimulatedVggt:
         )  # fmt: skip
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
-        """Simulated geometry of `images`; the first camera is the world."""
+        """Return simulated geometry of `images`; the first camera is the world."""
         if not images:
             raise ValueError("`images` is empty; give at least one image")
         indices = [self.oracle.index_of(image) for image in images]
@@ -98,7 +98,7 @@ class SimulatedVggt:
         return poses, found
 
     def _overlaps(self, indices: list[int]) -> np.ndarray:
-        """Share of the pixels of view a that are seen in view b, made symmetric by the smaller: float [n, n]."""
+        """Return the share of the pixels of view a that view b sees, the smaller of both directions: float [n, n]."""
         height, width = self.oracle.depth(indices[0]).shape
         columns = (np.arange(_GRID[0]) + 0.5) / _GRID[0] * width - 0.5
         rows = (np.arange(_GRID[1]) + 0.5) / _GRID[1] * height - 0.5

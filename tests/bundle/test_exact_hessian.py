@@ -9,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from priors import prior_on
 from scenes import make_scene
-from vggtgeo.solvers.arrow import multiply, reduce
+from vggtgeo.solvers.arrow import dense_schur_complement, multiply
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State
@@ -25,7 +25,7 @@ def both(problem: Problem, state: State) -> tuple[jax.Array, ...]:
     total = lambda step: oracle.energy(problem, ba.retract(state, unflat(step)))
     system = ba.hessian(state)
     matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
-    gradient = jnp.concatenate([reduce(system).gradient, system.landmark_gradient.ravel()])
+    gradient = jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
     return gradient, matrix, jax.grad(total)(flat), jax.hessian(total)(flat)
 
 

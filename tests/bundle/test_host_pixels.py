@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vggtgeo.solvers.arrow import reduce
+from vggtgeo.solvers.arrow import dense_schur_complement
 
 import vggtgeo as vg
 from vggtgeo.bundle.linearise import energy_gradient, linearise
@@ -62,7 +62,7 @@ def test_schur_complement_of_the_exact_hessian(window):
     """By dense elimination of all landmark unknowns from the Hessian of the energy."""
     problem, state = window
     hessian = np.asarray(jax.jit(jax.hessian(_energy_of(problem, state)))(jnp.zeros(state.num_unknowns)))
-    reduced = reduce(linearise(prepared(problem), state, exact=True))
+    reduced = dense_schur_complement(linearise(prepared(problem), state, exact=True))
     count = problem.num_camera
     inverse = np.linalg.pinv(hessian[count:, count:], hermitian=True)
     expected = hessian[:count, :count] - hessian[:count, count:] @ inverse @ hessian[count:, :count]
@@ -75,8 +75,8 @@ def test_hand_written_columns_are_the_derived_ones(window):
     grouped = replace(problem, camera_of=jnp.zeros(KEYFRAMES, jnp.int32))
     grouped = replace(grouped, fixed_intrinsics=problem.fixed_intrinsics[None])
     both = [
-        reduce(linearise(prepared(problem), state)),
-        reduce(linearise(prepared(grouped), replace(state, intrinsics=state.intrinsics[None]))),
+        dense_schur_complement(linearise(prepared(problem), state)),
+        dense_schur_complement(linearise(prepared(grouped), replace(state, intrinsics=state.intrinsics[None]))),
     ]
     for name in ("hessian", "gradient", "schur", "schur_gradient"):
         first, second = (np.asarray(getattr(found, name)) for found in both)
@@ -209,7 +209,7 @@ def test_marginalisation_takes_the_pixels_along():
             )
         )
     )
-    gauss_newton = reduce(linearise(prepared(alone), state))
+    gauss_newton = dense_schur_complement(linearise(prepared(alone), state))
     information = np.asarray(gauss_newton.hessian - gauss_newton.schur)
     kept, gone = np.r_[12:18], np.r_[6:12]
     expected = (

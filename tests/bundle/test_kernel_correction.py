@@ -10,7 +10,7 @@ import oracle
 import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene
-from vggtgeo.solvers.arrow import multiply, reduce
+from vggtgeo.solvers.arrow import dense_schur_complement, multiply
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
@@ -30,7 +30,7 @@ def dense(problem: Problem, state: State, correction: jax.Array | None) -> tuple
     system = ba.linearise(state, correction)
     flat, unflat = ravel_pytree(ba.zero_step(state))
     matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat)))
-    return matrix, jnp.concatenate([reduce(system).gradient, system.landmark_gradient.ravel()])
+    return matrix, jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
 
 
 @eqx.filter_jit

@@ -10,7 +10,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene, matrix
 from scipy.linalg import expm
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, multiply, reduce
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_schur_complement, multiply
 from vggtgeo.solvers.reduced import DenseCholesky
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
@@ -44,7 +44,7 @@ def linearise_both(problem: Problem, state: State):
     weights = oracle.reweighted(problem, state)
     vector = lambda step: oracle.weighted_residuals(problem, ba.retract(state, unflat(step)), weights)
     matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
-    gradient = jnp.concatenate([reduce(system).gradient, system.landmark_gradient.ravel()])
+    gradient = jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
     return system, matrix, gradient, jax.jacfwd(vector)(flat), vector(flat)
 
 

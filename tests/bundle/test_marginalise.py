@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import make_scene
-from vggtgeo.solvers.arrow import ArrowVector, reduce
+from vggtgeo.solvers.arrow import ArrowVector, dense_schur_complement
 from vggtgeo.solvers.exact_model import exact_model
 from vggtgeo.solvers.kernels import Square
 
@@ -35,7 +35,7 @@ def _made(keyframes: int, points: int, lines: int, **options: Any) -> _Made:
 @eqx.filter_jit
 def _gauss_newton_step(problem: Problem, state: State) -> ArrowVector:
     system = linearise(prepared(problem), state)
-    gradient = ArrowVector(reduce(system).gradient, system.landmark_gradient)
+    gradient = ArrowVector(dense_schur_complement(system).gradient, system.landmark_gradient)
     return exact_model(system).solve(jax.tree.map(jnp.negative, gradient))
 
 

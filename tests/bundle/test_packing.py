@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from reported import raises
 from scenes import Scene, make_scene
-from vggtgeo.solvers.arrow import reduce
+from vggtgeo.solvers.arrow import dense_schur_complement
 from vggtgeo.solvers.kernels import Huber
 
 import vggtgeo as vg
@@ -139,7 +139,7 @@ def test_padding_edges_change_nothing(edges: int) -> None:
     for stored in (None, edges):
         problem, state, _ = SCENE.pack(size=PaddedSize(4, 8, 6, 3, edges=stored))
         assert len(problem.edges.source) == (stored or 12)
-        systems.append(reduce(linearise(prepared(problem), state)))
+        systems.append(dense_schur_complement(linearise(prepared(problem), state)))
     for name in ("hessian", "gradient", "schur", "schur_gradient"):
         every, some = (np.asarray(getattr(system, name)) for system in systems)
         np.testing.assert_allclose(some, every, rtol=1e-10, atol=1e-10 * np.abs(every).max(), err_msg=name)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from reported import raises
 from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, reduce
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_schur_complement
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.block_band import BandMatrix, BandVector
 from vggtgeo.solvers.block_elimination import eliminate, selected_inverse, solve_eliminated
@@ -95,7 +95,7 @@ def test_exact_hessians_are_solved(name: str, definite: bool, solved: State) -> 
     if not definite:
         assert system.factors is not None
         system = eqx.tree_at(lambda s: s.factors.hessian, system, -3 * system.factors.hessian)
-    reduced = jax.jit(reduce)(system)
+    reduced = jax.jit(dense_schur_complement)(system)
     free = np.ix_(system.free, system.free)
     scale = np.sqrt(np.diag(reduced.hessian)[system.free]) if definite else 1.0
     least = np.linalg.eigvalsh(np.asarray(reduced.hessian - reduced.schur)[free] / scale / np.reshape(scale, (-1, 1)))[
@@ -116,7 +116,7 @@ def test_a_solve_that_ends_too_early_says_so(iterations: int, ended: bool, solve
     rng = np.random.default_rng(0)
     vector = ArrowVector(jnp.asarray(rng.normal(size=system.free.shape)), jnp.zeros_like(system.cross[:, -1]))
     step, told = eqx.filter_jit(lambda s, v: exact_model(s, solver).checked(v))(system, vector)
-    reduced = jax.jit(reduce)(system)
+    reduced = jax.jit(dense_schur_complement)(system)
     off = np.where(system.free, (reduced.hessian - reduced.schur) @ step.dense - vector.dense, 0.0)
     assert bool(told) == ended
     assert (np.abs(off).max() < 1e-6) == ended

@@ -7,7 +7,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.run import with_own_depth
-from vggtgeo.slam.verdict.witness import EvidenceRecorder
+from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 
 rng = np.random.default_rng(0)
 
@@ -26,7 +26,8 @@ def _frames(depths: list[int], pictures: list[int]) -> list[Frame]:
 
 def test_depth_of_another_picture_is_not_used() -> None:
     """A depth image that comes again with the next picture is that of the picture before, however often both come then;
-    where the picture comes again, too, it is this one's. Neither run nor witness reads it. Oracle: what was repeated.
+    where the picture comes again, too, it is this one's. Neither run nor corner recorder reads it. Oracle: what was
+    repeated.
     """
     frames = _frames([0, 0, 1, 1, 1, 1, 2], [0, 1, 2, 2, 3, 3, 4])
     changed = frames[-1].depth

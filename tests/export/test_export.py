@@ -398,8 +398,8 @@ def test_targets_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None
     assert sorted(copy.rglob("*")) == [path for path in before if path.name != "map.ply"]
 
 
-def test_pieces_that_nothing_ties_to_the_map_are_left_out(tmp_path: Path) -> None:
-    # Proves that keyframes of another piece of the map, which stand anywhere, are in no COLMAP model, with their
+def test_submaps_that_nothing_ties_to_the_map_are_left_out(tmp_path: Path) -> None:
+    # Proves that keyframes of another submap, which stand anywhere, are in no COLMAP model, with their
     # pictures and what they saw. Oracle: the run whole, and with its last keyframe cut off.
     slam = recorded_run().slam
     last = slam.keyframes[-1].number

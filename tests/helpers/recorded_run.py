@@ -13,9 +13,9 @@ from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
@@ -24,7 +24,7 @@ FRAMES = 9
 # The shape of tests/slam/test_pipeline.py, so that a process that runs both compiles the solver once.
 SETTINGS = SlamSettings(
     window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
-    refinement=RefinementSettings(global_adjustment=False),
+    refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
 
@@ -58,7 +58,7 @@ def recorded_run() -> RecordedRun:
     for slam in run_frames(iter(frames), sequence.camera, ROLES, SETTINGS, Clock()):
         recorder.on_frame(slam, frames[slam.frames[-1].frame])
         states.append(slam)
-    states[-1] = settled(states[-1])
+    states[-1] = merge_pending_window(states[-1])
     recorder.on_adjust(states[-1])
     return RecordedRun(
         sequence,

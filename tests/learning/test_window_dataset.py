@@ -164,7 +164,7 @@ def test_the_windows_of_a_run(tmp_path: Path) -> None:
     # that the run reports.
     settings = vg.SlamSettings(
         window=vg.settings.WindowSettings(size=3, point_slots=32, line_slots=12),
-        refinement=vg.settings.RefinementSettings(global_adjustment=False),
+        refinement=vg.settings.GlobalMapSettings(global_adjustment=False),
     )
     sequence = vg.simulate("room", 20, size=(160, 120), rate=4.0)
     with WindowWriter(tmp_path) as writer:

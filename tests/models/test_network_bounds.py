@@ -28,7 +28,7 @@ from vggtgeo.models.onnx.vggt import decode_cameras
 from vggtgeo.models.roles import DepthEstimate, Features, Segments
 
 import vggtgeo as vg
-from vggtgeo.slam.verdict.input import check_refusals
+from vggtgeo.slam.verdict.input_findings import check_refusals
 
 SIZE = (48, 64)
 IMAGE = np.random.default_rng(0).integers(0, 255, (*SIZE, 3)).astype(np.uint8)

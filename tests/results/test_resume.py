@@ -33,8 +33,8 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.verdict.witness import FrameEvidence
 
 TIMES = ("seconds_by_stage", "frames_per_second", "peak_memory_gb")
 

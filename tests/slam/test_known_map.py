@@ -27,10 +27,10 @@ from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.known_map import as_map, entered, save_map
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import save_state
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.judge import judge
 
@@ -48,7 +48,7 @@ def run(start: int = 0, end: int | None = None, seed: int = 0, **options: Any) -
     given = {"roles": ROLES, "settings": SETTINGS, **options}
     frames = sequence(seed) if given["roles"].metric else without_depth(sequence(seed))
     *_, slam = vg.run(frames, **given, start=start, end=end)
-    return settled(slam)
+    return merge_pending_window(slam)
 
 
 @cache
@@ -135,9 +135,9 @@ def test_the_state_of_a_run_is_a_map(known: Slam) -> None:
 
 
 def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:
-    """Frames that follow are found in the map and extend it: one piece, in its world; oracle: the truth."""
+    """Frames that follow are found in the map and extend it: one submap, in its world; oracle: the truth."""
     slam = run(HALF, known_map=known)
-    assert len(pieces_by_size(slam)) == 1
+    assert len(submaps_by_size(slam)) == 1
     assert [record.tracked for record in slam.frames] == [True] * (FRAMES - HALF)
     assert worst_error(slam) < 0.02
     assert len(slam.keyframes) > len(known.keyframes)
@@ -172,7 +172,7 @@ def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     assert not any(record.tracked for record in slam.frames)
     assert len(slam.tracker.waiting) == 6
     assert "0 of 6 frames were found in the known map" in judge(slam).reasons[0]
-    assert not Claim.of(first_half()).in_known_map
+    assert not Claim.of(first_half()).began_in_known_map
 
 
 def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.pending_window import LAG, begin_window, is_due, settled
+from vggtgeo.slam.pending_window import LAG, begin_window, is_due, merge_pending_window
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
@@ -52,14 +52,14 @@ def test_what_was_noted_meanwhile_is_kept() -> None:
         map=replace(slam.map, factors=(*slam.map.factors, late)),
         notes=(*slam.notes, "tracked"),
     )
-    after = settled(slam)
+    after = merge_pending_window(slam)
     assert after.pending is None
     assert after.window.members == (1, 2)
     assert after.frames == (frame,)
     assert after.map.factors == (early, found, late)
     assert after.notes == ("before", "adjusted", "tracked")
     np.testing.assert_array_equal(after.intrinsics, 2 * CAMERA)
-    assert settled(after) is after
+    assert merge_pending_window(after) is after
 
 
 def test_it_is_due_by_the_number_of_frames() -> None:
@@ -71,7 +71,7 @@ def test_it_is_due_by_the_number_of_frames() -> None:
     assert [
         is_due(replace(slam, tracker=replace(slam.tracker, frames=(frame,) * count))) for count in (1, LAG, LAG + 1)
     ] == [False, False, True]
-    assert not is_due(settled(slam))
+    assert not is_due(merge_pending_window(slam))
 
 
 @pytest.mark.parametrize("again", [lambda slam: pickle.loads(pickle.dumps(slam)), copy.deepcopy])
@@ -87,7 +87,7 @@ def test_a_state_that_waits_for_a_window_pickles_and_copies(again: Callable[[Sla
     assert found.pending is not None
     assert slam.pending is not None
     assert found.pending.due == slam.pending.due
-    after = settled(found)
+    after = merge_pending_window(found)
     assert after.window.members == (1, 2)
     np.testing.assert_array_equal(after.intrinsics, 2 * CAMERA)
 
@@ -99,4 +99,4 @@ def test_an_error_is_not_lost() -> None:
         raise ValueError("no optimum")
 
     with pytest.raises(ValueError, match="no optimum"):
-        settled(begin_window(STATE, fails))
+        merge_pending_window(begin_window(STATE, fails))

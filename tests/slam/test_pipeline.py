@@ -30,12 +30,12 @@ from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.global_shape import padded_count, padded_edges, shape_for
 from vggtgeo.slam.global_map.loops import close_loops
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import updated
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.factors import FREE_LENGTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.sliding_window import solve_jit, window_problem
@@ -45,7 +45,7 @@ SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.
 SETTINGS = SlamSettings(
     window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
-    refinement=RefinementSettings(global_adjustment=False),
+    refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
 
@@ -57,7 +57,7 @@ def room() -> tuple[list[Frame], Camera, object]:
 
 
 def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES, settings: SlamSettings = SETTINGS) -> Slam:
-    return settled(list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1])
+    return merge_pending_window(list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1])
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +221,7 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
 
 
 def _visited_twice(slam: Slam, motion: np.ndarray) -> Slam:
-    """The map with every keyframe once more, as of a second visit that began a piece of its own, off by `motion`."""
+    """The map with every keyframe once more, as of a second visit that began a submap of its own, off by `motion`."""
     count = len(slam.keyframes)
     again = tuple(replace(k, number=k.number + count, pose=k.pose @ rigid.invert(motion)) for k in slam.keyframes)
     pairs = tuple(replace(p, first=p.first + count, second=p.second + count) for p in slam.map.pairs)
@@ -248,7 +248,7 @@ def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
     motion[:3, 3] = 2.0, 0.5, -2.0
     count = len(tracked.keyframes)
     closed = close_loops(_visited_twice(tracked, motion), ROLES, settings)
-    assert any("straightened the map" in note for note in closed.notes), closed.notes
+    assert any("corrected the drift" in note for note in closed.notes), closed.notes
     assert sum(pair.first < count <= pair.second for pair in closed.map.pairs) >= 3
     for slam, bound in ((closed, 0.10), (adjust_all(closed, settings), 0.005)):
         poses = np.array([keyframe.pose for keyframe in slam.keyframes])
@@ -398,7 +398,7 @@ def test_bad_sequences_end_with_finite_poses(room, case: int) -> None:
 
 @pytest.mark.long
 def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
-    """After a jump to a place never seen, tracking is reported lost, the map goes on from a new origin, and each piece
+    """After a jump to a place never seen, tracking is reported lost, the map goes on from a new origin, and each submap
     is written to a file of its own, the one of more frames first. Oracle: which frames are of which place.
     """
     frames, camera, _ = room
@@ -408,21 +408,21 @@ def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
     assert any("tracking was lost at frame 8" in note for note in slam.notes), slam.notes
     assert len(slam.map.roots) == 2
     assert len(slam.frames) == 22
-    (tmp_path / "trajectory-5.txt").write_text("of a piece that was joined since")
+    (tmp_path / "trajectory-5.txt").write_text("of a submap that was joined since")
     write_trajectories(tmp_path, slam)
     told = list_submaps(slam)
-    assert [piece["trajectory"] for piece in told] == ["trajectory.txt", "trajectory-2.txt"]
+    assert [submap["trajectory"] for submap in told] == ["trajectory.txt", "trajectory-2.txt"]
     assert sorted(file.name for file in tmp_path.glob("traj*")) == ["trajectory-2.txt", "trajectory.txt"]
-    times = [Trajectory.load_tum(tmp_path / piece["trajectory"]).timestamps for piece in told]
+    times = [Trajectory.load_tum(tmp_path / submap["trajectory"]).timestamps for submap in told]
     assert times[0].min() > 0.75, "the jump's place has more frames"
     np.testing.assert_allclose(times[1], np.arange(8) / 10)
-    assert [piece["poses"] for piece in told] == [len(own) for own in times]
+    assert [submap["poses"] for submap in told] == [len(own) for own in times]
     assert told[1]["frames"] == [0, 7]
 
 
 @pytest.mark.long
-def test_back_from_a_jump_the_window_is_of_one_piece(room) -> None:
-    """Back where the map began after a jump that began a piece of its own: keyframes of that piece, whose place is a
+def test_back_from_a_jump_the_window_is_of_one_submap(room) -> None:
+    """Back where the map began after a jump that began a submap of its own: keyframes of that submap, whose place is a
     guess, are not matched with those of the first, which lines alone would tie to it.
     """
     frames, camera, _ = room
@@ -433,7 +433,7 @@ def test_back_from_a_jump_the_window_is_of_one_piece(room) -> None:
     assert len(slam.map.roots) == 2, slam.notes
     assert any("found again" in note for note in slam.notes), slam.notes
     assert slam.keyframes[-1].frame > 22, "a keyframe was made after the return"
-    assert len(set(piece_of(slam.map)[list(slam.window.members)])) == 1
+    assert len(set(submap_of(slam.map)[list(slam.window.members)])) == 1
     jumped = {keyframe.number for keyframe in slam.keyframes if 8 <= keyframe.frame < 22}
     assert not [pair.key for pair in slam.map.pairs if len(jumped & set(pair.key)) == 1]
 

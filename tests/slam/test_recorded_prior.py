@@ -19,13 +19,13 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.sparse_map.units import longer, scaled_factor, scaled_keyframe
@@ -37,7 +37,7 @@ SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
 SETTINGS = SlamSettings(
     window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
-    refinement=RefinementSettings(global_adjustment=False),
+    refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
 DARK = range(16, 26)
@@ -64,7 +64,7 @@ def _run(walk: Walk, roles: Roles) -> Slam:
     frames, camera, _ = walk
     if not roles.metric:
         frames = [replace(frame, depth=None) for frame in frames]
-    return settled(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
+    return merge_pending_window(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
 
 
 def _disturbed(truth: Trajectory, drift: float = 0.02, scale: float = 1.05) -> Trajectory:
@@ -202,7 +202,7 @@ def test_submaps_are_joined_in_the_unit_of_the_recording(walk: Walk) -> None:
     )
     recorded = RecordedPoses(_disturbed(beyond, drift=0.0))
     joined = with_recorded_ties(slam, replace(ROLES, depth=NoDepth(), recorded=recorded))
-    assert piece_of(joined.map).max() == 0
+    assert submap_of(joined.map).max() == 0
     assert joined.map.roots == (0,)
     error = evaluate_trajectory(frame_trajectory(joined), recorded.trajectory)
     assert error.se3.statistics.rmse < 0.03, error.se3.statistics.rmse
@@ -219,14 +219,14 @@ def test_another_recording_is_contradicted(walk: Walk) -> None:
 
 
 def test_black_frames_are_bridged(walk: Walk) -> None:
-    """The camera turns in the dark, and the map stays in one piece; without recorded poses it falls apart. Oracle: the
+    """The camera turns in the dark, and the map stays in one submap; without recorded poses it falls apart. Oracle: the
     renderer's poses.
     """
     truth = walk[2]
     torn = _run(walk, ROLES)
     assert not all(record.tracked for record in torn.frames)
     slam = _run(walk, replace(ROLES, recorded=RecordedPoses(_disturbed(truth))))
-    assert piece_of(slam.map).max() == 0
+    assert submap_of(slam.map).max() == 0
     assert all(record.tracked for record in slam.frames)
     assert evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse < 0.03
     assert prior_summary(slam, replace(ROLES, recorded=RecordedPoses(_disturbed(truth))))["pose_prior"]["used"]
@@ -237,8 +237,8 @@ def test_black_frames_are_bridged_without_depth(walk: Walk) -> None:
     """The same where nothing but the recording tells the scale behind the dark."""
     truth = walk[2]
     roles = replace(ROLES, depth=NoDepth(), recorded=RecordedPoses(_disturbed(truth)))
-    slam = finish(_run(walk, roles), roles, replace(SETTINGS, refinement=RefinementSettings(rolling_shutter=False)))
-    assert piece_of(slam.map).max() == 0
+    slam = finish(_run(walk, roles), roles, replace(SETTINGS, refinement=GlobalMapSettings(rolling_shutter=False)))
+    assert submap_of(slam.map).max() == 0
     assert evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse < 0.04
 
 

@@ -22,7 +22,7 @@ from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.slam import self_calibration
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
@@ -156,7 +156,7 @@ def test_windows_hold_a_found_camera() -> None:
         first = begin(guess, ROLES)
         first = replace(first, camera=replace(first.camera, self_calibrated=camera_found))
         *_, slam = run_frames(iter(recorded_run().frames), guess, ROLES, SETTINGS, Clock(), first)
-        ends.append(settled(slam).intrinsics)
+        ends.append(merge_pending_window(slam).intrinsics)
     held, free = ends
     assert held == pytest.approx(wrong, abs=0.1)
     assert np.abs(free - wrong).max() > 1.0

@@ -26,14 +26,14 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRotation
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import STATE, load_state, save_state
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.tracker import SeenPoints, Waiting
+from vggtgeo.slam.tracking.tracker import SeenPoints, UnplacedFrame
 from vggtgeo.slam.window.window import WindowPrior
 
 MIDDLE = 4
@@ -52,9 +52,9 @@ def full(slam: Slam) -> Slam:
     """The state with something in every field that a good run leaves empty."""
     frame = recorded_run().frames[MIDDLE]
     newest = slam.keyframes[-1]
-    waiting = Waiting(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
+    waiting = UnplacedFrame(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
     compressed = (slam.keyframes[0].compressed(), *slam.keyframes[1:])
-    slam = settled(slam)
+    slam = merge_pending_window(slam)
     assert slam.window.solved is not None
     adjustment, state = slam.window.solved
     one = jnp.ones(1)
@@ -105,7 +105,7 @@ def test_the_walk_sees_a_difference() -> None:
     """The oracle of the test above finds one bit, an order in memory, a kind and a length; so a lost field would be
     seen.
     """
-    slam = settled(recorded_run().states[MIDDLE])
+    slam = merge_pending_window(recorded_run().states[MIDDLE])
     pose = slam.keyframes[0].pose
     off = pose.copy()
     off[0, 3] = np.nextafter(off[0, 3], 1)
@@ -130,7 +130,7 @@ def test_the_run_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     loaded = load_state(tmp_path / "state.npz")
     rest = iter(run.frames[MIDDLE + 1 :])
     again = list(run_frames(rest, run.sequence.camera, ROLES, SETTINGS, Clock(), loaded))
-    again[-1] = settled(again[-1])
+    again[-1] = merge_pending_window(again[-1])
     assert loaded.pending is not None  # a window was being adjusted when the state was saved
     assert len(again[-1].keyframes) > len(loaded.keyframes)
     for one, other in zip(run.states[MIDDLE + 1 :], again, strict=True):
@@ -334,7 +334,7 @@ def test_a_damaged_image_of_a_keyframe_is_told(tmp_path: Path) -> None:
     """Bytes that are no image, or one of another kind, are an error when the file is read. Oracle: the file, the image
     and the keyframe that it names.
     """
-    slam = settled(recorded_run().slam)
+    slam = merge_pending_window(recorded_run().slam)
     small = slam.keyframes[0].compressed()
     for name, wrong in (
         ("colour", {"data": b""}),

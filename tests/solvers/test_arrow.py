@@ -12,9 +12,9 @@ from vggtgeo.solvers.arrow import (
     back_substitute,
     carry_to_nodes,
     dense_gradient,
+    dense_schur_complement,
     inverse_landmark_hessian,
     multiply,
-    reduce,
 )
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
@@ -60,7 +60,7 @@ def test_multiply_is_the_dense_product(pair: tuple[ArrowSystem, Dense]) -> None:
 def test_reduce_is_the_dense_schur_complement(pair: tuple[ArrowSystem, Dense]) -> None:
     # Proves the reduced matrix and right-hand side. Oracle: block elimination by numpy on the dense matrix.
     system, dense = pair
-    reduced, size = jax.jit(reduce)(system), len(system.free)
+    reduced, size = jax.jit(dense_schur_complement)(system), len(system.free)
     coupling, hessian = dense.matrix[:size, size:], np.diag(dense.matrix[size:, size:])
     inverse = np.divide(1, hessian, out=np.zeros_like(hessian), where=hessian != 0)
     scale = np.abs(dense.matrix).max()
@@ -126,7 +126,7 @@ def test_a_flat_gauge_is_held() -> None:
     size = len(system.free)
     direction = np.zeros(size)
     direction[[2, 3]] = [0.6, 0.8]
-    reduced, off = reduce(system), np.eye(size) - np.outer(direction, direction)
+    reduced, off = dense_schur_complement(system), np.eye(size) - np.outer(direction, direction)
     matrix, rhs = reduced.hessian - reduced.schur, reduced.schur_gradient - reduced.gradient
     flat_system = eqx.tree_at(
         lambda s: (s.prior_hessian, s.prior_gradient, s.gauge),
@@ -196,6 +196,6 @@ def test_groups_as_sparse_blocks(grouped: tuple[ArrowSystem, Dense]) -> None:
     # Proves the blocks of the weakest directions. Oracle: the dense Schur complement.
     system, _ = grouped
     found = sparse_matrix(reduced_blocks(system, sparse_layout(system)), sparse_layout(system)).toarray()
-    reduced = jax.jit(reduce)(system)
+    reduced = jax.jit(dense_schur_complement)(system)
     expected = np.asarray(reduced.hessian - reduced.schur)
     np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())

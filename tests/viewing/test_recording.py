@@ -180,7 +180,7 @@ def test_points_without_depth_are_logged_again_when_they_left_the_window(run: Re
 
 def test_loops_and_lost_frames_are_shown(run: RecordedRun, tmp_path: Path) -> None:
     """A map without a loop gets one, and frames that had a pose lose it: each is drawn from then on, between the places
-    by hand; a piece that nothing joins has a path of its own and no line to it. Oracle: the poses.
+    by hand; a submap that nothing joins has a path of its own and no line to it. Oracle: the poses.
     """
     slam = replace(run.slam, map=replace(run.slam.map, factors=(), pairs=()))
     first, second = slam.keyframes[0], slam.keyframes[2]

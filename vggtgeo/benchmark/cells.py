@@ -175,7 +175,7 @@ def cell_of(rows: Sequence[Row], column: Column) -> Cell:
 
 
 def _text_or_ending(rows: Sequence[Row], column: Column) -> str:
-    """The text of a cell; without any number, how the runs failed."""
+    """Return the text of a cell; without any number, how the runs failed."""
     lost = [row for row in rows if row["status"] != "ok" or row.get("verdict") == "failed"]
     text = text_of(rows, column)
     return f"{text}{at_coverage(rows)}" if text and text != FREE else text or verdicts(lost)
@@ -248,7 +248,7 @@ def _placed_alone(numbers: Sequence[float], column: Column, medians: Sequence[st
 
 
 def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """Sequences on which every setting that is ranked at all is ranked."""
+    """Return the sequences on which every setting that is ranked at all is ranked."""
     names = sequences_of(suite, rows)
     groups = [[select(rows, name, setting) for name in names] for setting in settings_of(suite, rows)]
     ranks = [[is_ranked(own, column) for own in line] for line in groups]

@@ -36,7 +36,10 @@ MIN_POSES = 3
 
 
 def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
-    """The error of each setting (logarithmic), a panel a sequence: a dot a run, a bar at the mean, its interval."""
+    """Draw the error of each setting (logarithmic), a panel a sequence.
+
+    A dot is a run, a bar the mean with its interval.
+    """
     good = [row for row in rows if row["status"] == "ok"]
     column = headline(good)
     panels = {
@@ -61,22 +64,22 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
 
 
 def _part(rows: Sequence[Row]) -> str:
-    """The coverage where it is too small for a comparison."""
+    """Return the coverage as text if it is too small for a comparison."""
     return "" if cells.is_covered(rows) else cells.at_coverage(rows)
 
 
 def _wrapped(text: str, width: int, most: int = 3) -> str:
-    """In lines of at most `width` letters, at most `most` of them."""
+    """Wrap into at most `most` lines of at most `width` letters."""
     return "\n".join(wrap(text.replace("`", ""), width, max_lines=most, placeholder=" ..."))
 
 
 def _height(labels: Sequence[str]) -> float:
-    """Inches of as many rows, all as high as the one whose label has most lines."""
+    """Return the height of as many rows, inches; all are as high as the one whose label has most lines."""
     return (_ROW + _LINE * max((label.count("\n") for label in labels), default=0)) * len(labels)
 
 
 def headline(rows: Sequence[Row]) -> cells.Column:
-    """The error that is drawn: after SE(3) where every run is metric, else after Sim(3)."""
+    """Return the error to draw: after SE(3) if every run is metric, else after Sim(3)."""
     metric = all(row.get("metric") is not False and not row.get("external") for row in rows)
     return cells.SE3 if metric else cells.SIM3
 
@@ -124,7 +127,7 @@ class Path3:
 
 
 def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[Path3]:
-    """The first run of each setting on a sequence that left a trajectory that can be aligned with the truth."""
+    """Return the first run of each setting on a sequence with a trajectory that can be aligned with the truth."""
     found = []
     for setting in cells.settings_of(suite, rows):
         drawn = (_path(suite, row, folder) for row in select(rows, sequence, setting))
@@ -133,7 +136,7 @@ def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> lis
 
 
 def _path(suite: Suite, row: Row, folder: Path) -> Path3 | None:
-    """That of a run; None where it left none, or where too few of its poses have a truth to be aligned."""
+    """Return the trajectory of a run; None if it has none, or too few of its poses have a truth to be aligned."""
     place = folder / "runs" / f"{row['sequence']}.{row['setting']}.{row['seed']}"
     title = suite.title_of(str(row["setting"])).replace("`", "")
     try:
@@ -152,7 +155,7 @@ def _truth_file(place: Path, folder: Path, sequence: str, seed: object) -> Path:
 
 
 def paths_figure(given: Sequence[Path3], width: float = 5.0) -> NotebookFigure:
-    """The paths from above, with the truth; and the error along the time."""
+    """Draw the paths from above, with the truth, and the error along the time."""
     figure = NotebookFigure(figsize=(width, 1.25 * width), layout="constrained")
     FigureCanvasAgg(figure)
     above, along = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
@@ -180,7 +183,7 @@ _STAGES_LEFT_OUT = frozenset({"seconds_all", "seconds_wall", "seconds_process"})
 
 
 def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
-    """Seconds of each stage, and the peak memory, means over runs; a row a sequence and setting."""
+    """Draw the seconds of each stage, and the peak memory, means over runs; a row a sequence and setting."""
     groups = [
         (_wrapped(f"{sequence}, {suite.title_of(setting)}", _LABEL), own)
         for sequence in cells.sequences_of(suite, rows)

@@ -131,7 +131,7 @@ def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
 
 
 def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> RenderedWalk:
-    """The walk of a suite's table `simulate`, from the scratch folder or rendered (a quarter of a second per frame)."""
+    """Return the walk of a suite's table `simulate`, from the scratch folder or rendered (0.25 s a frame)."""
     kept = None if scratch is None else scratch / walk_name(table, seed)
     if kept is not None and kept.is_file():
         with kept.open("rb") as stream:
@@ -174,7 +174,7 @@ class RenderedWalk:
         return len(self.rendered)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """The frames at positions start, start + stride, ... below end."""
+        """Yield the frames at positions start, start + stride, ... below end."""
         check_selection(self.name, len(self), start, end, stride)
         yield from self.rendered[start:end:stride]
 
@@ -201,7 +201,7 @@ class DegradedWalk:
         return len(self.recording.frames)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """The frames at positions start, start + stride, ... below end."""
+        """Yield the frames at positions start, start + stride, ... below end."""
         check_selection(self.name, len(self), start, end, stride)
         yield from self.recording.frames[start:end:stride]
 
@@ -236,7 +236,7 @@ def _start(name: str, vggt: SimulatedVggt) -> InitialGeometry:
 
 
 def _without(sequence: Sequence, spec: Mapping[str, Any]) -> Sequence:
-    """The sequence without the depth or the calibration that the spec hides."""
+    """Return the sequence without the depth or the calibration that the spec hides."""
     if spec["rgb_only"]:
         sequence = without_depth(sequence)
     if not spec["calibrated"]:
@@ -269,11 +269,11 @@ class ExactFrames(Protocol):
     def __len__(self) -> int: ...
 
     def depth(self, index: int) -> np.ndarray:
-        """True depth float64 [H, W], metres, NaN = unknown."""
+        """Return the true depth, float64 [H, W], metres, NaN = unknown."""
         ...
 
     def pose(self, index: int) -> np.ndarray:
-        """True pose, world -> camera, float64 [4, 4]; NaN if unknown."""
+        """Return the true pose, world -> camera, float64 [4, 4]; NaN if unknown."""
         ...
 
 
@@ -305,14 +305,14 @@ class RecordedFrames:
         return len(self.sequence)
 
     def depth(self, index: int) -> np.ndarray:
-        """Depth of the file; all NaN if it cannot be read."""
+        """Return the depth of the file; all NaN if it cannot be read."""
         frame = next(self.sequence.frames(index, index + 1), None)
         if frame is None or frame.depth is None:
             return np.full((self.camera.height, self.camera.width), np.nan)
         return frame.depth.astype(np.float64)
 
     def pose(self, index: int) -> np.ndarray:
-        """Ground truth at the time of the frame."""
+        """Return the ground truth at the time of the frame."""
         frame = next(self.sequence.frames(index, index + 1), None)
         times = np.array([] if frame is None else [frame.timestamp])
         _, rows = nearest_in_time(times, self.truth.timestamps, _DELAY)

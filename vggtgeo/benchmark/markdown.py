@@ -111,7 +111,7 @@ _NAMES = ("sequence", "setting", "runs")
 
 
 def _poses(runs: Sequence[tuple[Sequence[str], Sequence[Row]]], references: Sequence[cells.Column]) -> str:
-    """The table of the poses, with the verdicts."""
+    """Return the table of the poses, with the verdicts."""
     shown = cells.measured([own for _, own in runs], (*cells.GROUPS["Poses"], *references))
     lines = [
         [*names, cells.tracked(own), *(_marked(cells.cell_of(own, column)) for column in shown), cells.verdicts(own)]

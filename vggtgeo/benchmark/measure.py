@@ -149,7 +149,7 @@ def _relative(report: TrajectoryReport, name: str, metric: bool) -> dict[str, An
 
 
 def _plain(value: Any) -> Any:
-    """As a JSON type; None for NaN."""
+    """Convert to a JSON type; None for NaN."""
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -74,7 +74,7 @@ def _sequence(suite: Suite, rows: Sequence[Row], name: str, folder: Path) -> dic
 
 
 def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> list[dict[str, Any]]:
-    """A table for each group of numbers; the one of the poses has the number of runs and the verdicts."""
+    """Return a table for each group of numbers; the one of the poses has the number of runs and the verdicts."""
     settings = cells.settings_of(suite, select(cells.finished(rows), sequence))
     groups = [select(rows, sequence, setting) for setting in settings]
     tables = []

@@ -236,7 +236,7 @@ def subtract_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row
 
 
 def _pose_differences(row: Row, base: Row, runs: Path) -> dict[str, Any]:
-    """Differences of the pose errors; empty if a trajectory is missing."""
+    """Return the differences of the pose errors; empty if a trajectory is missing."""
     truth = _place(base, runs) / "truth.txt"
     files = _estimate(row, runs), _estimate(base, runs)
     if not all(file.is_file() for file in (truth, *files)):

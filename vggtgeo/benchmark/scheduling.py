@@ -128,7 +128,7 @@ def _last_line(log: bytes) -> str:
 
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
-    """A temporary folder in that of the batch; the one of a killed batch is removed first."""
+    """Make a temporary folder in that of the batch; the one of a killed batch is removed first."""
     place = folder / ".scratch"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(mode=0o700, parents=True)  # rendered walks are pickles: no other user may write them

@@ -28,7 +28,7 @@ from vggtgeo.slam.settings.table import Tables, updated
 
 
 def _of(*kinds: type) -> Callable[[Any], bool]:
-    """Exact type check: in Python, `isinstance(True, int)`."""
+    """Check the exact type: in Python, `isinstance(True, int)`."""
     return lambda value: type(value) in kinds
 
 

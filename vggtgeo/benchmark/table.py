@@ -68,7 +68,7 @@ def number(row: Row, column: str) -> float:
 
 
 def _same_type(column: list[Any]) -> list[Any]:
-    """The values converted to one type: to float if any is a float, else to text if types differ."""
+    """Convert the values to one type: to float if any is a float, else to text if types differ."""
     if any(isinstance(value, float) for value in column):
         return [float(value) if isinstance(value, int | float) else None for value in column]
     kinds = {type(value) for value in column if value is not None}

@@ -137,7 +137,7 @@ def end_with_parent(parent: int, seconds: float = 1.0) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Entry point: `python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT`; PARENT is a process id."""
+    """Run `python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT`; PARENT is a process id."""
     folder, scratch, parent = arguments
     end_with_parent(int(parent))
     try:
@@ -151,7 +151,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _is_full(error: BaseException) -> bool:
-    """Whether a full disk is the cause of an error."""
+    """Return whether a full disk is the cause of an error."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return True
     return error.__context__ is not None and _is_full(error.__context__)

@@ -117,7 +117,7 @@ def linearise(
     if not joined:
         return system
     # Before the change of basis: the bound is on the inverse depths themselves.
-    system = replace(system, held=_held(problem, state, system.cross[:, -2, num_offsets(state) :]))
+    system = replace(system, held=_landmarks_at_bound(problem, state, system.cross[:, -2, num_offsets(state) :]))
     return join_landmarks(system, None if problem.fraction is None else jax.lax.stop_gradient(problem.fraction))
 
 
@@ -149,7 +149,7 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
             found = term.gradient(seen)
             local += found.shared
             by_unknown = [part[None] for part in (*([] if found.pixel is None else found.pixel), found.depth)]
-            for start, part in _places(term, seen, by_unknown, sizes):
+            for start, part in _columns_at_landmarks(term, seen, by_unknown, sizes):
                 own = own.at[start : start + part.shape[1]].add(part[0])
         return local, own
 
@@ -240,7 +240,7 @@ def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[in
     size = seen[0][1].size
     # The product of all columns: a slice of the shared coordinates would be copied first.
     gram = sum((columns @ columns.T)[: size + 1, : size + 1] for columns in parts)
-    return gram, *_placed(seen, coupled, blocks, sizes)
+    return gram, *_cross_terms_and_pixel_blocks(seen, coupled, blocks, sizes)
 
 
 def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
@@ -254,25 +254,29 @@ def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, in
         own = [] if model.pixels is None else [model.pixels.coupled[:, 0], model.pixels.coupled[:, 1]]
         coupled.append([*own, model.coupled])
         blocks.append(None if model.pixels is None else model.pixels.blocks)
-    return gram, *_placed(seen, coupled, blocks, sizes)
+    return gram, *_cross_terms_and_pixel_blocks(seen, coupled, blocks, sizes)
 
 
-def _placed(
+def _cross_terms_and_pixel_blocks(
     seen: Seen, coupled: list[list[Array]], blocks: list[Array | None], sizes: tuple[int, int]
 ) -> tuple[Columns, Array | None]:
-    """Return the terms' cross terms and blocks at their landmarks, added up."""
-    parts = [part for (term, view), own in zip(seen, coupled, strict=True) for part in _places(term, view, own, sizes)]
+    """Return the cross terms of all terms at their landmarks, and the blocks of free pixels, added up."""
+    parts = [
+        part
+        for (term, view), own in zip(seen, coupled, strict=True)
+        for part in _columns_at_landmarks(term, view, own, sizes)
+    ]
     pixels = [
         (term.first_slot, own[:, : view.free_pixels])
         for (term, view), own in zip(seen, blocks, strict=True)
         if own is not None
     ]
     free, slots = sizes
-    joint = jnp.concatenate([part for _, part in _joined(pixels, free)], 1) if pixels else None
-    return _joined(parts, 2 * free + slots), joint
+    joint = jnp.concatenate([part for _, part in _merge_columns(pixels, free)], 1) if pixels else None
+    return _merge_columns(parts, 2 * free + slots), joint
 
 
-def _places(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tuple[int, int]) -> Columns:
+def _columns_at_landmarks(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tuple[int, int]) -> Columns:
     """Return the columns of a term by `u`, `v` (if free) and inverse depth, with their landmark positions."""
     free, points = view.free_pixels, sizes[0]
     *pixels, depth = by_unknown
@@ -280,7 +284,7 @@ def _places(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tupl
     return [*by_pixel, (2 * points + term.first_slot, depth)]
 
 
-def _joined(parts: Columns, size: int) -> Columns:
+def _merge_columns(parts: Columns, size: int) -> Columns:
     """Merge blocks of columns to blocks that cover all `size` columns once, each with its first column."""
     ends = [start + part.shape[1] for start, part in parts]
     if [0, *ends] == [*(start for start, _ in parts), size]:
@@ -318,7 +322,7 @@ def _pixel_terms(
     return blocks, gradient
 
 
-def _held(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool[Array, "h t"] | None:
+def _landmarks_at_bound(problem: Problem, state: State, gradient: Float[Array, "h s"]) -> Bool[Array, "h t"] | None:
     """Return the landmarks at an active bound; segments are bounded as a whole and never marked."""
     if not problem.positive_depth:
         return None

@@ -38,7 +38,7 @@ from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.io.kept_program import KeptProgram
-from vggtgeo.solvers.arrow import reduce
+from vggtgeo.solvers.arrow import dense_schur_complement
 from vggtgeo.solvers.finite import is_finite, unless
 
 _MAX_KEYFRAMES = 1000
@@ -165,7 +165,7 @@ def _quadratic(problem: Problem, point: State, leaving: Int[Array, ""] | int) ->
     """Return Hessian and gradient of the leaving terms with landmarks eliminated, and whether they are finite."""
     leaving_terms = tuple(_leaving(term, problem, leaving) for term in problem.terms)
     system = linearise(prepared(problem.with_terms(leaving_terms)), point)
-    reduced = reduce(system)
+    reduced = dense_schur_complement(system)
     return reduced.hessian - reduced.schur, reduced.gradient - reduced.schur_gradient, is_finite(system)
 
 

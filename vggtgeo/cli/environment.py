@@ -45,7 +45,7 @@ def check_address_space(command: str) -> None:
 
 
 def _limit_gb() -> float | None:
-    """The limit, None if there is none."""
+    """Return the limit; None if there is none."""
     if sys.platform == "win32":
         return None
     import resource

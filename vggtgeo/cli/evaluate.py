@@ -163,7 +163,7 @@ def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
 
 
 def _in_metres(file: Path) -> bool | None:
-    """Whether the poses of a file are in metres: by a run's summary, or by the file name of a benchmark."""
+    """Return whether the poses of a file are in metres: by a run's summary, or by a benchmark's file name."""
     scale = load_scale(file)
     if scale is not None:
         return scale.startswith("metric")

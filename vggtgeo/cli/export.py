@@ -36,6 +36,6 @@ def export(
 
 
 def _in_words(name: str, value: float) -> str:
-    """`3 images`, `0.42 px mean reprojection error over points`."""
+    """Return text as `3 images`, `0.42 px mean reprojection error over points`."""
     unit = " px" if name.endswith("_px") else ""
     return f"{value:.6g}{unit} {name.removesuffix('_px').replace('_', ' ')}"

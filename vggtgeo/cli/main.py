@@ -195,17 +195,17 @@ def load_command(entry: CommandEntry) -> Any:
 
 
 def _examples(calls: tuple[str, ...]) -> str | None:
-    """Text for the end of a help page; blank lines keep typer from joining the lines."""
+    """Return text for the end of a help page; blank lines keep typer from joining the lines."""
     return "\n\n".join(("Examples:", *(f"  {call}" for call in calls))) if calls else None
 
 
 def _is_call_for_help(error: BaseException) -> bool:
-    """Whether typer shows the help page because arguments are missing."""
+    """Return whether typer shows the help page because arguments are missing."""
     return type(error).__name__ == "NoArgsIsHelpError"
 
 
 def _is_usage_error(error: BaseException) -> bool:
-    """Whether the command line is invalid, for example by an unknown option."""
+    """Return whether the command line is invalid, for example by an unknown option."""
     return callable(getattr(error, "format_message", None)) and not _is_call_for_help(error)
 
 
@@ -230,7 +230,7 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
-    """Whether memory or threads ran out: NumPy, Python, JAX and the dynamic loader have different errors for it."""
+    """Return whether memory or threads ran out: NumPy, Python, JAX and the loader raise different errors."""
     words = ("RESOURCE_EXHAUSTED", "can't start new thread")
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error) or "cannot allocate memory" in str(error).lower()
@@ -238,7 +238,7 @@ def _is_short_of_memory(error: BaseException) -> bool:
 
 
 def _usage_message(error: Any, command: str) -> str:
-    """The error in the command line, and a hint to the help of the command."""
+    """Return the error in the command line, and a hint to the help of the command."""
     message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
     command = error.ctx.command_path if error.ctx is not None else command
     file = _settings_file(error)
@@ -246,7 +246,7 @@ def _usage_message(error: Any, command: str) -> str:
 
 
 def _settings_file(error: Any) -> Path | None:
-    """The settings file of the invalid value; None if it was given as a flag."""
+    """Return the settings file of the invalid value; None if it was given as a flag."""
     if error.ctx is None or getattr(error, "param", None) is None:
         return None
     source = error.ctx.get_parameter_source(error.param.name)
@@ -263,7 +263,7 @@ def _version(asked: bool) -> bool:
 
 
 def _stand_in() -> None:
-    """Never called: `_LazyGroup` replaces it by the command."""
+    """Stand in for the command, which `_LazyGroup` puts in its place; never called."""
 
 
 def make_app() -> typer.Typer:
@@ -291,7 +291,7 @@ def make_app() -> typer.Typer:
 
 
 def main() -> None:
-    """Entry point of the program."""
+    """Run the program."""
     gc.set_threshold(GC_THRESHOLD)
     set_jax_flags()
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; an unknown backend in the environment would end a run

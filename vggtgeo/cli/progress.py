@@ -78,7 +78,7 @@ class ProgressBar(Callback):
             self._print(name)
 
     def _is_due(self, done: int) -> bool:
-        """Whether it is time for a log line."""
+        """Return whether it is time for a log line."""
         now, part = time.perf_counter(), PARTS * done // self._total if self._total else self._part
         pause = now - self._last_line
         due = pause >= MAX_PAUSE or (pause >= MIN_PAUSE and part > self._part)

@@ -150,7 +150,7 @@ def _save_map(result: Result, file: Path | None) -> str:
 
 
 def _reopen(sequence: Sequence, roles: Roles | Perception, settings: SlamSettings) -> Sequence | None:
-    """The frames as the run read them, with depth if the run used the sensor's; None for a stream."""
+    """Reopen the frames as the run read them, with depth if the run used the sensor's; None for a stream."""
     if not len(sequence):
         return None
     own = roles.roles if isinstance(roles, Perception) else roles
@@ -179,7 +179,7 @@ class _EarlyFiles(Callback):
 def _rerun_callbacks(
     output: Output, folder: RunFolder, name: str, window: int
 ) -> tuple[tuple[RerunCallback, ...], str | None]:
-    """The callback that logs the run, if any, and the URL of a served recording.
+    """Return the callback that logs the run, if any, and the URL of a served recording.
 
     A recording in the run's own folder is written to its stage.
     """

@@ -104,7 +104,7 @@ def _validated(
     names: dict[str, str],
     types: dict[str, Any],
 ) -> dict[str, Any]:
-    """The values by parameter name."""
+    """Return the values by parameter name."""
     for key, value in given.items():
         if key not in names:
             near = difflib.get_close_matches(key, names, 1, 0.0)[0]
@@ -116,7 +116,7 @@ def _validated(
 
 
 def _short(value: Any) -> str:
-    """A value as text, truncated if long."""
+    """Return a value as text, truncated if long."""
     text = repr(value)
     return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]} ..."
 
@@ -135,7 +135,7 @@ def _positive(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]
 
 
 def _keys(context: Any, negated: bool = False) -> dict[str, str]:
-    """Parameter name of each key (of each switch's opposite if `negated`), in the order of the help."""
+    """Return the parameter name of each key (of each switch's opposite if `negated`), in the order of the help."""
     keys = {}
     for parameter in context.command.params:
         if parameter.name is not None and parameter.name not in _NOT_SETTINGS:
@@ -146,6 +146,6 @@ def _keys(context: Any, negated: bool = False) -> dict[str, str]:
 
 
 def _types(context: Any) -> dict[str, Any]:
-    """The annotated type of each parameter, without `| None`."""
+    """Return the annotated type of each parameter, without `| None`."""
     hints = typing.get_type_hints(context.command.callback)
     return {name: next((t for t in typing.get_args(hint) if t in _KINDS), hint) for name, hint in hints.items()}

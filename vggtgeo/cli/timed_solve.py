@@ -102,6 +102,6 @@ def timed_solve(problem: Problem, start: State, max_steps: int, repeat: int) -> 
 
 
 def _widen(state: State) -> State:
-    """The state in float64, with normalised quaternions."""
+    """Return the state in float64, with normalised quaternions."""
     wide: State = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), state)
     return replace(wide, poses=wide.poses.normalize())

@@ -135,7 +135,7 @@ def _depth_pixels(session: Session, image: np.ndarray) -> int | None:
 
 
 def _contract_name(file: Path, asked: str | None) -> str:
-    """The contract of the requested network, else of the file's metadata, else the one that its signature matches."""
+    """Return the contract of the requested network, else by the file's metadata, else by its signature."""
     if asked is not None:
         if asked not in NETWORKS:
             raise InputError(f"`--network` must be one of {', '.join(NETWORKS)}, got {asked!r}")

@@ -61,7 +61,10 @@ def _best(ranks: Mapping[str, tuple[int, ...]]) -> str:
 
 
 def _is_depth(name: str, message: Any) -> bool:
-    """By its encoding; 16 bits of grey (mono16), which old drivers gave depth, too, by the name of the topic."""
+    """Return whether a topic is depth: by its encoding; 16 bits of grey (mono16) by the name of the topic.
+
+    Old drivers gave depth as mono16.
+    """
     if message is None or isinstance(message, Unread) or _INFRARED.search(name):
         return False
     if not hasattr(message, "encoding") and "compresseddepth" in f"{name} {message.format}".lower():
@@ -75,7 +78,10 @@ def _rank_of_depth(name: str) -> tuple[int]:
 
 
 def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:
-    """None for a message that is no image in colour or grey. Last: infrared, then depth in false colours, then grey."""
+    """Rank a message by its image; None without an image in colour or grey.
+
+    Last are infrared, then depth in false colours, then grey.
+    """
     if message is None or isinstance(message, Unread):
         return None
     encoding = encoding_of(message)
@@ -85,7 +91,7 @@ def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:
 
 
 def described_choice(chosen: Chosen, poses: str) -> str:
-    """What was chosen, as a sentence; empty where there was no choice. poses: the topic of the truth, "" for none."""
+    """Describe what was chosen; empty if there was no choice. poses: the topic of the truth, "" for none."""
     if not chosen.others:
         return ""
     depth = f", depth of `{chosen.depth}`" if chosen.depth else ", no depth"

@@ -67,7 +67,7 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
 
 
 def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
-    """Messages about listed files that are missing, and the sequence without them."""
+    """Return messages about listed files that are missing, and the sequence without them."""
     if not isinstance(sequence, FolderSequence):
         return [], sequence
     images = [file.image for file in sequence.files if not sequence.holds(file.image)]
@@ -93,7 +93,7 @@ def _sample(sequence: Sequence) -> list[Frame]:
 
 
 def _texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:
-    """Warnings without notes, which report what was done as intended."""
+    """Return the warnings without notes, which report what was done as intended."""
     problems = (one for one in caught if issubclass(one.category, InputWarning))
     return [str(one.message) for one in problems if not issubclass(one.category, NoteWarning)]
 

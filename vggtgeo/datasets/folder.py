@@ -119,11 +119,12 @@ class FolderSequence:
     def load_depth(self, path: Path) -> np.ndarray:
         """Return the depth in a file, float32 [H, W], metres, NaN for none, in the colour camera."""
         depth = read_depth(path, self.depth_format)
-        return self.enlarged(depth) if self.depth_of_fewer_pixels else depth
+        return self.enlarge_depth(depth) if self.depth_of_fewer_pixels else depth
 
-    def enlarged(self, depth: np.ndarray) -> np.ndarray:
-        """Return depth of fewer pixels in the same view, float32 [height, width]: each pixel takes the nearest. Depth
-        of another aspect, or of hardly any pixels, is of another view, and is returned as it is.
+    def enlarge_depth(self, depth: np.ndarray) -> np.ndarray:
+        """Enlarge depth of fewer pixels to the images, float32 [height, width]; each pixel takes the nearest depth.
+
+        Depth of another aspect, or of hardly any pixels, is of another view, and is returned as it is.
         """
         (rows, columns), width, height = depth.shape, self.camera.width, self.camera.height
         same_view = abs(columns * height / width - rows) < max(1.0, _SAME_SHAPE * rows)
@@ -164,7 +165,7 @@ class FolderSequence:
                 continue
             if depth.shape != (self.camera.height, self.camera.width):
                 raise InputError(
-                    self._other_size(path, depth) + ": register the depth to the images, or leave it out with "
+                    self._depth_size_message(path, depth) + ": register the depth to the images, or leave it out with "
                     "--rgb-only"
                 )
             if np.isfinite(depth).any():
@@ -218,7 +219,7 @@ class FolderSequence:
         return read
 
     def _read_depth(self, file: FrameFile) -> np.ndarray | None:
-        """None if there is no depth, or, with a warning, if it cannot be used."""
+        """Read the depth of a frame; None if there is none, or, with a warning, if it cannot be used."""
         if file.depth is None:
             return None
         try:
@@ -227,11 +228,12 @@ class FolderSequence:
             _warn(f"{error}; the frame is used without depth")
             return None
         if depth.shape != (self.camera.height, self.camera.width):
-            _warn(f"{self._other_size(file.depth, depth)}; used without depth")
+            _warn(f"{self._depth_size_message(file.depth, depth)}; used without depth")
             return None
         return depth
 
-    def _other_size(self, path: Path, depth: np.ndarray) -> str:
+    def _depth_size_message(self, path: Path, depth: np.ndarray) -> str:
+        """Say that a depth image has another size than the images."""
         size = f"{self.camera.width} x {self.camera.height}"
         return f"`{path}` is {depth.shape[1]} x {depth.shape[0]} pixels; the colour images are {size}"
 

@@ -165,8 +165,9 @@ def _open_folder(place: Path, kind: str | None) -> Sequence:
 
 
 def _broken_links(folder: Path) -> str:
-    """Broken links in a folder and in those in it, as a message: a disk is missing, or a tool for large files has not
-    fetched their content.
+    """Return a message on broken links in a folder and its subfolders; empty without any.
+
+    A disk is missing, or a tool for large files has not fetched their content.
     """
     places = (folder, *(path for path in sorted(folder.iterdir()) if path.is_dir()))
     dead = [path for place in places for path in place.iterdir() if path.is_symlink() and not is_there(path)]
@@ -189,7 +190,7 @@ def _open_video(file: Path, depth: bool) -> Sequence:
 
 
 def _hint(folder: Path) -> str:
-    """Recordings in the folders of a folder, as the end of a message."""
+    """Return the recordings in the folders of a folder, as the end of a message."""
     inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
     found = [f"`{path}`" for path in inside if is_readable(path)]
     return f"; it holds {', '.join(found[:3])}" if found else ""

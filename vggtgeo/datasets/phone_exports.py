@@ -65,7 +65,7 @@ class PhoneExport(FolderSequence):
         depth = read_depth(path, self.depth_format)
         if path in self.confidence:
             remove_doubtful(depth, self.confidence[path])
-        return self.enlarged(depth)
+        return self.enlarge_depth(depth)
 
     def ground_truth(self) -> Trajectory | None:
         """Return ARKit's poses, camera -> world; the files have OpenGL's axes."""

@@ -123,7 +123,7 @@ class Record3d(FolderSequence):
     def load_depth(self, path: Path) -> np.ndarray:
         """Return the depth in a file of the archive, enlarged to the images, without that of low confidence."""
         if path.suffix == ".exr":
-            return self.enlarged(read_depth(path, self.depth_format))
+            return self.enlarge_depth(read_depth(path, self.depth_format))
         shape = self.camera.height, self.camera.width
         depth = _shaped(self._unpacked(path, 4), np.float32, path, self.depth_size[::-1], shape)
         depth = metres_of_floats(depth)
@@ -131,7 +131,7 @@ class Record3d(FolderSequence):
         if self.holds(trusted):
             trust = _shaped(self._unpacked(trusted, 1), np.uint8, trusted, depth.shape, shape)
             depth[trust < _MIN_CONFIDENCE] = np.nan
-        return self.enlarged(depth)
+        return self.enlarge_depth(depth)
 
     def ground_truth(self) -> Trajectory | None:
         """Return ARKit's poses, camera -> world, None without any; the file has OpenGL's axes."""

@@ -79,7 +79,7 @@ class DepthRegistration:
 
 
 def _covered(pixels: np.ndarray, reach: float, size: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Along one axis, the pixels that may be covered: int64 [n], and whether each is covered and inside; bool [n]."""
+    """Return the pixels that may be covered along one axis, int64 [n], and which are covered and inside, bool [n]."""
     reach = min(reach, _MAX_REACH)
     middle = np.rint(pixels).astype(np.int64)
     most = math.ceil(reach + 0.5) - 1
@@ -92,7 +92,7 @@ def _covered(pixels: np.ndarray, reach: float, size: int) -> list[tuple[np.ndarr
 
 
 def _undistorted_box(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest pixels of the camera's `pinhole` that its images show."""
+    """Return the lowest and highest pixels of the camera's `pinhole` that its images show."""
     along = np.linspace(-0.5, 0.5, _BORDER_STEPS)
     ends = np.full(_BORDER_STEPS, 0.5)
     border = np.concatenate([np.column_stack(side) for one in (ends, -ends) for side in ((along, one), (one, along))])

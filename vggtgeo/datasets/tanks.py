@@ -129,7 +129,7 @@ def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray
 
 
 def _in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Even-odd rule: a ray along the first axis crosses the boundary an odd number of times."""
+    """Apply the even-odd rule: a ray along the first axis crosses the boundary an odd number of times."""
     inside = np.zeros(len(points), bool)
     for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         spans = (ay > points[:, 1]) != (by > points[:, 1])

@@ -162,7 +162,7 @@ def _in_order(file: Path, entries: list[_Entry], frames: bool) -> list[_Entry]:
 
 
 def partners_in_time(images: list[_Entry], depths: list[_Entry]) -> list[int | None]:
-    """For each image (time, file) the row of its depth in a list in the order of time.
+    """Return for each image (time, file) the row of its depth in a list in the order of time.
 
     Pairs are made in the order of their time difference, each row once.
     """

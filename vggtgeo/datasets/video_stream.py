@@ -103,7 +103,7 @@ class VideoStream:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
     def _seconds(self) -> float:
-        """Duration of the stream as Matroska states it, else of the whole file."""
+        """Return the duration of the stream as Matroska states it, else of the whole file."""
         stated = re.fullmatch(r"(\d+):(\d+):([\d.]+)", self._stream.metadata.get("DURATION", ""))
         if stated is None:
             return (self._container.duration or 0) * 1e-6

@@ -266,8 +266,9 @@ class OffsetModel:
         return self._columns(unknowns, true, motion / seconds[:, None])
 
     def _columns(self, unknowns: Unknowns, body: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Jacobian for poses and velocities of the truth's point; the log's own Jacobian is taken as the identity, as
-        for small residuals.
+        """Return the Jacobian for poses and velocities of the truth's point.
+
+        The log's own Jacobian is taken as the identity, as for small residuals.
         """
         camera = body[:, :3, :3] @ unknowns.turn.T
         arm = body[:, :3, 3] - self._middle
@@ -288,7 +289,7 @@ class OffsetModel:
         return np.concatenate(parts)
 
     def _white(self, residuals: np.ndarray) -> Noises:
-        """White noise with the RMS of the residuals."""
+        """Return white noise with the RMS of the residuals."""
         parts = zip((residuals[:, :3], residuals[:, 3:]), self._min_sigma, strict=True)
         first, second = (DriftNoise(max(float(np.sqrt(np.mean(part**2))), sigma)) for part, sigma in parts)
         return first, second

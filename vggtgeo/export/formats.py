@@ -157,7 +157,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
 
 @contextmanager
 def _staged(output: Path) -> Iterator[Path]:
-    """A temporary folder in `output` for the files of an export; new folders that stay empty are removed as well."""
+    """Make a temporary folder in `output` for the files of an export; remove new folders that stay empty."""
     made = [folder for folder in (output, *output.parents) if not folder.exists()]
     try:
         stage = _new_stage(output)
@@ -212,7 +212,7 @@ def _check_target(output: Path, run: Path) -> None:
 
 
 def _is_recording(folder: Path) -> bool:
-    """Whether the folder has the layout of a dataset, other than plain images."""
+    """Return whether the folder has the layout of a dataset, other than plain images."""
     return any(reader.matches(folder) for name, reader in FOLDER_KINDS.items() if name != "images")
 
 
@@ -241,7 +241,7 @@ def _record(output: Path, names: list[str], ours: bool) -> None:
 
 
 def _foreign_image(output: Path, names: list[str], known: Collection[str]) -> Path | None:
-    """An image that no export wrote, in a folder to which images are exported."""
+    """Return an image that no export wrote, in a folder to which images are exported."""
     for folder in sorted({(output / name).parent for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES}):
         for path in image_files(folder) if folder.is_dir() else ():
             if path.relative_to(output).as_posix() not in known:

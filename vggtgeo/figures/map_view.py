@@ -101,7 +101,7 @@ def _along_the_extent(axes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _extent(points: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around the path and the points without outliers (0.5 % at each end), with a margin."""
+    """Return the corners of a box around path and points without outliers (0.5 % at each end), with a margin."""
     low = np.minimum(np.quantile(points, 0.005, axis=0), path.min(axis=0))
     high = np.maximum(np.quantile(points, 0.995, axis=0), path.max(axis=0))
     margin = 0.03 * (high - low).max() + 0.05

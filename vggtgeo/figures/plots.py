@@ -136,7 +136,7 @@ def view_axes(trajectory: Trajectory, level_world: bool = False) -> Float[np.nda
 
 
 def _yaws(trajectory: Trajectory) -> bool:
-    """Whether the cameras rotate enough for their image rows to span the horizontal plane."""
+    """Return whether the cameras rotate enough for their image rows to span the horizontal plane."""
     rows = trajectory.rotations[:, :, 0]
     return bool(np.linalg.eigvalsh(rows.T @ rows / len(rows))[1] > _MIN_YAW)
 

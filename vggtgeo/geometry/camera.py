@@ -38,6 +38,8 @@ _FISHEYE_LENGTH = 4
 class Camera:
     """A camera with one set of intrinsics for the whole sequence.
 
+    Readers and runs know this class only; bundle adjustment takes any `vggtgeo.cameras.AbstractCamera`.
+
     Fields:
         intrinsics: fx, fy, cx, cy in pixels; fx, fy > 0.
         width, height: of the image, pixels.

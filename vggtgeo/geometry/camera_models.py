@@ -29,7 +29,9 @@ _NEWTON_STEPS = 8
 
 
 class AbstractCamera(eqx.Module):
-    """A camera model: focal lengths and principal point first, then further parameters.
+    """A camera model of bundle adjustment: focal lengths and principal point first, then further parameters.
+
+    Any subclass can be adjusted and differentiated; readers and runs take a `vggtgeo.Camera` only.
 
     Fields:
         parameters: [q], as listed in `names`: pixels, then distortion without a unit.

@@ -41,17 +41,17 @@ class RecordedTruth:
     intrinsics: np.ndarray
 
     def image(self, index: int) -> np.ndarray:
-        """uint8 [H, W, 3]."""
+        """Return the image, uint8 [H, W, 3]."""
         return self.frames[index].image
 
     def depth(self, index: int) -> np.ndarray:
-        """Measured depth [H, W], metres, NaN = none."""
+        """Return the measured depth [H, W], metres, NaN = none."""
         depth = self.frames[index].depth
         assert depth is not None
         return depth
 
     def pose(self, index: int) -> np.ndarray:
-        """World -> camera, float64 [4, 4]."""
+        """Return world -> camera, float64 [4, 4]."""
         return np.asarray(self.poses[index])
 
     def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -22,7 +22,7 @@ from vggtgeo.models.roles import MetricDepth
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.keyframe_images import array_of
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.threads import map_in_threads
 
 DenseMode = Literal["auto", "mvs", "sensor", "network", "none"]
@@ -92,7 +92,7 @@ def dense_map(slam: Slam, mode: str = "auto") -> DenseMap:
     check_dense(mode, any(keyframe.images.has_depth for keyframe in slam.keyframes))
     # Each submap by itself: the relative pose of two is unknown.
     depth_maps: dict[int, DepthMap | None] = {}
-    submaps = pieces_by_size(slam)
+    submaps = submaps_by_size(slam)
     for numbers in submaps:
         own = [slam.keyframes[number] for number in numbers]
         # A submap without any measured depth has none, whatever the others have.

@@ -15,7 +15,7 @@ from vggtgeo.mapping.consistency import DIFFERENCE_RANGE, PosedDepth, confirm
 from vggtgeo.mapping.dense import fill_holes
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.global_map.frame_poses import frame_poses
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.state import Slam
 
 MAX_VIEWS = 4
@@ -66,7 +66,7 @@ class FrameDepths:
     def __init__(self, slam: Slam, depth_maps: Sequence[DepthMap | None]):
         self._slam = slam
         self._poses = frame_poses(slam)[1]
-        self._submap = piece_of(slam.map)
+        self._submap = submap_of(slam.map)
         self._views: Mapping[int, PosedDepth] = {
             keyframe.number: PosedDepth(depth_map, keyframe.pose, np.asarray(slam.intrinsics, np.float64))
             for keyframe, depth_map in zip(slam.keyframes, depth_maps, strict=True)

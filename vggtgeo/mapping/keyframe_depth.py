@@ -100,7 +100,7 @@ def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray,
         estimate = -np.log(slots.inverse_depth)
         correction = estimate - here
         # Exactly at its prior, a key point has taken no part in an adjustment.
-        adjusted = estimate != -np.log(slots.prior)
+        adjusted = estimate != -np.log(slots.prior_mean)
     good = inside & np.isfinite(correction) & adjusted & (np.abs(correction) < MAX_CORRECTION)
     return slots.pixels[good], correction[good], slots.confidence[good] * slots.prior_confidence[good]
 

@@ -19,7 +19,7 @@ from vggtgeo.mapping.consistency import PosedDepth, confirm
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.plane_sweep import Photo, matching_cost
 from vggtgeo.mapping.semi_global import semi_global
-from vggtgeo.mapping.uncertainty import support
+from vggtgeo.mapping.uncertainty import stereo_depth_sigma
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 
@@ -122,7 +122,7 @@ def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo], settings:
     )
     step = float(planes[1] - planes[0])
     inverse = (planes[0] + step * position).astype(np.float32)
-    seen = support(photo, others, inverse, step, settings.window)
+    seen = stereo_depth_sigma(photo, others, inverse, step, settings.window)
     good = (seen.views >= 1) & (margin > settings.margin) & (seen.sigma < MAX_SIGMA * inverse)
     nan = np.float32(np.nan)
     return DepthMap(

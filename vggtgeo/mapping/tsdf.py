@@ -168,7 +168,7 @@ def _with_view(
 
 
 def _surface(volume: np.ndarray, corner: np.ndarray, voxel: float, min_count: int) -> Mesh | None:
-    """Marching cubes in one block, in cubes known at all corners; None without a surface."""
+    """Apply marching cubes to one block, in cubes known at all corners; None without a surface."""
     weight = volume[..., 4]
     known = volume[..., 5] >= min_count
     # Unknown corners are "in front": marching cubes must not close a surface there.

@@ -46,8 +46,10 @@ class Support:
     views: np.ndarray
 
 
-def support(reference: Photo, others: Sequence[Photo], inverse_depth: np.ndarray, step: float, window: int) -> Support:
-    """Return standard deviation and number of views of each pixel's inverse depth.
+def stereo_depth_sigma(
+    reference: Photo, others: Sequence[Photo], inverse_depth: np.ndarray, step: float, window: int
+) -> Support:
+    """Return the standard deviation and the number of views of each pixel's inverse depth.
 
     Args:
         reference: image of the inverse depth.

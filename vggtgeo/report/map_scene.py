@@ -175,7 +175,7 @@ def _add_quantised(arrays: dict[str, np.ndarray], name: str, points: Float[np.nd
 
 
 def _box(points: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box around the path and the points without outliers (1 % at each end)."""
+    """Return the corners of the box around the path and the points without outliers (1 % at each end)."""
     low, high = path.min(axis=0), path.max(axis=0)
     if not len(points):
         return low, high
@@ -183,7 +183,7 @@ def _box(points: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _spacing(points: np.ndarray) -> float:
-    """Median distance to the nearest neighbour; 0 for fewer than two points."""
+    """Return the median distance to the nearest neighbour; 0 for fewer than two points."""
     if len(points) < 2:
         return 0.0
     asked = points[:: max(1, len(points) // _SPACING_SAMPLES)]
@@ -200,7 +200,7 @@ def _thinned(positions: np.ndarray) -> Float[np.ndarray, "n 3"]:
 
 
 def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> Trajectory | None:
-    """The truth during the run in the frame of the estimate; None if their times do not match."""
+    """Return the truth during the run in the frame of the estimate; None if their times do not match."""
     if truth is None:
         return None
     try:
@@ -213,7 +213,7 @@ def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> T
 
 
 def _sigma_at(uncertainty: PoseUncertainty | None, keyframes: Sequence[Pictured]) -> np.ndarray:
-    """Standard deviation of each keyframe's position; NaN = unknown."""
+    """Return the standard deviation of each keyframe's position; NaN = unknown."""
     if uncertainty is None or not len(uncertainty.timestamps):
         return np.full(len(keyframes), np.nan)
     times = np.array([keyframe.timestamp for keyframe in keyframes])
@@ -223,7 +223,7 @@ def _sigma_at(uncertainty: PoseUncertainty | None, keyframes: Sequence[Pictured]
 
 
 def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> Float[np.ndarray, "k 5 3"]:
-    """Camera centre and the four corners of the image plane, world frame."""
+    """Return the camera centre and the four corners of the image plane, world frame."""
     fx, fy, cx, cy = intrinsics
     x, y = cx / fx, cy / fy
     corners = length * np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]])

@@ -23,7 +23,7 @@ from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.window_recorder import WindowRecord
 
@@ -143,13 +143,13 @@ def _view(
     uncertainty: PoseUncertainty | None,
     mesh: Callable[[], Mesh | None],
 ) -> str | None:
-    """The 3D view; None if no frame has a pose, or K3D is not installed."""
+    """Return the 3D view; None if no frame has a pose, or K3D is not installed."""
     if not len(trajectory) or not has_viewer():
         return None
     scene = map_scene(
         cloud,
         trajectory,
-        pictured([slam.keyframes[number] for number in pieces_by_size(slam)[0]]),
+        pictured([slam.keyframes[number] for number in submaps_by_size(slam)[0]]),
         [float(value) for value in slam.intrinsics],
         mesh=mesh(),
         truth=truth,
@@ -161,7 +161,7 @@ def _view(
 
 
 def _draw_trajectory(slam: Slam, trajectory: Trajectory, truth: Trajectory | None, metres: bool) -> str:
-    """The figure as SVG; empty if no frame was localised in a known map. metres: whether the truth is in metres."""
+    """Return the figure as SVG; empty if no frame has a pose. metres: whether the truth is in metres."""
     if not len(trajectory):
         return ""
     return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric, metres)
@@ -187,7 +187,7 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
 
 
 def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
-    """Level, share of the run in percent, and description of each segment; empty for a single segment."""
+    """Return level, share of the run in percent, and description of each segment; empty for a single segment."""
     frames = sum(part.end - part.start + 1 for part in verdict.segments)
     if len(verdict.segments) < 2:
         return []
@@ -203,7 +203,7 @@ def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
 
 
 def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[str, list[str]]]:
-    """Rows of RMSE, mean, median, maximum; for a free scale of estimate or truth, after Sim(3) alignment only."""
+    """Return rows of RMSE, mean, median, maximum; with a free scale, after Sim(3) alignment only."""
     if truth is None:
         return []
     metric = metric and truth["in_metres"]
@@ -233,7 +233,7 @@ def _spread(values: Sequence[_Value], count: int) -> list[_Value]:
 
 
 def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
-    """2nd and 98th percentile of the samples' depth, metres; NaN without depth."""
+    """Return the 2nd and 98th percentile of the samples' depth, metres; NaN without depth."""
     depths = [depth_map.depth[::8, ::8] for depth_map in depth_maps]
     known = np.concatenate([np.zeros(0, np.float32), *(depth[np.isfinite(depth)] for depth in depths)])
     if not len(known):
@@ -259,7 +259,7 @@ def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | 
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Settings as text, by name or `group.name`."""
+    """Return the settings as text, by name or `group.name`."""
     rows: dict[str, str] = {}
     for name, value in settings.items():
         if isinstance(value, Mapping):

@@ -26,7 +26,7 @@ _HEIGHT = 640
 
 
 def has_viewer() -> bool:
-    """Whether K3D-jupyter is installed."""
+    """Return whether K3D-jupyter is installed."""
     return find_spec("k3d") is not None
 
 
@@ -73,13 +73,13 @@ class MapView:
 
 @cache
 def _library() -> str:
-    """K3D's JavaScript, compressed. It is found without importing `k3d`, which takes a second."""
+    """Return K3D's JavaScript, compressed, without importing `k3d`, which takes a second."""
     return base64.b64encode(zlib.compress((_folder() / "standalone.js").read_bytes(), 9)).decode()
 
 
 @cache
 def _licences() -> str:
-    """Of K3D and of what its JavaScript contains (three.js and others), as they ask for."""
+    """Return the licences of K3D and of what its JavaScript contains (three.js and others), as they require."""
     texts = [text.read_text() for text in distribution("k3d").files or () if text.name == "LICENSE.txt"]
     return "\n".join([*texts, (_folder() / "standalone.js.LICENSE.txt").read_text()])
 

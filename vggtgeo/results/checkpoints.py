@@ -33,7 +33,7 @@ from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
-from vggtgeo.slam.verdict.witness import FrameEvidence
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.window_recorder import WindowRecord
 
 _EXCERPT = 110

@@ -17,7 +17,7 @@ from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_unce
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 
 DEPTH_UNIT = 5000.0
 """Counts per metre in the 16-bit depth images, as in the TUM RGB-D format."""
@@ -40,7 +40,7 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
     for name in ("trajectory", "keyframes", "uncertainty"):
         for old in folder.glob(f"{name}-[0-9]*.txt"):
             old.unlink()
-    for rank in range(max(len(pieces_by_size(slam)), 1)):
+    for rank in range(max(len(submaps_by_size(slam)), 1)):
         frame_trajectory(slam, rank).save_tum(folder / submap_file("trajectory", rank))
         keyframe_trajectory(slam, rank).save_tum(folder / submap_file("keyframes", rank))
         uncertainty = frame_uncertainty(slam, rank)

@@ -116,7 +116,7 @@ def check_checkpoint_path(path: Path) -> None:
 
 
 def _inside(place: Path, source: Path) -> str | None:
-    """The entry of `place` that contains `source`; None if `source` is elsewhere."""
+    """Return the entry of `place` that contains `source`; None if `source` is elsewhere."""
     try:
         parts = whole_path(source).relative_to(whole_path(place)).parts
     except ValueError:

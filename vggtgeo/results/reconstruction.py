@@ -48,10 +48,10 @@ from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Finding, Verdict
-from vggtgeo.slam.verdict.input import check_input, check_refusals, check_still_parts
+from vggtgeo.slam.verdict.input_findings import check_input, check_refusals, check_static_overlay
 from vggtgeo.slam.verdict.judge import judge_or_report
-from vggtgeo.slam.verdict.witness import EvidenceRecorder
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (
@@ -160,7 +160,7 @@ def reconstruct(
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
         with loop.checkpoint_writer(checkpoints, identity) as writer:
             tracked = loop.track(writer)
-            slam, interrupted = _adjust(tracked, perception.roles, settings, hooks, stop)
+            slam, interrupted = _finish_unless_interrupted(tracked, perception.roles, settings, hooks, stop)
         summary_facts = {
             **perception.facts(),
             **(facts or {}),
@@ -258,8 +258,9 @@ def _conclude(
 
 
 def _first_state(known: Slam | None, source: Source, settings: SlamSettings, roles: Roles) -> Slam | None:
-    """The state before the first frame in a known map; raise InputError if it is missing, or has another camera or
-    matcher.
+    """Return the state before the first frame in a known map.
+
+    Raise InputError if it is missing, or has another camera or matcher.
     """
     if known is not None:
         if source.has_depth and not known.metric:
@@ -324,10 +325,10 @@ def _perception(
     return replace(found, roles=found.roles.seeded(seed)) if seed else found
 
 
-def _adjust(
+def _finish_unless_interrupted(
     tracked: Tracked, roles: Roles, settings: SlamSettings, hooks: RunCallbacks, stop: Interruption
 ) -> tuple[Slam, bool]:
-    """The state after the last adjustment, and whether Ctrl-C ended the run, which skips it."""
+    """Run the last adjustment, unless Ctrl-C ended the run; return the state, and whether it did."""
     hooks.each("on_adjust", tracked.slam)
     if tracked.interrupted:
         return tracked.slam, True
@@ -384,4 +385,4 @@ class StaticOverlaySearch(Callback):
         """Return the findings for the verdict, after the last frame."""
         if not self._searched:
             self._overlay = static_overlay_of(self._images, self._size)
-        return check_still_parts(self._overlay, left_out=self.found is not None)
+        return check_static_overlay(self._overlay, left_out=self.found is not None)

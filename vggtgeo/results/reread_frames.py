@@ -68,7 +68,7 @@ def depth_of_frames(
 
 
 def _sensor_depths(slam: Slam, frames: Frames | None) -> Iterator[tuple[int, DepthMap | None]]:
-    """Rows of `slam.frames`, each with the frame's depth image, undistorted."""
+    """Yield rows of `slam.frames`, each with the frame's depth image, undistorted."""
     left = set(range(len(slam.frames)))
     if frames is not None and frames.has_depth and slam.metric:
         undistorter, sensor = (slam.camera.lens or frames.camera).undistorter(), SensorDepth()

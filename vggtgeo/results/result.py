@@ -47,12 +47,12 @@ from vggtgeo.results.summary import (
 from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.verdict.witness import Evidence
 from vggtgeo.slam.window_recorder import WindowRecord
 
 DepthChoice = bool | Literal["every"]
@@ -134,14 +134,14 @@ class Result:
         return frame_uncertainty(self.record.slam) if self.record.slam.keyframes else None
 
     @classmethod
-    def of(cls, slam: Slam, evidence: Evidence = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
+    def of(cls, slam: Slam, evidence: CornerTracks = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
         """Return the result of a state of `vggtgeo.run` or `vggtgeo.finish`.
 
         evidence: frame data of an `EvidenceRecorder`; without it the verdict uses the state alone. truth: ground truth,
         camera -> world. dense: source of the dense depth, as in `vggtgeo.reconstruct`.
         """
         check_kind("slam", slam, Slam, "a state of `vggtgeo.run`")
-        slam = settled(slam)
+        slam = merge_pending_window(slam)
         verdict, built = judge(slam, evidence), dense_map(slam, dense)
         count = len(built.cloud)
         report = compare_with_truth(slam, truth)

@@ -24,7 +24,7 @@ from vggtgeo.results.reread_frames import reread_frames
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 
 MASK = "image-mask.png"
 JPEG_QUALITY = 95
@@ -150,7 +150,7 @@ SCENE = Format("scene", 2, by_name((Scene, Tracks)))
 
 
 def _largest_submap(slam: Slam) -> tuple[Keyframe, ...]:
-    return tuple(slam.keyframes[number] for number in pieces_by_size(slam)[0])
+    return tuple(slam.keyframes[number] for number in submaps_by_size(slam)[0])
 
 
 def write_scene(folder: Path, slam: Slam, valid: np.ndarray | None = None, frames: Frames | None = None) -> None:

@@ -7,7 +7,7 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 from vggtgeo.report import MapView, Pictured, check_viewer, map_scene, pictured
 from vggtgeo.results.result import Result
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 
 NOTEBOOK_POINTS = 150_000
 """Of the view: a notebook keeps it in its file, some 3 MB."""
@@ -42,7 +42,7 @@ def show(result: Result, truth: Trajectory | None = None, *, max_points: int = N
         raise InputError("`result` has no pose: no frame was tracked, and there is no map to show")
     record = result.record
     if record is not None:
-        keyframes = pictured([record.slam.keyframes[number] for number in pieces_by_size(record.slam)[0]])
+        keyframes = pictured([record.slam.keyframes[number] for number in submaps_by_size(record.slam)[0]])
     else:
         poses = zip(result.keyframes.timestamps, result.keyframes.poses, strict=True)
         keyframes = [Pictured(f"keyframe {row}", pose, time) for row, (time, pose) in enumerate(poses)]

@@ -130,7 +130,7 @@ def open_source(
 
 
 def _truth(sequence: Sequence) -> Trajectory | None:
-    """The ground truth; warn and return None if it cannot be read, since the run itself does not need it."""
+    """Return the ground truth; warn and return None if it cannot be read, since the run itself does not need it."""
     try:
         truth = sequence.ground_truth()
         if truth is not None and not getattr(sequence, "truth_in_metres", True):

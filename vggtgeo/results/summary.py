@@ -24,7 +24,7 @@ from vggtgeo.results.files import submap_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 
 
@@ -45,7 +45,7 @@ def compare_with_truth(slam: Slam, truth: Trajectory | None) -> TrajectoryReport
 
 RESERVED_KEYS = frozenset(
     {
-        *("verdict", "settings", "versions", "frames", "frames_tracked", "keyframes", "pairs", "pieces"),
+        *("verdict", "settings", "versions", "frames", "frames_tracked", "keyframes", "pairs", "submaps"),
         *("peak_memory_gb", "scale", "scale_basis", "pose_sigma", "intrinsics", "lens", "rolling_shutter"),
         *("seconds_by_stage", "notes", "map_points", "dense", "frames_per_second", "interrupted", "images_reduced"),
         *("static_overlay", "truth", "frames_per_second_whole_run", "pose_prior"),
@@ -77,7 +77,7 @@ def summarise(
         "frames_tracked": tracked,
         "keyframes": len(slam.keyframes),
         "pairs": len(slam.map.pairs),
-        "pieces": list_submaps(slam),
+        "submaps": list_submaps(slam),
         "peak_memory_gb": round(peak_memory_gb(), 3),
         "scale": scale_name(slam, verdict, recorded=counts.get("pose_prior", {}).get("used", False)),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
@@ -93,7 +93,7 @@ def summarise(
 
 
 def _pose_sigma(slam: Slam) -> dict[str, Any]:
-    """Median and largest standard deviation of the poses of the largest submap; empty if unknown."""
+    """Return median and largest standard deviation of the poses of the largest submap; empty if unknown."""
     sigma = frame_uncertainty(slam) if slam.keyframes else None
     if sigma is None or not np.isfinite(sigma.translation).any():
         return {}
@@ -109,7 +109,7 @@ def list_submaps(slam: Slam) -> list[dict[str, Any]]:
     No factor connects two submaps, so that their relative pose and scale are unknown.
     """
     found = []
-    for rank, numbers in enumerate(pieces_by_size(slam)):
+    for rank, numbers in enumerate(submaps_by_size(slam)):
         inside = set(numbers)
         own = [record.frame for record in slam.frames if record.tracked and record.reference in inside]
         ends = [min(own), max(own)] if own else []
@@ -203,7 +203,7 @@ def warn_if_truncated(file: Path, poses: Trajectory) -> Trajectory:
     A file cut off at the end of a line is still valid: only the number of poses shows it.
     """
     try:
-        largest = json.loads(whole_text(file.with_name("summary.json"), errors="strict"))["pieces"][0]
+        largest = json.loads(whole_text(file.with_name("summary.json"), errors="strict"))["submaps"][0]
         count = largest[POSES[file.name]]
     except (OSError, ValueError, LookupError, TypeError, RecursionError):  # not a run's, or without the number
         return poses

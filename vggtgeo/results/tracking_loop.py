@@ -18,7 +18,7 @@ from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, Notice, R
 from vggtgeo.results.source import Source
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
@@ -138,12 +138,12 @@ class TrackingLoop:
             self._message("interrupted: keeping the frames so far")
         elif writer is not None:
             writer.on_end(slam, frame)
-        slam = settled(slam)
+        slam = merge_pending_window(slam)
         earlier = 0.0 if self.before is None else self.before.tracking
         return Tracked(slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began))
 
     def _frames(self, writer: CheckpointWriter | None) -> tuple[list[Frame], Iterator[Frame]]:
-        """The last two frames of the resumed run, if any, and the frames that are left."""
+        """Return the last two frames of the resumed run, if any, and the frames that are left."""
         start, end, stride = self.selection
         if self.before is None or writer is None:
             return [], iter(self.source.frames.frames(start, end, stride))

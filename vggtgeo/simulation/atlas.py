@@ -33,7 +33,7 @@ class Atlas:
     wraps: np.ndarray
 
     def sample(self, which: np.ndarray, u: np.ndarray, v: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """Trilinear look-up.
+        """Return trilinear values.
 
         which: int [n], texture. u, v: float32 [n], position in tiles. footprint: float32 [n], width of the pixel in
         tiles. Returns float32 [n, C] (or [n]) in the units of `image`.
@@ -63,7 +63,7 @@ class Atlas:
 
 
 def look_up(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bilinear values of `image` at pixel coordinates x, y (float32 [n], pixel centres at whole numbers)."""
+    """Return bilinear values of `image` at pixel coordinates x, y (float32 [n], pixel centres at whole numbers)."""
     count = len(x)
     if not count:
         return np.zeros((0, *image.shape[2:]), image.dtype)

@@ -27,7 +27,7 @@ _PAINTS = ((0.72, 0.80, 0.70), (0.72, 0.76, 0.88), (0.90, 0.80, 0.66))
 
 
 def _round(base: float) -> list[tuple[float, float, float]]:
-    """Once round the corridor of a floor, from the stairs and back to them."""
+    """Return a way once round the corridor of a floor, from the stairs and back to them."""
     (west, south), (east, north) = _LOW, _HIGH
     half, z = 0.5 * _AISLE, base + _EYE
     out, back = _DOOR + 0.15, _DOOR - 0.15
@@ -51,7 +51,7 @@ BUILDING_WALK = Walk(way=_way(), speed=0.8, corner=0.25, turn=0.40, glance=0.15,
 
 
 def build_building(seed: int) -> Scene:
-    """Corridors with doors, boards and pictures, each floor in its colour, about a well of dog-leg stairs."""
+    """Build corridors with doors, boards and pictures, each floor in its colour, about a well of dog-leg stairs."""
     b = SceneBuilder(seed)
     for floor in range(_FLOORS):
         _corridor(b, floor)
@@ -93,7 +93,7 @@ def _corridor(b: SceneBuilder, floor: int) -> None:
 
 
 def _dress(b: SceneBuilder, start: Vector, end: Vector, base: float, number: int, keep_free: bool) -> None:
-    """Doors and what hangs between them along one wall; nothing before the way to the stairs where `keep_free`."""
+    """Add doors and what hangs between them along one wall; nothing before the way to the stairs if `keep_free`."""
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     hang(b, start, end, 0.5 * length, base, (length, 0.09), Look("wood", 1.3), 0.015, Look("wood", 1.3))
     for place, along in enumerate(np.arange(1.0, length - 0.9, 1.5)):

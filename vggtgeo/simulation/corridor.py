@@ -45,7 +45,7 @@ CORRIDOR_WALK = Walk(
 
 
 def build_corridor(seed: int) -> Scene:
-    """Two arms with doors on both sides, two meeting rooms behind glass, and a few things to hold on to."""
+    """Build two arms with doors on both sides, two meeting rooms behind glass, and a few things to hold on to."""
     b = SceneBuilder(seed)
     floor_and_ceiling(b, (0, 0), (_LONG, _WIDTH), _HEIGHT, _FLOOR, Look("ceiling", 1.2, detail=0.03))
     low, high = (_LONG - _WIDTH, _WIDTH), (_LONG, _SHORT)
@@ -71,7 +71,7 @@ def build_corridor(seed: int) -> Scene:
 
 
 def _plain_wall(b: SceneBuilder, start: Vector, end: Vector, doors: bool = True) -> None:
-    """White paint, a skirting, and the same grey door with its sign every 3.2 m."""
+    """Add white paint, a skirting, and the same grey door with its sign every 3.2 m."""
     wall(b, start, end, _HEIGHT, WHITE, edges=True)
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     hang(b, start, end, 0.5 * length, 0.0, (length, 0.10), _GREY, 0.012, _GREY)

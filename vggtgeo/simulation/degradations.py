@@ -304,7 +304,7 @@ def rolled(frame: Frame, velocity: np.ndarray, intrinsics: tuple[float, ...], se
     rays = pinhole.grid_rays((height, width), intrinsics)
 
     def seen(depth: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """At the moment of the frame, what lies at these depths in the rows: its depth, and its pixels."""
+        """Return what lies at these depths in the rows at the moment of the frame: its depth, and its pixels."""
         there = np.einsum("rij,rcj->rci", back[:, :3, :3], rays * depth[..., None]) + back[:, None, :3, 3]
         ahead = np.concatenate([there[..., :2], np.maximum(there[..., 2:], 1e-3)], -1)
         at = pinhole.project(ahead, intrinsics, nearest=0.0).astype(np.float32)

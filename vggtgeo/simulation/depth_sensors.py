@@ -84,7 +84,7 @@ def _hidden(disparity: np.ndarray) -> np.ndarray:
 
 
 def _correlated(rng: np.random.Generator, shape: tuple[int, ...], grain: float) -> np.ndarray:
-    """White noise, or noise that is correlated over `grain` pixels; standard deviation 1."""
+    """Return white noise, or noise that is correlated over `grain` pixels; standard deviation 1."""
     white = rng.standard_normal(shape)
     if grain < 1:
         return white

@@ -80,7 +80,7 @@ def desk(b: SceneBuilder, at: Vector, yaw: float, variant: int = 0, width: float
 
 
 def stack_of_books(b: SceneBuilder, at: Vector, yaw: float, count: int) -> None:
-    """`count` books of random size and cover, on top of each other."""
+    """Add `count` books of random size and cover, on top of each other."""
     base = np.array([*at, 0.0][:3], float)
     for _ in range(count):
         width, depth, height = b.rng.uniform([0.15, 0.20, 0.02], [0.22, 0.28, 0.05])
@@ -213,7 +213,7 @@ def beam(
 
 
 def railing(b: SceneBuilder, start: Vector, end: Vector, height: float, look: Look, spacing: float = 0.9) -> None:
-    """Posts and two rails along start -> end (x, y, z); the rails follow a slope."""
+    """Add posts and two rails along start -> end (x, y, z); the rails follow a slope."""
     low, high = np.asarray(start, float), np.asarray(end, float)
     for share in np.linspace(0, 1, max(2, round(float(np.linalg.norm(high - low)) / spacing) + 1)):
         b.box(low + share * (high - low), (0.04, 0.04, height), look, edges=False, shadow=False)

@@ -54,7 +54,7 @@ HALL_WALK = Walk(
 
 
 def build_hall(seed: int) -> Scene:
-    """Two rows of columns, a gallery on the north side, windows high up, and islands of seats and kiosks."""
+    """Build two rows of columns, a gallery on the north side, windows high up, and islands of seats and kiosks."""
     b = SceneBuilder(seed)
     sx, sy = _SIZE
     floor_and_ceiling(b, (0, 0), _SIZE, _HEIGHT, Look("terrazzo", 2.4, detail=0.07), Look("metal", 2.5, detail=0.06))
@@ -78,7 +78,7 @@ def build_hall(seed: int) -> Scene:
 
 
 def _dress(b: SceneBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
-    """High windows, banners, and doors and posters at eye level."""
+    """Add high windows, banners, and doors and posters at eye level."""
     number = 20 * side
     for along in np.arange(3.0, length - 1.5, 6.0):
         look = Look(f"window:{number % 4}", None, emission=0.9)

@@ -34,7 +34,7 @@ class Lightmap:
     density: np.ndarray
 
     def sample(self, which: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Irradiance float32 [n] of surfaces `which` [n] at (s, t) [n], metres."""
+        """Return the irradiance float32 [n] of surfaces `which` [n] at (s, t) [n], metres."""
         x = self.corner[:, 0][which] + s * self.density[:, 0][which]
         y = self.corner[:, 1][which] + t * self.density[:, 1][which]
         return look_up(self.image, x, y)
@@ -65,7 +65,7 @@ def bake(
 
 
 def _pack(counts: np.ndarray) -> tuple[np.ndarray, int]:
-    """Shelf packing of [P, 2] (width, height) rectangles: corners [P, 2] and the height used."""
+    """Pack [P, 2] (width, height) rectangles on shelves; return corners [P, 2] and the height used."""
     corner = np.zeros((len(counts), 2), int)
     x = y = shelf = 0
     for row in np.argsort(-counts[:, 1], kind="stable"):
@@ -78,7 +78,7 @@ def _pack(counts: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _texels(surfaces: Surfaces, counts: np.ndarray) -> tuple[np.ndarray, ...]:
-    """(surface, s, t) of every texel, and how many each surface has; outer texels lie 1 cm inside the border."""
+    """Return (surface, s, t) of every texel, and how many each surface has; outer texels lie 1 cm inside the border."""
     which, s, t = [], [], []
     for row, (width, height) in enumerate(counts):
         margin = np.minimum(0.01, 0.1 * surfaces.extent[row])
@@ -162,7 +162,7 @@ def _shadowed(points: np.ndarray, rays: np.ndarray, blockers: Blockers, starts: 
 
 
 def _meets(points: np.ndarray, rays: np.ndarray, blockers: Blockers, some: np.ndarray) -> np.ndarray:
-    """Slab test of segments points [n, 1, 3], rays [n, S, 3] against the boxes `some` [B]: bool [n, S]."""
+    """Test segments points [n, 1, 3], rays [n, S, 3] against the boxes `some` [B], slab by slab: bool [n, S]."""
     yaw = blockers.yaw[some]
     cos, sin = np.cos(yaw).astype(np.float32), np.sin(yaw).astype(np.float32)
     half = blockers.half[some].astype(np.float32)

@@ -123,7 +123,7 @@ def _drifted(
 
 
 def _surfaces(poses: Float[np.ndarray, "n 7"], reach: int, rng: np.random.Generator) -> SurfaceAlignment:
-    """Point-to-plane alignments of wall and floor, which leave the way along the corridor open."""
+    """Return point-to-plane alignments of wall and floor, which leave the way along the corridor open."""
     count = len(poses)
     first = np.repeat(np.arange(count), reach)
     second = (first + np.tile(np.arange(1, reach + 1), count)) % count

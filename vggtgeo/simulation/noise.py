@@ -43,7 +43,7 @@ def quantise(colour: np.ndarray) -> np.ndarray:
 
 
 def random_colour(rng: np.random.Generator, low: int = 20, high: int = 235) -> tuple[int, int, int]:
-    """Red, green, blue, each uniform in [low, high)."""
+    """Return red, green, blue, each uniform in [low, high)."""
     red, green, blue = rng.integers(low, high, 3)
     return int(red), int(green), int(blue)
 

@@ -56,7 +56,7 @@ OFFICE_WALK = Walk(
 
 
 def build_office(seed: int) -> Scene:
-    """Four islands of four desks, lined by shelves, boards, doors and windows."""
+    """Build four islands of four desks, lined by shelves, boards, doors and windows."""
     b = SceneBuilder(seed)
     floor_and_ceiling(b, (0, 0), _SIZE, _HEIGHT, Look("carpet", 1.3), Look("ceiling", 1.2, detail=0.05))
     sx, sy = _SIZE
@@ -80,7 +80,7 @@ def build_office(seed: int) -> Scene:
 
 
 def _island(b: SceneBuilder, at: Vector, variant: int) -> None:
-    """Four desks back to back with screens of cloth between them."""
+    """Add four desks back to back with screens of cloth between them."""
     place = Place(at, 0.0)
     for column, x in enumerate((-0.78, 0.78)):
         for row, yaw in enumerate((0.0, np.pi)):
@@ -96,7 +96,7 @@ def _island(b: SceneBuilder, at: Vector, variant: int) -> None:
 
 
 def _dress(b: SceneBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
-    """Things on one wall, about one in 2 m, in an order drawn from the seed."""
+    """Add things on one wall, about one in 2 m, in an order drawn from the seed."""
     along, number = 1.1, 10 * side
     while along < length - 1.0:
         kind = str(b.rng.choice(list(_ON_THE_WALL), p=list(_ON_THE_WALL.values())))
@@ -111,7 +111,7 @@ def _dress(b: SceneBuilder, start: Vector, end: Vector, length: float, side: int
 
 
 def _pillars_and_corners(b: SceneBuilder) -> None:
-    """Low shelves along the walls, two pillars, and corners with plants and a sofa."""
+    """Add low shelves along the walls, two pillars, and corners with plants and a sofa."""
     for index, x in enumerate((3.6, 6.0, 10.4, 12.6)):
         shelf(b, (x, 0.20), np.pi, 1.3, 0.85, 3 * index % 9)
     for index, x in enumerate((4.4, 9.6, 12.2)):

@@ -97,17 +97,17 @@ class SimulatedOracle:
         return index
 
     def timestamp(self, index: int) -> float:
-        """Seconds."""
+        """Return the time, seconds."""
         return self.sequence.timestamp(index)
 
     def pose(self, index: int) -> np.ndarray:
-        """True pose, world -> camera, float64 [4, 4]."""
+        """Return the true pose, world -> camera, float64 [4, 4]."""
         if index not in self._poses:
             self._poses[index] = self.sequence.pose(index)
         return self._poses[index].copy()
 
     def depth(self, index: int) -> np.ndarray:
-        """True depth float64 [H, W], metres, NaN = none."""
+        """Return the true depth float64 [H, W], metres, NaN = none."""
         return self._known(index).picture.depth
 
     def glass(self, index: int) -> np.ndarray:
@@ -115,11 +115,11 @@ class SimulatedOracle:
         return self._known(index).picture.glass
 
     def texture(self, index: int) -> np.ndarray:
-        """Strength of texture, float32 [H, W] in [0, 1)."""
+        """Return the strength of texture, float32 [H, W] in [0, 1)."""
         return self._known(index).texture
 
     def edges(self, index: int) -> VisibleEdges:
-        """Visible parts of the scene's straight edges."""
+        """Return the visible parts of the scene's straight edges."""
         known = self._known(index)
         if not known.edges:
             known.edges.append(visible_edges(self.sequence.scene, self.pose(index), self.camera, known.picture))

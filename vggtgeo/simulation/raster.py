@@ -91,7 +91,7 @@ def rasterise(
 def surface_coordinates(
     view: View, which: np.ndarray, x: np.ndarray, y: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(s, t) in metres of pixels that see surface `which` [n] at (x, y) [n] with inverse depth w [n]."""
+    """Return (s, t) in metres of pixels that see surface `which` [n] at (x, y) [n] with inverse depth w [n]."""
     dtype = w.dtype
     z = 1.0 / w
     s = _affine(view.s_form.astype(dtype), which, x, y) * z
@@ -171,7 +171,7 @@ def _cast_cylinder(view: View, surface: int, x: np.ndarray, y: np.ndarray) -> tu
 
 
 def _bounds(corners: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """Bounds [P, 4] in normalised coordinates of corners [P, 8, 3]; x0 > x1 where all is behind the camera."""
+    """Return bounds [P, 4] in normalised coordinates of corners [P, 8, 3]; x0 > x1 if all is behind the camera."""
     depth = corners[..., 2]
     ahead = depth > NEAR
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -213,7 +213,7 @@ _BLOTCH_TILE = 7.9
 def shade(
     scene: Scene, view: View, which: np.ndarray, x: np.ndarray, y: np.ndarray, w: np.ndarray, focal: float
 ) -> np.ndarray:
-    """Linear light float32 [n, 3] of the surfaces `which` [n] along rays (x, y) [n] at inverse depth w [n].
+    """Return linear light float32 [n, 3] of the surfaces `which` [n] along rays (x, y) [n] at inverse depth w [n].
 
     x, y, w: float32; focal: pixels, decides how finely texture is looked up. Black where `which` is `EMPTY`.
     """
@@ -238,7 +238,7 @@ def shade(
 
 
 def encode(light: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
-    """Linear light [0, 1] as uint8 with the display's gamma; `noise` is added in grey levels before rounding."""
+    """Encode linear light [0, 1] as uint8 with the display's gamma; `noise`, grey levels, is added before rounding."""
     levels = _ENCODE[(np.clip(light, 0.0, 1.0) * _ENCODE_STEPS).astype(np.int32)]
     if noise is not None:
         levels = levels + noise
@@ -246,14 +246,14 @@ def encode(light: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
 
 
 def _decode(colour: np.ndarray) -> np.ndarray:
-    """Display values [0, 255] to linear light, between the entries of the table."""
+    """Decode display values [0, 255] to linear light, between the entries of the table."""
     below = colour.astype(np.int32)
     low = _DECODE[below]
     return low + (colour - below) * (_DECODE[np.minimum(below + 1, 255)] - low)
 
 
 def _structure(scene: Scene, which: np.ndarray, s: np.ndarray, t: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Fine grain and broad blotches on top of the texture, about 1: no two places look the same."""
+    """Return fine grain and broad blotches on top of the texture, about 1: no two places look the same."""
     materials = scene.materials
     none = np.zeros(len(which), np.int32)
     shift = materials.uv[:, 2][which]

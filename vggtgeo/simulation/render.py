@@ -73,7 +73,7 @@ def _exact_depth(view: View, which: np.ndarray, grid: _Grid) -> np.ndarray:
 
 
 def _soften_edges(scene: Scene, view: View, light: np.ndarray, which: np.ndarray, fine_grid: _Grid) -> None:
-    """Replaces pixels of `light` that lie on an edge by the mean of their sub-pixels."""
+    """Replace pixels of `light` that lie on an edge by the mean of their sub-pixels."""
     nearest, fine = rasterise(view, fine_grid.xs, fine_grid.ys)
     quarters = [(i, j) for i in (0, 1) for j in (0, 1)]
     mixed = np.zeros(which.shape, bool)
@@ -117,7 +117,7 @@ def _reflection(panes: Surfaces, index: int) -> np.ndarray:
 
 
 def _fresnel(view: View, index: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Reflected share of a sheet of glass (both faces; Schlick's approximation)."""
+    """Return the reflected share of a sheet of glass (both faces; Schlick's approximation)."""
     normal = view.normal[index].astype(np.float32)
     cosine = np.abs(normal[0] * x + normal[1] * y + normal[2]) / np.sqrt(x * x + y * y + 1.0)
     return 0.08 + 0.92 * (1.0 - cosine) ** 5

@@ -56,7 +56,7 @@ ROOM_WALK = Walk(
 
 
 def floor_and_ceiling(b: SceneBuilder, low: Vector, high: Vector, height: float, floor: Look, ceiling: Look) -> None:
-    """Floor at z = 0 facing up, ceiling at `height` facing down, over the rectangle low .. high (x, y)."""
+    """Add floor at z = 0 facing up, ceiling at `height` facing down, over the rectangle low .. high (x, y)."""
     dx, dy = high[0] - low[0], high[1] - low[1]
     b.rectangle((*low, 0.0), (dx, 0, 0), (0, dy, 0), floor)
     b.rectangle((low[0], high[1], height), (dx, 0, 0), (0, -dy, 0), ceiling)

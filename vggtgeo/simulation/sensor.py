@@ -46,11 +46,11 @@ class Sensor:
             raise InputError(f"`depth_range` is {self.depth_range}; it must be (near, far) with 0 <= near < far")
 
     def gain(self, time: float) -> float:
-        """Exposure factor at `time` seconds, about 1."""
+        """Return the exposure factor at `time` seconds, about 1."""
         return 1.0 + self.exposure_swing * float(np.sin(1.05 * time) + 0.5 * np.sin(0.43 * time + 1.0)) / 1.5
 
     def image(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Linear light float32 [H, W, 3] as a noisy uint8 image."""
+        """Return linear light float32 [H, W, 3] as a noisy uint8 image."""
         if not self.noise:
             return encode(light)
         noise = rng.standard_normal(light.shape, dtype=np.float32)
@@ -59,7 +59,7 @@ class Sensor:
         return encode(light, noise)
 
     def depth(self, depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """True depth float64 [H, W] as measured: float32, NaN outside the range."""
+        """Return true depth float64 [H, W] as measured: float32, NaN outside the range."""
         measured = depth
         if self.depth_noise:
             measured = depth + self.depth_noise * depth**2 * rng.standard_normal(depth.shape, dtype=np.float32)

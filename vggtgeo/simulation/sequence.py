@@ -65,11 +65,11 @@ class SyntheticSequence:
         return Trajectory(times, np.array([self.motion.camera_to_world(time) for time in times]))
 
     def timestamp(self, index: int) -> float:
-        """Seconds; the middle of the exposure."""
+        """Return the time of the middle of the exposure, seconds."""
         return index / self.rate
 
     def pose(self, index: int) -> np.ndarray:
-        """True pose of a frame, world -> camera, float64 [4, 4]."""
+        """Return the true pose of a frame, world -> camera, float64 [4, 4]."""
         return self._pose_at(self.timestamp(index))
 
     def frame(self, index: int, picture: Picture | None = None) -> Frame:
@@ -82,11 +82,11 @@ class SyntheticSequence:
         return Frame(index, self.timestamp(index), image, depth, f"{self.scene.name}-{index:05d}")
 
     def picture(self, index: int) -> Picture:
-        """What an ideal camera sees at the frame's instant: light, exact depth, surfaces, glass."""
+        """Render what an ideal camera sees at the frame's instant: light, exact depth, surfaces, glass."""
         return self._render(self.pose(index), 0, self.camera.height)
 
     def true_depth(self, index: int) -> np.ndarray:
-        """Exact depth, float64 [H, W], metres; NaN where no surface is."""
+        """Return the exact depth, float64 [H, W], metres; NaN without a surface."""
         return self.picture(index).depth
 
     def _pose_at(self, time: float) -> np.ndarray:
@@ -153,7 +153,7 @@ MAX_FRAMES, MAX_SIDE = 1_000_000, 8192
 
 
 def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, speed: float | None) -> None:
-    """InputError for what `simulate` cannot take."""
+    """Raise InputError for what `simulate` cannot take."""
     if scene not in tuple(WORLDS):
         raise InputError(f"`scene` is {scene!r}; it must be one of {', '.join(WORLDS)}")
     check_kind("size", size, tuple | list | np.ndarray, "(width, height), in pixels")
@@ -173,7 +173,7 @@ def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, spee
 
 
 def check_within_frame(sensor: Sensor, rate: float) -> None:
-    """InputError for an image that no camera of this rate takes: the next one would have begun before it is done."""
+    """Raise InputError for an image that lasts longer than a frame of this rate."""
     for name in ("exposure_time", "readout_time"):
         if getattr(sensor, name) * rate > 1 + 1e-9:
             raise InputError(

@@ -186,6 +186,6 @@ def stack_surfaces(rows: list[tuple]) -> Surfaces:
 
 
 def stack_blockers(boxes: list[tuple]) -> Blockers:
-    """Boxes of a builder as arrays."""
+    """Return the boxes of a builder as arrays."""
     centre, yaw, half = zip(*boxes, strict=True) if boxes else ((), (), ())
     return Blockers(np.reshape(centre, (-1, 3)), np.array(yaw, float), np.reshape(half, (-1, 3)))

@@ -209,7 +209,7 @@ def centres_of(poses: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 3"]:
 
 
 def _arc(keyframes: int) -> np.ndarray:
-    """Cameras along x that turn towards a place 3 m ahead."""
+    """Return cameras along x that turn towards a place 3 m ahead."""
     steps = np.arange(keyframes) - 0.5 * (keyframes - 1)
     centres = np.stack([0.15 * steps, 0.04 * np.sin(1.7 * steps), 0.02 * steps**2], 1)
     turn = Rotation.from_rotvec(np.stack([np.zeros(keyframes), -0.05 * steps, 0.01 * steps], 1))
@@ -219,7 +219,7 @@ def _arc(keyframes: int) -> np.ndarray:
 
 
 def _segments(keyframes: int, lines: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Hosts, pixels and depths of the samples; along the image of a straight line, inverse depth is affine."""
+    """Return hosts, pixels and depths of the samples; along the image of a straight line, inverse depth is affine."""
     count = keyframes * lines
     middle = rng.uniform(70, np.array(SIZE) - 70, (count, 1, 2))
     angle = rng.uniform(0, np.pi, count)

@@ -21,7 +21,7 @@ _PAINTS = ((0.62, 0.72, 0.62), (0.62, 0.68, 0.80), (0.85, 0.72, 0.55), (0.75, 0.
 
 
 def climb(floor: int, eye: float) -> list[tuple[float, float, float]]:
-    """Way points of a camera at height `eye` from `floor` up to the next, x, y, z in metres."""
+    """Return way points of a camera at height `eye` from `floor` up to the next, x, y, z in metres."""
     east, west = WIDTH - 0.5 * FLIGHT, 0.5 * FLIGHT
     near, far = 0.62 * LANDING, LENGTH - 0.62 * LANDING
     base, half = floor * STOREY + eye, (floor + 0.5) * STOREY + eye
@@ -31,7 +31,7 @@ def climb(floor: int, eye: float) -> list[tuple[float, float, float]]:
 
 
 def _there_and_back() -> np.ndarray:
-    """From the lowest floor up to the highest and down again, a little to the side."""
+    """Return a way from the lowest floor up to the highest and down again, a little to the side."""
     up = [point for floor in range(_FLOORS - 1) for point in climb(floor, _EYE)]
     down = [(x + (0.12 if x < 0.5 * WIDTH else -0.12), y, z - 0.04) for x, y, z in reversed(up)]
     return np.array([*up, *down])
@@ -41,7 +41,10 @@ STAIRCASE_WALK = Walk(way=_there_and_back(), speed=0.5, corner=0.22, turn=0.30, 
 
 
 def build_staircase(seed: int) -> Scene:
-    """Concrete flights between two-coloured walls; each floor has a door and a number, each half landing a window."""
+    """Build concrete flights between two-coloured walls, with doors, numbers and windows.
+
+    Each floor has a door and a number, each half landing a window.
+    """
     b = SceneBuilder(seed)
     height = _FLOORS * STOREY
     stone = Look("terrazzo", 1.3, tint=(0.9, 0.88, 0.85))
@@ -67,7 +70,7 @@ def build_staircase(seed: int) -> Scene:
 
 
 def flight(b: SceneBuilder, x: float, base: float, way: int) -> None:
-    """Ten steps up from `base` along +y (`way` 1) or -y (-1), a sloping underside and a railing towards the well."""
+    """Add ten steps up from `base` along +y (`way` 1) or -y (-1), an underside, and a railing at the well."""
     start = LANDING if way > 0 else LENGTH - LANDING
     stone = Look("terrazzo", 1.3, tint=(0.9, 0.88, 0.85))
     for step in range(STEPS):

@@ -22,19 +22,19 @@ Painter = Callable[[np.random.Generator, int], np.ndarray]
 
 
 def plaster(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Painted wall: visible roller grain and faint stains."""
+    """Draw a painted wall: visible roller grain and faint stains."""
     shade = 222 + 3.5 * fractal(rng, size, 0.6) + 4.0 * fractal(rng, size, 1.6)
     return quantise(shade[..., None] * np.array([1.0, 0.985, 0.955], np.float32))
 
 
 def white(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Smooth white paint: a faint noise and nothing else."""
+    """Draw smooth white paint: a faint noise and nothing else."""
     shade = 236 + 0.7 * fractal(rng, size, 0.9)
     return quantise(np.repeat(shade[..., None], 3, axis=2))
 
 
 def brick(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Brick wall, 24 courses of 8; at a tile of 1.7 m a brick is 21 x 7 cm."""
+    """Draw a brick wall, 24 courses of 8; at a tile of 1.7 m a brick is 21 x 7 cm."""
     cell, gap_x, gap_y = tile_cells(size, 24, 8, 0.5)
     tone = rng.uniform(0, 1, 24 * 8)[cell] + 0.13 * fractal(rng, size, 1.0)
     dark = rng.uniform(0.72, 1.08, 24 * 8)[cell] + 0.06 * fractal(rng, size, 0.5)
@@ -46,7 +46,7 @@ def brick(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def parquet(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Wooden floor, 16 courses of 2 boards with their own grain and tone."""
+    """Draw a wooden floor, 16 courses of 2 boards with their own grain and tone."""
     cell, gap_x, gap_y = tile_cells(size, 16, 2, 0.37)
     grain = fractal(rng, size, 1.15, stretch=14.0)
     shift = rng.integers(0, size, 16 * 2)
@@ -59,7 +59,7 @@ def parquet(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def wood(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Veneer of furniture: long grain with rings."""
+    """Draw veneer of furniture: long grain with rings."""
     bend = fractal(rng, size, 1.9, stretch=6.0, lowest=1.0)
     y = np.arange(size, dtype=np.float32)[:, None] / size
     rings = np.sin(2 * np.pi * (9 * y + 0.45 * bend))
@@ -68,7 +68,7 @@ def wood(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def carpet(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Office carpet: speckle in three yarns over a soft blotch."""
+    """Draw an office carpet: speckle in three yarns over a soft blotch."""
     yarn = fractal(rng, size, 0.15)
     tone = 0.5 + 0.22 * yarn + 0.10 * fractal(rng, size, 1.3)
     base = blend((58, 66, 84), (118, 124, 136), tone)
@@ -77,7 +77,7 @@ def carpet(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def fabric(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Upholstery in a light weave; tinted by its user."""
+    """Draw upholstery in a light weave; tinted by its user."""
     wave = np.sin(2 * np.pi * np.arange(size) * 48 / size).astype(np.float32)
     weave = wave[:, None] * wave[None, :]
     shade = 188 + 9 * weave + 12 * fractal(rng, size, 0.9) + 6 * fractal(rng, size, 0.2)
@@ -85,7 +85,7 @@ def fabric(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def ceiling(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Mineral-fibre ceiling, 2 x 2 panels with pits and rails."""
+    """Draw a mineral-fibre ceiling, 2 x 2 panels with pits and rails."""
     _, gap_x, gap_y = tile_cells(size, 2, 2, 0.0)
     pits = np.clip(fractal(rng, size, 0.3) - 1.5, 0, 1.2)
     shade = 224 + 3 * fractal(rng, size, 1.2) - 55 * pits
@@ -95,13 +95,13 @@ def ceiling(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def metal(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Brushed sheet metal."""
+    """Draw brushed sheet metal."""
     shade = 158 + 7 * fractal(rng, size, 0.5, stretch=24.0) + 4 * fractal(rng, size, 1.4)
     return quantise(shade[..., None] * np.array([0.98, 1.0, 1.02], np.float32))
 
 
 def concrete(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Fair-faced concrete: stains, pores, and the seams of its boards."""
+    """Draw fair-faced concrete: stains, pores, and the seams of its boards."""
     _, gap_x, gap_y = tile_cells(size, 4, 2, 0.0)
     pores = np.clip(fractal(rng, size, 0.45) - 2.2, 0, 1)
     shade = 152 + 13 * fractal(rng, size, 1.4) + 5 * fractal(rng, size, 0.4) - 70 * pores
@@ -111,7 +111,7 @@ def concrete(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def terrazzo(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Polished stone floor: chips of three colours in slabs."""
+    """Draw a polished stone floor: chips of three colours in slabs."""
     image = blend((176, 168, 154), (206, 198, 184), 0.5 + 0.25 * fractal(rng, size, 1.1))
     for colour, threshold in (((96, 84, 74), 1.45), ((226, 220, 208), 1.35), ((140, 96, 74), 1.75)):
         chips = gaussian_filter(fractal(rng, size, 0.0), 0.0035 * size, mode="wrap")
@@ -123,7 +123,7 @@ def terrazzo(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Glazed floor tiles, 4 x 4, with marbling."""
+    """Draw glazed floor tiles, 4 x 4, with marbling."""
     cell, gap_x, gap_y = tile_cells(size, 4, 4, 0.0)
     vein = np.abs(fractal(rng, size, 1.5))
     shade = 205 + rng.normal(0, 5, 16)[cell] - 26 * np.clip(0.5 - vein, 0, 1) + 3 * fractal(rng, size, 0.6)
@@ -133,7 +133,7 @@ def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def rug(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Woven rug: nested diamonds in a few colours, with the unevenness of handwork."""
+    """Draw a woven rug: nested diamonds in a few colours, with the unevenness of handwork."""
     y, x = np.mgrid[0:size, 0:size].astype(np.float32) / size
     wobble = 0.012 * fractal(rng, size, 1.3)
     band = (np.abs(x * 3 % 1 - 0.5) + np.abs(y * 3 % 1 - 0.5) + wobble) * 9
@@ -144,7 +144,7 @@ def rug(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def wallpaper(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Paper with scattered leaves of random size and tone."""
+    """Draw paper with scattered leaves of random size and tone."""
     image = quantise(blend((196, 190, 168), (220, 214, 194), 0.5 + 0.2 * fractal(rng, size, 0.9)))
     for _ in range(260):
         centre = rng.integers(0, size, 2)

@@ -106,14 +106,14 @@ def _gaze_at(samples: np.ndarray, at: np.ndarray, walk: Walk) -> tuple[np.ndarra
 
 
 def _smooth_angle(angle: np.ndarray, width: float) -> tuple[np.ndarray, float]:
-    """Periodic smoothing of an unwrapped angle, and the whole turns it gains in one period."""
+    """Smooth an unwrapped angle periodically; return it and the whole turns it gains in one period."""
     winding = 2 * np.pi * np.round((angle[-1] - angle[0]) / (2 * np.pi))
     trend = winding * np.arange(len(angle)) / len(angle)
     return gaussian_filter1d(angle - trend, width, mode="wrap") + trend, float(winding)
 
 
 def _waves(rng: np.random.Generator) -> np.ndarray:
-    """Seeded sinusoids; the vertical sway also has the 1.8 Hz bob of walking."""
+    """Return seeded sinusoids; the vertical sway also has the 1.8 Hz bob of walking."""
     rms = np.array([0.22, 0.007, 0.007, 0.005, 0.009, 0.009, 0.010])
     highest = np.array([0.4, 1.5, 1.5, 1.5, 2.5, 2.5, 1.5])
     count = 10

@@ -21,7 +21,7 @@ from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
@@ -34,12 +34,12 @@ FEW = 20
 """Number of key points below which this is not checked."""
 SAME_CAMERA = 0.02
 """Largest relative difference of focal lengths and principal point between calibrations of one camera: twice the
-standard deviation of a calibration (`PRIOR` in `camera/calibration.py`)."""
+standard deviation of a calibration (`PRIOR` in `camera/given_camera.py`)."""
 
 
 def as_map(slam: Slam) -> Slam:
     """Return the map of a run's state."""
-    slam = settled(slam)
+    slam = merge_pending_window(slam)
     count = len(slam.keyframes)
     keyframes = tuple(
         replace(
@@ -71,8 +71,9 @@ def save_map(path: str | os.PathLike[str], slam: Slam) -> None:
 
 @in_double_precision
 def load_map(path: str | os.PathLike[str]) -> Slam:
-    """The map that `vggtgeo run --save-map` or `Result.save_map` wrote, for `known_map` of `vggtgeo.run` and
-    `vggtgeo.reconstruct`.
+    """Load the map that `vggtgeo run --save-map` or `Result.save_map` wrote.
+
+    Pass it as `known_map` to `vggtgeo.run` or `vggtgeo.reconstruct`.
 
     Raises:
         InputError: the file is missing, damaged, of a version that is not known, or no map.

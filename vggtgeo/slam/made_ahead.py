@@ -19,8 +19,9 @@ def made_ahead(
     count: int,
     waiting: Callable[[], AbstractContextManager[Any]] = nullcontext,
 ) -> Iterator[_Made]:
-    """What `make` gives until it gives None, or raises what it raises; at most `count` are made before they are asked
-    for.
+    """Yield the values of `make` until it returns None; make at most `count` ahead, in a thread.
+
+    Errors of `make` are raised here.
 
     waiting: entered while the next one is waited for. A camera that stalls gives nothing, and does not end: so the
     thread is no executor's, which the end of the program would wait for.

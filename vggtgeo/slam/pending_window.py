@@ -32,13 +32,15 @@ def begin_window(slam: Slam, adjusted: Callable[[], Slam]) -> Slam:
 
 
 def is_due(slam: Slam) -> bool:
-    """Whether the next frame is to be tracked in the adjusted map."""
+    """Return whether the next frame is to be tracked in the adjusted map."""
     return slam.pending is not None and len(slam.frames) >= slam.pending.due
 
 
-def settled(slam: Slam) -> Slam:
-    """The state with the window that was pending; waits for it. What tracking has noted since is kept, and what the
-    other thread has found of the frames before.
+def merge_pending_window(slam: Slam) -> Slam:
+    """Wait for the pending window and merge it.
+
+    Keyframes, matches and window are from its thread; frames, factors and notes added since it began from tracking. For
+    frames before it began, the thread's records are used.
     """
     if slam.pending is None:
         return slam

@@ -12,22 +12,22 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.global_map.join_submaps import join_pieces
-from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe, view_change
+from vggtgeo.slam.global_map.join_submaps import join_submaps
+from vggtgeo.slam.keyframe_decision import becomes_keyframe, track_by_old_keyframe, view_change
 from vggtgeo.slam.manhattan import constrain_rotation
-from vggtgeo.slam.pending_window import begin_window, is_due, settled
+from vggtgeo.slam.pending_window import begin_window, is_due, merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import RecordedPrior, recorded_prior
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.start import (
-    MAX_WAITING,
+    MAX_FRAMES_WITHOUT_POSE,
     begin_again_with_depth,
     start_without_depth,
     without_depth,
@@ -40,7 +40,6 @@ from vggtgeo.slam.tracking.relocalisation import (
     place_waiting,
     record_of,
     relocalise,
-    revisit,
     view_of,
     wait,
 )
@@ -51,7 +50,6 @@ from vggtgeo.slam.tracking.track import (
     TrackingInput,
     moved_with,
     refined_by_map,
-    tie_between,
     tie_to,
     track,
     track_by_map,
@@ -62,7 +60,7 @@ from vggtgeo.slam.tracking.two_view_motion import usual_step
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 LOST_PATIENCE = 10
-"""Frames that show something, but nothing of the map, before a new piece of map begins. Black frames do not count."""
+"""Number of lost frames with texture after which a new submap begins. Black frames do not count."""
 NEIGHBOURS = 3
 """Keyframes before and after an old one that make up the window when the camera comes back to it."""
 
@@ -79,12 +77,12 @@ def step(
     """Take one frame (undistorted) into the state; its key points are found if they are needed."""
     clock = clock or Clock()
     if is_due(slam):
-        slam = _settled(slam, clock)
+        slam = _merge_pending_window(slam, clock)
     if not slam.metric:
         roles = without_depth(roles)
     if not slam.keyframes:
         return _first(slam, frame, description.features, roles, settings)
-    if not _in_known_map(slam) and not _started(slam):
+    if not _only_localises(slam) and not _started(slam):
         with clock.measure("start"):
             features = description.features
             begun = begin_again_with_depth(slam, frame, features, roles, settings) if slam.metric else None
@@ -93,12 +91,14 @@ def step(
     recorded = recorded_prior(slam, roles)
     slam, data, found = _track(slam, frame, description, recorded, roles, settings, clock)
     if found is None or not found.accepted:
-        return _missed(slam, data, Evidence() if found is None else found.evidence, recorded, roles, settings, clock)
+        return _handle_lost_frame(
+            slam, data, Evidence() if found is None else found.evidence, recorded, roles, settings, clock
+        )
     was_lost = bool(slam.tracker.lost)
     slam = _moved(slam, frame, found)
 
-    slam, found, becomes_keyframe = _decide(slam, data, found, roles, settings, clock)
-    if becomes_keyframe:
+    slam, found, inserts = _decide(slam, data, found, roles, settings, clock)
+    if inserts:
         slam = _insert_and_adjust(slam, data, found, recorded, roles, settings, clock)
     else:
         slam = _refer_to(slam, found.keyframe, roles)
@@ -107,20 +107,23 @@ def step(
     return _place_waiting(slam, roles) if was_lost else slam
 
 
-def _settled(slam: Slam, clock: Clock) -> Slam:
+def _merge_pending_window(slam: Slam, clock: Clock) -> Slam:
     with clock.measure("wait for the window"):
-        return settled(slam)
+        return merge_pending_window(slam)
 
 
 def _started(slam: Slam) -> bool:
-    """Whether there is a map to track in. A later keyframe may well be without depth: its neighbours have some."""
+    """Return whether there is a map to track in; a later keyframe may lack depth, since its neighbours have some."""
     return len(slam.window.members) > 1 or bool(
         np.any(np.isfinite(slam.keyframes[slam.window.members[-1]].points.inverse_depth))
     )
 
 
-def _in_known_map(slam: Slam) -> bool:
-    """Whether there is a map that no frame has been tracked in so far, or none that became a keyframe."""
+def _only_localises(slam: Slam) -> bool:
+    """Return whether this run still only localises in a map of an earlier run.
+
+    None of its own frames has become a keyframe.
+    """
     return not slam.window.members
 
 
@@ -146,21 +149,21 @@ def _track(
     settings: SlamSettings,
     clock: Clock,
 ) -> tuple[Slam, FrameData, Track | None]:
-    """The frame and its pose by the map, and the state that the pose belongs to.
+    """Track a frame in the map; return the state that the pose belongs to, the frame's data and the track.
 
     A pending window is taken up first where the frame has no pose, or becomes a keyframe.
     """
     with clock.measure("track"):
         data = _with_lines(frame_data(frame, description, slam.intrinsics, roles, slam.metric), roles, settings)
         # In a map of another run the place of the first frame is unknown: it is searched by appearance alone.
-        unknown_place = _in_known_map(slam) and slam.tracker.reference is None
+        unknown_place = _only_localises(slam) and slam.tracker.reference is None
         found = None if unknown_place else _find(slam, data, recorded, roles, settings)
     if slam.pending is not None and (found is None or not found.accepted):
-        slam = _settled(slam, clock)
+        slam = _merge_pending_window(slam, clock)
         with clock.measure("track"):
             found = _find(slam, data, recorded, roles, settings)
-    if slam.pending is not None and found is not None and _needs_keyframe(found, settings):
-        slam = _settled(slam, clock)
+    if slam.pending is not None and found is not None and becomes_keyframe(found, settings.keyframes):
+        slam = _merge_pending_window(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if (slam.tracker.lost or not slam.metric) and (found is None or not found.accepted):
         with clock.measure("relocalise"):
@@ -176,7 +179,7 @@ def _track(
 
 
 def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
-    """The state with the motion to a tracked frame, which is unknown after tracking was lost."""
+    """Set the motion to a tracked frame; it is unknown after tracking was lost."""
     if slam.tracker.lost:
         slam = _noted_found(slam, frame)
         velocity = np.eye(4)
@@ -188,16 +191,19 @@ def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
 def _decide(
     slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
 ) -> tuple[Slam, Track, bool]:
-    """Whether a tracked frame becomes a keyframe; not where an old one shows it as well, which is then its keyframe."""
-    if _needs_keyframe(found, settings):
+    """Decide whether a tracked frame becomes a keyframe.
+
+    It does not where an old keyframe shows it as well; that one is then its keyframe.
+    """
+    if becomes_keyframe(found, settings.keyframes):
         with clock.measure("track"):
-            tied, found = _seen_before(slam, data, found, roles, settings)
+            tied, found = track_by_old_keyframe(slam, data, found, roles, settings)
             slam = slam if settings.keyframes.localise_only else tied
-    return slam, found, not settings.keyframes.localise_only and _needs_keyframe(found, settings)
+    return slam, found, not settings.keyframes.localise_only and becomes_keyframe(found, settings.keyframes)
 
 
 def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Roles, settings: SlamSettings) -> Track:
-    """The frame's pose against the reference, or against whatever other keyframe sees more of it."""
+    """Track a frame against the reference, or against another keyframe that sees more of it."""
     prior = _prior(slam, data.frame, recorded)
     first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
     others = [number for number in reversed(slam.window.members) if number != first][:2]
@@ -214,16 +220,16 @@ def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Ro
     # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
     if best.accepted and not data.description.described:
         return best
-    piece = slam.keyframes[slam.map.roots[-1] :]
+    submap = slam.keyframes[slam.map.roots[-1] :]
     if not best.accepted:
         source = view_of(best.keyframe, slam.tracker, slam.intrinsics, roles)
-        joint = track_by_map(given, piece, best.keyframe, source)
+        joint = track_by_map(given, submap, best.keyframe, source)
         return joint if joint.accepted else best
-    return refined_by_map(best, given, piece)
+    return refined_by_map(best, given, submap)
 
 
 def _prior(slam: Slam, frame: Frame, recorded: RecordedPrior | None) -> MotionPrior:
-    """Where a frame is, as recorded, or if the camera goes on as it did."""
+    """Predict a frame's pose from the recording, or by constant velocity."""
     step = None if recorded is None else recorded.step(slam, frame.timestamp)
     velocity = slam.tracker.velocity if step is None else step
     predicted = rigid.orthonormal(velocity @ slam.last_pose)
@@ -231,7 +237,7 @@ def _prior(slam: Slam, frame: Frame, recorded: RecordedPrior | None) -> MotionPr
 
 
 def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameData:
-    """The data with a way to its segments."""
+    """Add a function that detects the frame's segments."""
     return replace(data, find_lines=lambda: find_lines(data.frame.image, roles, settings))
 
 
@@ -248,7 +254,7 @@ def _insert_and_adjust(
     settings: SlamSettings,
     clock: Clock,
 ) -> Slam:
-    """The state with the frame as a keyframe, whose window is matched and adjusted.
+    """Insert the frame as a keyframe, match it and adjust the window.
 
     Beside tracking where the keyframe's own depth places the next frames, and where there is one submap only.
     """
@@ -288,7 +294,7 @@ def _insert_and_adjust(
         return _with_record(begin_window(inserted, lambda: adjusted(" (own thread)")), record)
     slam = adjusted("")
     with clock.measure("relocalise"):
-        return _with_record(join_pieces(slam, data, roles, settings), record)
+        return _with_record(join_submaps(slam, data, roles, settings), record)
 
 
 def _with_record(slam: Slam, record: FramePose) -> Slam:
@@ -296,8 +302,9 @@ def _with_record(slam: Slam, record: FramePose) -> Slam:
 
 
 def _with_odometry(slam: Slam, odometry: MeasuredRelativePose) -> Slam:
-    """The state with an odometry factor, and a pair of its keyframes, if without a match: so the last adjustment
-    aligns the surfaces of both.
+    """Add an odometry factor, and a pair without a match if its keyframes have none.
+
+    So the last adjustment aligns the surfaces of both.
     """
     known = replace(slam.map, factors=(*slam.map.factors, odometry))
     if all(pair.key != odometry.keyframes for pair in known.pairs):
@@ -321,11 +328,11 @@ def _place_waiting(slam: Slam, roles: Roles) -> Slam:
 
 
 def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
-    """A window of the keyframes around an old one, held where it is: the camera has come back to it.
+    """Return a window of the keyframes around an old one, which is fixed: the camera has come back to it.
 
-    Those of its own piece: the place of another is a guess, by which matches would be found that mean nothing.
+    Only of its own submap: the pose of another one is a guess, so matches predicted from it would be wrong.
     """
-    label = piece_of(slam.map)
+    label = submap_of(slam.map)
     around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
     window = tuple(other for other in around if label[other] == label[number])[-(settings.window.size - 1) :]
     # Without metric depth one held pose leaves the unit free: two hold it.
@@ -335,12 +342,12 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:
     note = f"found again at frame {frame.index} ({frame.name}), {slam.tracker.lost} frames after tracking was lost"
-    if _in_known_map(slam) and slam.tracker.reference is None:
+    if _only_localises(slam) and slam.tracker.reference is None:
         note = f"frame {frame.index} ({frame.name}) is the first that was found in the map"
     return replace(slam, notes=(*slam.notes, note))
 
 
-def _missed(
+def _handle_lost_frame(
     slam: Slam,
     data: FrameData,
     evidence: Evidence,
@@ -349,9 +356,7 @@ def _missed(
     settings: SlamSettings,
     clock: Clock,
 ) -> Slam:
-    """No pose by images: that of the recording, if it is known; else after too many such frames begin a piece of map of
-    its own.
-    """
+    """Give a frame that images do not place its recorded pose, if known; else let it wait, or begin a submap at it."""
     frame, features = data.frame, data.features
     carried = None if recorded is None else recorded.carried(slam, frame.timestamp)
     if carried is not None:
@@ -364,48 +369,17 @@ def _missed(
     if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
-    waiting = wait(slam.tracker, frame, features, MAX_WAITING)
+    waiting = wait(slam.tracker, frame, features, MAX_FRAMES_WITHOUT_POSE)
     slam = replace(slam, tracker=replace(slam.tracker, lost=slam.tracker.lost + 1))
     shown = sum(len(other.features) > settings.keyframes.min_inliers for other in waiting)
     patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE
     if not patient and len(features) > settings.keyframes.min_inliers:
         note = (
-            f"a new piece of map begins at frame {frame.index} ({frame.name}): "
-            "nothing ties it to the one before, its place is only a guess"
+            f"a new submap begins at frame {frame.index} ({frame.name}): "
+            "nothing connects it to the one before, its place is only a guess"
         )
         begun = _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
         return _place_waiting(begun, roles) if _started(begun) else begun
     reference, relative = (slam.frames[-1].reference, slam.frames[-1].relative) if slam.frames else (0, np.eye(4))
     record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, evidence)
     return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record), waiting=waiting))
-
-
-def _seen_before(slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings) -> tuple[Slam, Track]:
-    """The frame by an old keyframe that stands where it does, if there is one that shows it as well as the present one:
-    the map grows with space, not with time.
-
-    What the two keyframes know of each other by this frame ties them.
-    """
-    others = (keyframe for keyframe in slam.keyframes if keyframe.number != found.keyframe.number)
-    near = nearest_keyframe(found.pose, others, settings.keyframes)
-    again = None
-    if near is not None:
-        prior = MotionPrior(found.pose, slam.tracker.velocity)
-        given = TrackingInput(data, slam.intrinsics, roles, prior)
-        again = track(given, near, view_of(near, slam.tracker, slam.intrinsics, roles))
-        if not (again.accepted and again.evidence.certain) or _needs_keyframe(again, settings):
-            again = None  # drift may have put another keyframe there
-    if again is None:
-        given = TrackingInput(data, slam.intrinsics, roles)
-        again = revisit(given, found, slam.map, slam.tracker, slam.window.members)
-    if again is None or _needs_keyframe(again, settings) or not again.evidence.shows_as_well(found.evidence):
-        return slam, found
-    near = again.keyframe
-    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):
-        return slam, again
-    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie_between(found, again)))), again
-
-
-def _needs_keyframe(found: Track, settings: SlamSettings) -> bool:
-    own, reference = found.pose, found.keyframe.pose
-    return found.evidence.by_rays or needs_keyframe(own, reference, found.evidence.inliers, settings.keyframes)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.units import longer
 from vggtgeo.slam.state import Slam
@@ -30,24 +30,24 @@ class RecordedPrior:
     unit: float
 
     def step(self, slam: Slam, time: float) -> np.ndarray | None:
-        """The motion of the camera from the last frame with a pose to `time`, in the unit of the map."""
+        """Return the motion of the camera from the last frame with a pose to `time`, in the unit of the map."""
         last = last_placed(slam)
         motion = None if last is None else self.recorded.motion(last.timestamp, time)
         return None if motion is None else longer(motion, self.unit)
 
     def carried(self, slam: Slam, time: float) -> Track | None:
-        """A frame that images do not place, by the motion from the last one that has a pose."""
+        """Place a frame that images do not place, by the recorded motion from the last one with a pose."""
         last = last_placed(slam)
         return None if last is None else carried(self.recorded, slam.map, last, time, self.unit)
 
     def length(self, keyframe: Keyframe, time: float) -> float | None:
-        """Of the motion from a keyframe to `time`, in the unit of the map."""
+        """Return the length of the motion from a keyframe to `time`, in the unit of the map."""
         motion = self.recorded.motion(keyframe.timestamp, time)
         return None if motion is None else self.unit * float(np.linalg.norm(motion[:3, 3]))
 
     def with_tie(self, slam: Slam) -> Slam:
-        """The state with the recorded motion to its newest keyframe from the one before, if both are in one submap."""
-        label, (before, newest) = piece_of(slam.map), slam.keyframes[-2:]
+        """Add the recorded motion to the newest keyframe from the one before, if both are in one submap."""
+        label, (before, newest) = submap_of(slam.map), slam.keyframes[-2:]
         known = any(tie.keyframes == (before.number, newest.number) for tie in slam.map.recorded_factors)
         tie = recorded_tie(self.recorded, before, newest, self.unit)
         if tie is None or known or label[before.number] != label[newest.number]:
@@ -56,7 +56,7 @@ class RecordedPrior:
 
 
 def recorded_prior(slam: Slam, roles: Roles) -> RecordedPrior | None:
-    """The recorded poses of a run, while images agree with them."""
+    """Return the recorded poses of a run, while images agree with them."""
     if roles.recorded is None:
         return None
     found = compare(roles.recorded, slam.map)
@@ -64,7 +64,7 @@ def recorded_prior(slam: Slam, roles: Roles) -> RecordedPrior | None:
 
 
 def last_placed(slam: Slam) -> FramePose | None:
-    """The last frame that has a pose."""
+    """Return the last frame that has a pose."""
     return next((record for record in reversed(slam.frames) if record.tracked), None)
 
 

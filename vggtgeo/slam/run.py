@@ -31,19 +31,20 @@ from vggtgeo.slam.global_map.lost_frames import place_lost
 from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.made_ahead import made_ahead
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.tracking.frame_refinement import against_nearest
 
 AHEAD = 3
 """Frames that are prepared before they are needed."""
-Waiting = Callable[[], AbstractContextManager[Any]]
+WaitContext = Callable[[], AbstractContextManager[Any]]
+"""Makes a context that is entered while the run waits for a frame."""
 
 
 def run(
@@ -94,7 +95,7 @@ def run(
 
 
 def check_run_arguments(roles: Any, settings: Any, camera: Any, known_map: Any) -> None:
-    """Raises InputError for one that is something else, a table in the place of settings, say."""
+    """Raise InputError for an argument of another type, for example a table instead of settings."""
     check_kind("roles", roles, Roles | None, "`vggtgeo.Roles`, or None for the classical ones")
     check_kind("settings", settings, SlamSettings | None, "`vggtgeo.SlamSettings`, or None")
     check_kind(
@@ -104,7 +105,7 @@ def check_run_arguments(roles: Any, settings: Any, camera: Any, known_map: Any) 
 
 
 def default_roles(has_depth: bool) -> Roles:
-    """The classical roles, for frames with or without depth."""
+    """Return the classical roles, for frames with or without depth."""
     return Roles() if has_depth else Roles(depth=NoDepth())
 
 
@@ -116,9 +117,9 @@ def run_frames(
     clock: Clock,
     known: Slam | None = None,
     before: Collection[Frame] = (),
-    waiting: Waiting = nullcontext,
+    waiting: WaitContext = nullcontext,
 ) -> Iterator[Slam]:
-    """The same over any iterable of frames of one camera, on from a state that is known.
+    """As `run`, for an iterable of frames; continue from the state `known`, or begin a new map if it is None.
 
     before: the last frames of that state, of which the run that goes on asks whether the next depth image is new.
     waiting: entered while a frame is waited for.
@@ -154,7 +155,7 @@ def finish(
 
     """
     check_kind("slam", slam, Slam, "the state that `vggtgeo.run` yields")
-    slam, roles, settings = settled(slam), roles or default_roles(slam.metric), settings or SlamSettings()
+    slam, roles, settings = merge_pending_window(slam), roles or default_roles(slam.metric), settings or SlamSettings()
     fixed = settings.keyframes.localise_only or not settings.refinement.global_adjustment
     if fixed or len(slam.keyframes) < 3:
         return slam
@@ -169,10 +170,10 @@ def finish(
         return adjust_all(slam, settings)
 
 
-def frame_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
-    """Camera -> world of every frame that has a pose in a piece of the map, by default the one of most frames.
+def frame_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
+    """Return camera -> world of every frame that has a pose in a submap, by default the largest one.
 
-    A frame without one (lost, or before a start) is left out. Pieces are tied by nothing, so that their poses mean
+    A frame without one (lost, or before a start) is left out. Submaps are not connected, so that their poses mean
     nothing to each other: each has a trajectory of its own.
 
     Example:
@@ -181,26 +182,26 @@ def frame_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
         Trajectory(1 pose, 0.00 s, path 0.00 m)
 
     Raises:
-        InputError: `slam` is no state of a run, or has no such piece.
+        InputError: `slam` is no state of a run, or has no such submap.
 
     """
     check_kind("slam", slam, Slam, "a state of a run, as `vggtgeo.run` yields it")
-    check_whole("piece", piece, most=max(len(pieces_by_size(slam)) - 1, 0) if slam.keyframes else 0)
+    check_whole("submap", submap, most=max(len(submaps_by_size(slam)) - 1, 0) if slam.keyframes else 0)
     times, poses = frame_poses(slam)
-    own: set[int] = set(pieces_by_size(slam)[piece]) if slam.keyframes else set()
+    own: set[int] = set(submaps_by_size(slam)[submap]) if slam.keyframes else set()
     chosen = np.array([record.tracked and record.reference in own for record in slam.frames], bool)
     return Trajectory(times[chosen], rigid.invert(poses[chosen]))
 
 
-def keyframe_trajectory(slam: Slam, piece: int = 0) -> Trajectory:
-    """Camera -> world of the keyframes of a piece of the map, by default the one of most frames."""
-    own = [slam.keyframes[number] for number in pieces_by_size(slam)[piece]] if slam.keyframes else []
+def keyframe_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
+    """Return camera -> world of the keyframes of a submap, by default the largest one."""
+    own = [slam.keyframes[number] for number in submaps_by_size(slam)[submap]] if slam.keyframes else []
     poses = rigid.invert(np.array([keyframe.pose for keyframe in own]).reshape(-1, 4, 4))
     return Trajectory(np.array([keyframe.timestamp for keyframe in own]), poses)
 
 
 def in_order(frames: Iterable[Frame], camera: Camera, last: float = -math.inf) -> Iterator[Frame]:
-    """The frames that are frames of this camera, and later than those before: a pose is found again by its time."""
+    """Yield the frames that fit this camera and are later than those before: a pose is found again by its time."""
     for frame in frames:
         check_frame(frame, camera)
         if frame.timestamp <= last:
@@ -242,10 +243,11 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _described(
-    frames: Iterator[Frame], camera: Camera, roles: Roles, clock: Clock, waiting: Waiting
+    frames: Iterator[Frame], camera: Camera, roles: Roles, clock: Clock, waiting: WaitContext
 ) -> Iterator[tuple[Frame, Description]]:
-    """Undistorted frames, prepared in a thread of their own while earlier ones are tracked; where every frame needs its
-    key points, with them.
+    """Yield undistorted frames, prepared in a thread while earlier ones are tracked.
+
+    With key points if every frame needs them.
     """
     undistorter, intrinsics = camera.undistorter(), np.array(camera.intrinsics, np.float64)
 

@@ -16,11 +16,12 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track
-from vggtgeo.slam.tracking.tracker import FramePose, Waiting, given_up
+from vggtgeo.slam.tracking.tracker import FramePose, UnplacedFrame, given_up
 from vggtgeo.slam.window.sliding_window import scale_anchor
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
-MAX_WAITING = 90
+MAX_FRAMES_WITHOUT_POSE = 90
+"""Maximum number of frames that are kept to be tracked once there is a map, or tracking goes on."""
 MIN_SHARED = 100
 """Matches that a waiting frame must share with the current one to start the map instead of the first keyframe:
 `TwoViewStart` needs 60 inliers. The initialiser of ORB-SLAM (Mur-Artal, Montiel, Tardos, 2015) changes its reference
@@ -55,7 +56,7 @@ def begin_again_with_depth(
         replace(record, tracked=False, inliers=0) if record.frame == blind.frame else record for record in slam.frames
     )
     record = FramePose(frame.index, frame.timestamp, blind.number, np.eye(4), True, len(features))
-    waiting = (Waiting(blind.frame, blind.timestamp, blind.image, blind.features), *slam.tracker.waiting)
+    waiting = (UnplacedFrame(blind.frame, blind.timestamp, blind.image, blind.features), *slam.tracker.waiting)
     slam = replace(
         slam,
         map=replace(slam.map, keyframes=(*slam.keyframes[:-1], keyframe)),
@@ -114,7 +115,7 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
 
 
 def _two_views(slam: Slam, frame: Frame, features: Features, roles: Roles) -> tuple[Keyframe, PointMatches, StartGuess]:
-    """The first keyframe, its matches with the frame, and the estimated motion and structure of both."""
+    """Return the first keyframe, its matches with the frame, and the estimated motion and structure of both."""
     first = slam.keyframes[slam.window.members[-1]]
     matches = roles.points.match(first.features, features)
     guess = roles.geometry.start(matches.pixels_i, matches.pixels_j, slam.intrinsics, (first.image, frame.image))
@@ -147,18 +148,20 @@ def _later_first(slam: Slam, features: Features, roles: Roles, settings: SlamSet
         for record in slam.frames
     )
     others = tuple(waiting for waiting in slam.tracker.waiting if waiting.frame != chosen.frame)
-    back = Waiting(old.frame, old.timestamp, old.image, old.features)
+    back = UnplacedFrame(old.frame, old.timestamp, old.image, old.features)
     return replace(
         slam,
         map=replace(slam.map, keyframes=(*slam.keyframes[:-1], first)),
-        tracker=replace(slam.tracker, frames=tuple(records), waiting=(back, *others)[-MAX_WAITING:]),
+        tracker=replace(slam.tracker, frames=tuple(records), waiting=(back, *others)[-MAX_FRAMES_WITHOUT_POSE:]),
     )
 
 
 def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
-    waiting = (*slam.tracker.waiting, Waiting(frame.index, frame.timestamp, frame.image, features))
+    waiting = (*slam.tracker.waiting, UnplacedFrame(frame.index, frame.timestamp, frame.image, features))
     record = FramePose(frame.index, frame.timestamp, slam.window.members[-1], np.eye(4), False, 0)
-    return replace(slam, tracker=replace(slam.tracker, waiting=waiting[-MAX_WAITING:], frames=(*slam.frames, record)))
+    return replace(
+        slam, tracker=replace(slam.tracker, waiting=waiting[-MAX_FRAMES_WITHOUT_POSE:], frames=(*slam.frames, record))
+    )
 
 
 def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:

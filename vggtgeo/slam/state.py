@@ -90,7 +90,7 @@ class Slam:
         return self.tracker.frames
 
     def pose(self, record: FramePose) -> np.ndarray:
-        """World -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
+        """Return world -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""
         return frame_pose(self.map, record)
 
     @property

@@ -110,10 +110,10 @@ def _check_features(features: Features, shape: tuple[int, int]) -> None:
 
 def _check_slots(name: str, slots: Slots, count: int) -> None:
     _check_pixels(f"pixels of {name}", slots.pixels, (count, 2))
-    for field in ("inverse_depth", "prior", "sigma", "deviation"):
+    for field in ("inverse_depth", "prior_mean", "prior_sigma", "estimate_sigma"):
         _check_lengths(f"{field} of {name}", getattr(slots, field), (count,))
-    if ((slots.sigma == 0) & (slots.prior > 0)).any():
-        raise ValueError(f"`sigma of {name}` must be positive where there is a prior, got 0")
+    if ((slots.prior_sigma == 0) & (slots.prior_mean > 0)).any():
+        raise ValueError(f"`prior_sigma of {name}` must be positive where there is a prior, got 0")
     for field in ("prior_confidence", "confidence"):
         check_confidence(f"{field} of {name}", getattr(slots, field), (count,))
 

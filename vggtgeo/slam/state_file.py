@@ -42,7 +42,7 @@ from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_checks import check_state
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, Waiting
+from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, UnplacedFrame
 from vggtgeo.slam.window.adjustment import Adjustment
 from vggtgeo.slam.window.window import Window, WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
@@ -60,7 +60,7 @@ STATE_CLASSES: tuple[type, ...] = (
         FramePose,
         SecondMotion,
         SeenPoints,
-        Waiting,
+        UnplacedFrame,
         Evidence,
         Keyframe,
         Slots,
@@ -74,7 +74,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All classes that a file may have; a state with any other is not written."""
-VERSION = 19
+VERSION = 20
 STATE = Format("state", VERSION, by_name(STATE_CLASSES))
 
 
@@ -91,7 +91,7 @@ def save_state(path: str | os.PathLike[str], slam: Slam) -> None:
 
 @in_double_precision
 def load_state(path: str | os.PathLike[str]) -> Slam:
-    """The state that `save_state` wrote, bit by bit.
+    """Load the state that `save_state` wrote, bit by bit.
 
     Raises:
         InputError: the file is missing, damaged, of a version that is not known, or holds no state.

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.state import Slam
 
 
-def pieces_by_size(slam: Slam) -> tuple[tuple[int, ...], ...]:
+def submaps_by_size(slam: Slam) -> tuple[tuple[int, ...], ...]:
     """Return the numbers of the keyframes of each submap, first of the one with the most frames."""
     if not slam.keyframes:
         return ()
-    label = piece_of(slam.map)
+    label = submap_of(slam.map)
     hanging = np.bincount(label[[r.reference for r in slam.frames if r.tracked]], minlength=label.max(initial=-1) + 1)
     order = np.argsort(-hanging, kind="stable")
-    return tuple(tuple(int(number) for number in np.nonzero(label == piece)[0]) for piece in order)
+    return tuple(tuple(int(number) for number in np.nonzero(label == submap)[0]) for submap in order)
 
 
 def lost_stretches(slam: Slam) -> tuple[tuple[int, int], ...]:

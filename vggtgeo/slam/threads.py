@@ -15,7 +15,7 @@ MAX_THREADS = 4
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item], alone: bool = False) -> list[_Result]:
-    """`[function(item) for item in items]`, in that order; `function` is pure, so that threads change no result.
+    """Return `[function(item) for item in items]`; `function` is pure, so threads do not change the result.
 
     alone: one after the other; a network takes all cores, or the GPU, for one item.
     """

@@ -41,11 +41,11 @@ class WindowRecorder(Callback):
         self._last: object = None
 
     def so_far(self) -> tuple[WindowRecord, ...]:
-        """The records."""
+        """Return the records."""
         return tuple(self.records)
 
     def on_resume(self, so_far: tuple[WindowRecord, ...], slam: Slam) -> None:
-        """The last window of `slam` is among the records."""
+        """Continue with these records; the last window of `slam` is among them."""
         self.records = list(so_far)
         self._last = slam.window.solved
 

@@ -20,14 +20,17 @@ def insert_keyframe(
     *,
     length_known: bool = True,
 ) -> Slam:
-    """The state with a keyframe, which was tracked against `tied_to`, in the window and matched to the others."""
+    """Insert a keyframe, which was tracked against `tied_to`, into the window and match it to the others.
+
+    length_known: whether the distance to `tied_to` is measured.
+    """
     given = slam.map, slam.window, keyframe, slam.intrinsics, roles, settings, tied_to
     known, window = sliding_window.enter(*given, length_known=length_known)
     return replace(slam, map=known, window=window)
 
 
 def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
-    """The state after its window was bundle-adjusted."""
+    """Adjust the window of the state."""
     found = sliding_window.adjust(slam.map, slam.window, slam.intrinsics, camera_prior(slam), settings)
     return replace(
         slam,
@@ -39,6 +42,6 @@ def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
 
 
 def camera_prior(slam: Slam) -> CameraPrior:
-    """The prior of the intrinsics in the window."""
+    """Return the prior of the intrinsics in the window."""
     sigma = slam.camera.window_sigma(len(slam.keyframes))
     return CameraPrior(slam.camera.given, sigma)

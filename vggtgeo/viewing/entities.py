@@ -12,7 +12,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.run import frame_trajectory
-from vggtgeo.slam.sparse_map.connected import loop_edges, piece_of
+from vggtgeo.slam.sparse_map.connected import loop_edges, submap_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.state import Slam
@@ -100,7 +100,7 @@ def log_lost(stream: Any, slam: Slam) -> None:
     """
     import rerun as rr
 
-    label = piece_of(slam.map) if slam.keyframes else np.zeros(0, int)
+    label = submap_of(slam.map) if slam.keyframes else np.zeros(0, int)
     losses, gaps = [], []
     for first, last in lost_stretches(slam):
         around = [slam.frames[row] for row in (first - 1, last + 1) if 0 <= row < len(slam.frames)]
@@ -111,7 +111,7 @@ def log_lost(stream: Any, slam: Slam) -> None:
             gaps.append(centres)
     stream.log("world/lost", rr.LineStrips3D(gaps, colors=[_RED] * len(gaps), radii=-2.0))
     stream.log("world/lost/begun", rr.Points3D(np.reshape(losses, (-1, 3)), colors=[_RED], radii=-6.0))
-    paths = [frame_trajectory(slam, piece).positions for piece in range(1, label.max(initial=0) + 1)]
+    paths = [frame_trajectory(slam, submap).positions for submap in range(1, label.max(initial=0) + 1)]
     stream.log("world/unjoined", rr.LineStrips3D(paths, colors=[_ORANGE] * len(paths), radii=-1.5))
 
 
@@ -249,7 +249,7 @@ def log_iteration(stream: Any, row: int, energy: float, record: IterationRecord 
 
 
 def _centres(poses: Any) -> np.ndarray:
-    """Camera centres, [n, 3], of poses world -> camera, [n, 7]."""
+    """Return the camera centres, [n, 3], of poses world -> camera, [n, 7]."""
     return rigid.invert(rigid.to_matrix(np.asarray(poses, np.float64)))[:, :3, 3]
 
 

@@ -79,7 +79,7 @@ class LiveMap:
 
 
 def _is_stale(keyframe: Keyframe, before: _Logged | None, slam: Slam) -> bool:
-    """Whether to log the cloud of a keyframe (again).
+    """Return whether to log the cloud of a keyframe (again).
 
     Without dense depth the cloud is that of the adjusted points, which may have changed. Those of the window change
     with each keyframe and are shown by `world/points`.

@@ -68,7 +68,7 @@ def check_target(target: str) -> str:
 
 
 def _is_recording(file: Path) -> bool:
-    """Whether Rerun wrote the file, so that a new recording may replace it."""
+    """Return whether Rerun wrote the file, so that a new recording may replace it."""
     with file.open("rb") as handle:
         return handle.read(len(_MAGIC)) in (_MAGIC, b"")
 
@@ -142,7 +142,7 @@ def _send_error(stream: Any, seconds: float) -> str:
 
 
 def _write_error(stream: Any, file: Path) -> str:
-    """Why the file is incomplete; empty if it is complete.
+    """Return why the file is incomplete; empty if it is complete.
 
     Rerun's writing thread ends at the first error. A flush sent before is then never answered (rerun-sdk 0.41), and
     closing the stream waits for it. So the stream is abandoned once the file no longer grows.
@@ -165,7 +165,7 @@ def _abandon(stream: Any) -> None:
 
 
 def _disk_error(folder: Path) -> str:
-    """The error of writing a file in `folder`; empty if it can be written."""
+    """Return the error of writing a file in `folder`; empty if it can be written."""
     try:
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(bytes(_PROBE_SIZE))

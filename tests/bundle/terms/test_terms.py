@@ -19,7 +19,7 @@ from priors import prior_on
 from reported import raises
 from scenes import make_scene
 from scipy.spatial.transform import Rotation
-from vggtgeo.solvers.arrow import multiply, reduce
+from vggtgeo.solvers.arrow import dense_schur_complement, multiply
 from vggtgeo.solvers.kernels import Barron, Cauchy, Square
 
 import vggtgeo as vg
@@ -255,7 +255,7 @@ def assembled(
     ba = BundleAdjustment(problem)
     flat, unflat = ravel_pytree(ba.zero_step(state))
     times = lambda system: ravel_pytree(multiply(system, unflat(along)))[0]
-    forces = lambda system: jnp.concatenate([reduce(system).gradient, system.landmark_gradient.ravel()])
+    forces = lambda system: jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
     plain, exact = ba.linearise(state), ba.hessian(state)
     found = (times(plain), times(exact), forces(plain), forces(exact), ravel_pytree(ba.gradient(state))[0])
     slope, curved = jax.jvp(jax.grad(lambda step: vg.energy(problem, state.moved(step))), (flat,), (along,))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from own_terms import with_own_terms
-from vggtgeo.solvers.arrow import multiply, reduce
+from vggtgeo.solvers.arrow import dense_schur_complement, multiply
 
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
@@ -60,7 +60,7 @@ def test_second_derivatives_are_derived(own) -> None:
         total = lambda step: vg.energy(problem, ba.retract(state, unflat(step)))
         system = ba.hessian(state)
         matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
-        gradients = ravel_pytree(ba.gradient(state))[0], reduce(system).gradient
+        gradients = ravel_pytree(ba.gradient(state))[0], dense_schur_complement(system).gradient
         return matrix, gradients, jax.hessian(total)(flat), jax.grad(total)(flat)
 
     matrix, (gradient, dense), hessian, expected = both(problem, state)

@@ -110,7 +110,7 @@ def test_a_black_frame_has_no_confidence() -> None:
 
 @pytest.mark.parametrize(
     ("build", "name", "value"),
-    [(lambda: StructureTensor(sigma=0), "sigma", 0), (lambda: SensorDepth(nearest=3, farthest=2), "farthest", 2)],
+    [(lambda: StructureTensor(sigma=0), "sigma", 0), (lambda: SensorDepth(min_depth=3, max_depth=2), "max_depth", 2)],
 )
 def test_settings_out_of_range_are_refused(build, name: str, value: int) -> None:
     # Proves that a wrong setting is found when the object is made. Oracle: the broken setting.

@@ -22,14 +22,14 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
-from vggtgeo.slam.global_map.global_adjustment import _taken_lens, undistorted
+from vggtgeo.slam.global_map.global_adjustment import _apply_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import SeenPoints
 from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.judge import aligned
-from vggtgeo.slam.verdict.witness import FrameEvidence
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
 _solve = eqx.filter_jit(vg.solve)
@@ -121,12 +121,12 @@ def test_few_keyframes_tell_no_lens() -> None:
 
 def test_a_lens_that_does_not_pay_is_not_taken() -> None:
     # Proves that the state stays where matches do not ask for a lens, or it folds the image. Oracle: the state.
-    slam = settled(recorded_run().states[-1])
+    slam = merge_pending_window(recorded_run().states[-1])
     assert slam.window.solved is not None
     adjustment, state = slam.window.solved
     left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
     for found in (None, left_out, replace(left_out, warp=float("inf"))):
-        assert _taken_lens(slam, adjustment, found) is slam
+        assert _apply_lens(slam, adjustment, found) is slam
 
 
 def test_a_lens_that_folds_the_image_is_none() -> None:
@@ -151,7 +151,7 @@ LENS = Camera((140.0, 140.0, 80.0, 58.0), 160, 120, (-0.2, 0.03, 0.0, 0.0), know
 @cache
 def run_of_room() -> Slam:
     *_, slam = vg.run(vg.simulate("room", 6, size=(160, 120), rate=10.0), ROLES, SETTINGS)
-    return settled(slam)
+    return merge_pending_window(slam)
 
 
 def redrawn(pixels: np.ndarray) -> np.ndarray:
@@ -197,7 +197,7 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
 
 
 def test_corners_of_the_verdict_go_through_the_lens() -> None:
-    # Proves that the witness sees the same camera as the map. Oracle: what it is given, back through the lens.
+    # Proves that the corner tracks show the same camera as the map. Oracle: what it is given, back through the lens.
     slam = undistorted(run_of_room(), LENS)
     seen = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]], np.float32)
     nothing = np.zeros(3, np.float32)

@@ -12,7 +12,7 @@ import pytest
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.camera.calibration import Refinement, try_camera
+from vggtgeo.slam.camera.given_camera import RefinedCamera, refine_given_camera
 from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair, _Points, pairwise_intrinsics
 
 HELD = 1e-6
@@ -34,14 +34,14 @@ def pairs(window: vg.data.SimulatedWindow) -> list[CameraPair]:
     return found
 
 
-def trial(window: vg.data.SimulatedWindow, given: np.ndarray) -> Refinement:
+def trial(window: vg.data.SimulatedWindow, given: np.ndarray) -> RefinedCamera:
     """Adjusted with `given` held, then tried."""
     problem, initial, _ = window.pack(
         fixed_intrinsics=False, intrinsics_mean=given, intrinsics_sigma=np.full(4, HELD * given[0])
     )
     start = eqx.tree_at(lambda state: state.intrinsics, initial, jnp.asarray(given))
     solve = lambda problem, state: _solve(problem, state).state
-    found = try_camera(pairs(window), problem, solve(problem, start), solve)
+    found = refine_given_camera(pairs(window), problem, solve(problem, start), solve)
     assert found is not None
     return found
 

@@ -16,8 +16,8 @@ from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.degradations import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
-from vggtgeo.slam.camera.calibration import keyframe_pairs
 from vggtgeo.slam.camera.camera_estimate import Readout
+from vggtgeo.slam.camera.given_camera import keyframe_pairs
 from vggtgeo.slam.camera.rolling_shutter import (
     _descend,
     _Search,
@@ -179,12 +179,12 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
             (host.points.pixels[edge.slots] - slam.intrinsics[2:]) / slam.intrinsics[:2], np.ones(len(edge.slots))
         ]
         turned = target.pose @ rigid.invert(host.pose)
-        inverse = host.points.prior[edge.slots]
+        inverse = host.points.prior_mean[edge.slots]
         there = inverse / (ray @ turned[2, :3] + turned[2, 3] * inverse)
         return replace(edge, pixels=rolled_pixels(edge.pixels, there, edge.target))
 
     keyframes = tuple(
-        replace(k, points=replace(k.points, pixels=rolled_pixels(k.points.pixels, k.points.prior, k.number)))
+        replace(k, points=replace(k.points, pixels=rolled_pixels(k.points.pixels, k.points.prior_mean, k.number)))
         for k in slam.keyframes
     )
     seen = replace(slam, map=replace(slam.map, keyframes=keyframes))
@@ -274,7 +274,7 @@ def test_a_run_finds_the_shutter_of_its_camera() -> None:
     sequence = vg.simulate("office", 30, 0, (320, 240), rate=10.0, speed=1.5, sensor=sensor)
     errors = []
     for search in (False, True):
-        settings = vg.SlamSettings(refinement=vg.settings.RefinementSettings(rolling_shutter=search))
+        settings = vg.SlamSettings(refinement=vg.settings.GlobalMapSettings(rolling_shutter=search))
         result = vg.reconstruct(sequence, settings=settings, dense="none")
         errors.append(result.summary["truth"]["ate_se3_m"]["rmse"])
         assert ("rolling_shutter" in result.summary) == search

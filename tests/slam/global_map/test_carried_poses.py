@@ -28,7 +28,7 @@ def _straight(length: float) -> np.ndarray:
 
 def _walked(begins: tuple[int, ...]) -> Slam:
     """A walk of 1 m a frame whose keyframes the adjustment has put 1.5 m a frame apart. The keyframe numbers in
-    `begins` begin a piece of map; the others were tracked against the one before.
+    `begins` begin a submap; the others were tracked against the one before.
     """
     tracked, adjusted = _straight(1.0), _straight(1.5)
     like = keyframe(0, np.ones(SIZE))
@@ -61,8 +61,8 @@ def test_frames_between_keyframes_share_what_the_adjustment_changed() -> None:
     assert np.allclose(poses, _straight(1.5), atol=1e-12)
 
 
-def test_a_keyframe_that_begins_a_piece_keeps_its_pose_and_begins_its_own_share() -> None:
-    """The frame that a piece begins with stands where its keyframe does, and the frames behind it share what changed
+def test_a_keyframe_that_begins_a_submap_keeps_its_pose_and_begins_its_own_share() -> None:
+    """The frame that a submap begins with stands where its keyframe does, and the frames behind it share what changed
     from there on; those before it, which nothing ties to it, stay as they were tracked. Oracle: the straight paths.
     """
     _, poses = carried_poses(_walked(begins=(0, 1)))

@@ -12,8 +12,8 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import BELIEF
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.global_map.pose_graph import LOOP_GATE
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.connected import loop_edges
@@ -69,7 +69,7 @@ def test_true_loops_stay_and_false_ones_that_agree_go(seed: int, bias: float) ->
         for start in (0, SIDE):
             nearby, here = start + row - section, start + row
             loops.append(_measured(rng, nearby, here, np.eye(4), KNOWN))
-    kept = consistent_loops(loops, _odometry(rng, true, bias), BELIEF)
+    kept = consistent_loops(loops, _odometry(rng, true, bias), LOOP_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(6)), np.flatnonzero(kept)
 
 
@@ -84,8 +84,8 @@ def test_a_less_plausible_cluster_that_contradicts_a_taken_one_goes() -> None:
     motion = lambda first, second: true[second] @ rigid.invert(true[first])
     right = [_measured(rng, row, row + 2 * SIDE, motion(row, row + 2 * SIDE), KNOWN) for row in range(3)]
     wrong = [_measured(rng, row, row + 2 * SIDE, aside @ motion(row, row + 2 * SIDE), KNOWN) for row in range(10)]
-    assert np.all(Odometry.of(motions, len(true)).distances(wrong) < BELIEF), "odometry alone should allow them"
-    kept = consistent_loops([*wrong, *right], motions, BELIEF)
+    assert np.all(Odometry.of(motions, len(true)).distances(wrong) < LOOP_GATE), "odometry alone should allow them"
+    kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
     assert np.array_equal(np.flatnonzero(kept), [10, 11, 12]), np.flatnonzero(kept)
 
 
@@ -100,8 +100,8 @@ def test_a_true_loop_tells_how_far_odometry_can_be_off_elsewhere() -> None:
     motion = lambda first, second: true[second] @ rigid.invert(true[first])
     right = [_measured(rng, row, row + 2 * SIDE, motion(row, row + 2 * SIDE), KNOWN) for row in range(6)]
     wrong = [_measured(rng, row, row + SIDE, aside @ motion(row, row + SIDE), KNOWN) for row in range(20, 26)]
-    assert consistent_loops(wrong, motions, BELIEF).all(), "odometry alone should allow them"
-    kept = consistent_loops([*wrong, *right], motions, BELIEF)
+    assert consistent_loops(wrong, motions, LOOP_GATE).all(), "odometry alone should allow them"
+    kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(6, 12)), np.flatnonzero(kept)
 
 
@@ -114,7 +114,7 @@ def test_true_loops_at_several_places_stay(seed: int, bias: float) -> None:
     rng, true = np.random.default_rng(seed), _there_and_back()
     pairs = [(row + start, row + end) for start, end in ((0, 2 * SIDE), (10, 60), (30, 70)) for row in range(6)]
     loops = [_measured(rng, first, second, true[second] @ rigid.invert(true[first]), KNOWN) for first, second in pairs]
-    kept = consistent_loops(loops, _odometry(rng, true, bias), BELIEF)
+    kept = consistent_loops(loops, _odometry(rng, true, bias), LOOP_GATE)
     assert kept.all(), np.flatnonzero(~kept)
 
 
@@ -129,10 +129,10 @@ def test_submaps_are_joined_by_the_larger_cluster() -> None:
     motion = lambda first, second: true[second] @ rigid.invert(true[first])
     wrong = [_measured(rng, row, row + 2 * SIDE, aside @ motion(row, row + 2 * SIDE), KNOWN) for row in range(3)]
     right = [_measured(rng, row, row + 2 * SIDE, motion(row, row + 2 * SIDE), KNOWN) for row in range(6)]
-    kept = consistent_loops([*wrong, *right], motions, BELIEF)
+    kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(3, 9)), np.flatnonzero(kept)
-    assert not consistent_loops(right[:1], motions, BELIEF).any()
-    assert consistent_loops(right[:1], motions, BELIEF, alone=np.array([True])).all()
+    assert not consistent_loops(right[:1], motions, LOOP_GATE).any()
+    assert consistent_loops(right[:1], motions, LOOP_GATE, alone=np.array([True])).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -185,7 +185,7 @@ def test_a_rendered_corridor_of_equal_sections_is_not_folded(returns: bool) -> N
     """
     sequence, settings = repeated_corridor(0, 3, returns=returns), SlamSettings()
     roles, truth = default_roles(has_depth=True), sequence.ground_truth()
-    before = settled(list(run_frames(sequence.frames(), sequence.camera, roles, settings, Clock()))[-1])
+    before = merge_pending_window(list(run_frames(sequence.frames(), sequence.camera, roles, settings, Clock()))[-1])
     after = finish(before, roles, settings)
     error = lambda slam: evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
     assert any("contradict the rest of the map" in note for note in after.notes), after.notes

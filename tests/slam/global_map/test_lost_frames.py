@@ -15,19 +15,19 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.lost_frames import place_lost
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import place_waiting
-from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, Waiting
+from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, UnplacedFrame
 
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
 SETTINGS = SlamSettings(
     window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
-    refinement=RefinementSettings(global_adjustment=False),
+    refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
 FREE_ROLES = replace(ROLES, depth=NoDepth())
@@ -47,7 +47,7 @@ def walk() -> tuple[list[Frame], Camera, Trajectory]:
 def lost(walk: tuple[list[Frame], Camera, Trajectory]) -> Slam:
     """A map of the first frames whose scale is free, and all later frames without a pose."""
     frames, camera, _ = walk
-    slam = settled(list(run_frames(iter(frames[:KNOWN]), camera, ROLES, SETTINGS, Clock()))[-1])
+    slam = merge_pending_window(list(run_frames(iter(frames[:KNOWN]), camera, ROLES, SETTINGS, Clock()))[-1])
     last = slam.frames[-1]
     later = [replace(last, frame=frame.index, timestamp=frame.timestamp, tracked=False) for frame in frames[KNOWN:]]
     unplaced = tuple(_waiting(frame) for frame in frames[KNOWN:])
@@ -55,8 +55,8 @@ def lost(walk: tuple[list[Frame], Camera, Trajectory]) -> Slam:
     return replace(slam, map=replace(slam.map, metric=False), tracker=tracker)
 
 
-def _waiting(frame: Frame) -> Waiting:
-    return Waiting(frame.index, frame.timestamp, frame.image, ROLES.points.describe(frame.image))
+def _waiting(frame: Frame) -> UnplacedFrame:
+    return UnplacedFrame(frame.index, frame.timestamp, frame.image, ROLES.points.describe(frame.image))
 
 
 def test_lost_frames_are_placed_by_keyframes_made_of_them(
@@ -89,7 +89,7 @@ def test_frames_that_stay_without_a_pose_are_kept(lost: Slam) -> None:
     """Of the frames that waited, those that the next tracked one does not place are kept, and not more than fit."""
     blank = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     waiting = tuple(
-        Waiting(100 + row, 100.0 + row, blank, ROLES.points.describe(blank)) for row in range(MAX_UNPLACED + 5)
+        UnplacedFrame(100 + row, 100.0 + row, blank, ROLES.points.describe(blank)) for row in range(MAX_UNPLACED + 5)
     )
     tracked = FramePose(300, 300.0, 0, np.eye(4), True, 50)
     tracker = replace(lost.tracker, frames=(*lost.frames, tracked), waiting=waiting, unplaced=())

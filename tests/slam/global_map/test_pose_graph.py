@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, solve_pose_graph
+from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, PoseGraph, solve_pose_graph
 from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 
@@ -90,7 +90,7 @@ def test_large_drift_comes_back_and_false_loops_do_no_harm(seed: int, false: flo
     """
     true, graph, right = _drifting(seed, false, bias, alike)
     before = _errors(graph.poses, true)
-    sure = consistent_loops(graph.loops, graph.motions, BELIEF)
+    sure = consistent_loops(graph.loops, graph.motions, LOOP_GATE)
     assert np.mean(sure[right]) > 0.9, "true loops are consistent"
     found = solve_pose_graph(replace(graph, loops=tuple(compress(graph.loops, sure))))
     right = right[sure]

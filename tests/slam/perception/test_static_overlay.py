@@ -22,8 +22,8 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.perception.static_overlay import StaticOverlay, find_static_overlay
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.verdict.input import check_still_parts
-from vggtgeo.slam.verdict.witness import EvidenceRecorder
+from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
+from vggtgeo.slam.verdict.input_findings import check_static_overlay
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = vg.Camera((300.0, 300.0, 159.5, 119.5), WIDTH, HEIGHT)
@@ -140,7 +140,7 @@ def test_what_covers_most_of_the_picture_is_told(row: int, separable: bool) -> N
     assert not found.sure
     assert found.separable == separable
     assert found.share == pytest.approx(1 - row / HEIGHT, abs=0.06)
-    (finding,) = check_still_parts(found, left_out=separable)
+    (finding,) = check_static_overlay(found, left_out=separable)
     assert finding.level == "degraded"
     assert ("masked as the camera's own" if separable else "nothing was masked") in finding.text
 
@@ -211,7 +211,7 @@ def test_each_rule_is_needed(
 
 @pytest.mark.parametrize("matcher", [SiftMatcher(), OrbMatcher()])
 def test_nothing_is_looked_for_there(matcher: SiftMatcher | OrbMatcher) -> None:
-    """No key point, segment, depth or corner of the verdict's witness lies there; all others stay. Oracle: the same
+    """No key point, segment, depth or corner of the verdict's tracks lies there; all others stay. Oracle: the same
     without a mask.
     """
     image = moving()[0]

@@ -25,7 +25,7 @@ from vggtgeo.cli.models import FLAGS
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.simulation.sequence import SyntheticSequence, simulate, write_tum_folder
 from vggtgeo.slam.run import frame_trajectory, run
-from vggtgeo.slam.settings.groups import RefinementSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings
 from vggtgeo.slam.settings.presets import CHOICES, NEEDED, Perception, perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 
@@ -82,7 +82,7 @@ def test_a_run_asks_every_network_and_from_a_cache_none(
 ) -> None:
     # Proves that a whole run goes through every network of the preset and no other, that its result is finite, and
     # that a second run with the same cache asks none and gives the same. Oracle: a count, and the first trajectory.
-    settings = SlamSettings(refinement=RefinementSettings(global_adjustment=False))
+    settings = SlamSettings(refinement=GlobalMapSettings(global_adjustment=False))
     poses = []
     for expected in (set(NEEDED[preset]), set()):
         found = perception(preset, Roles(), files, tmp_path / "cache")
@@ -111,7 +111,7 @@ def test_depth_that_knows_nothing_leaves_every_other_network_its_part(
     shutil.copytree(files, folder)
     tiny.moge2(folder / "moge2.onnx", SIZE, mask=0.1)
     found = perception("paper", Roles(), folder)
-    *_, slam = run(walk, found.roles, SlamSettings(refinement=RefinementSettings(global_adjustment=False)), end=4)
+    *_, slam = run(walk, found.roles, SlamSettings(refinement=GlobalMapSettings(global_adjustment=False)), end=4)
     assert set(counted) == set(NEEDED["paper"])
     assert counted["vggt"] >= 3
     assert np.isfinite(frame_trajectory(slam).poses).all()
@@ -126,7 +126,7 @@ def test_an_interrupted_run_goes_on(
     def decoded(cache: Path, frames: int) -> int:
         counted.clear()
         roles = perception("paper", Roles(), files, cache).roles
-        for _ in run(walk, roles, SlamSettings(refinement=RefinementSettings(global_adjustment=False)), end=frames):
+        for _ in run(walk, roles, SlamSettings(refinement=GlobalMapSettings(global_adjustment=False)), end=frames):
             pass
         return counted.get("mast3r_decoder", 0)
 

@@ -16,7 +16,7 @@ from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.units import scaled_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import (
-    MAX_WAITING,
+    MAX_FRAMES_BETWEEN_KEYFRAMES,
     against_nearest,
     against_reference,
     squared_distance,
@@ -118,13 +118,17 @@ def test_pictures_do_not_wait_for_long(run: RecordedRun) -> None:
     """The picture that would be one too many is the last that waits: all of them are placed; oracle: the count."""
     slam, row = run.slam, between(run.slam)[-1]
     slam = waiting(
-        run, replace(slam, tracker=replace(slam.tracker, frames=slam.frames[: row + 1])), [row] * (MAX_WAITING - 1)
+        run,
+        replace(slam, tracker=replace(slam.tracker, frames=slam.frames[: row + 1])),
+        [row] * (MAX_FRAMES_BETWEEN_KEYFRAMES - 1),
     )
     seen = slam.tracker.between[0][1]
     waits = lambda known, tracker: len(with_view(known, tracker, seen, slam.intrinsics, Roles()).between)
-    assert waits(slam.map, replace(slam.tracker, between=slam.tracker.between[1:])) == MAX_WAITING - 1
+    assert waits(slam.map, replace(slam.tracker, between=slam.tracker.between[1:])) == MAX_FRAMES_BETWEEN_KEYFRAMES - 1
     assert waits(slam.map, slam.tracker) == 0
-    assert waits(replace(slam.map, metric=False), slam.tracker) == MAX_WAITING - 1, "lengths of a map without unit"
+    assert waits(replace(slam.map, metric=False), slam.tracker) == MAX_FRAMES_BETWEEN_KEYFRAMES - 1, (
+        "lengths of a map without unit"
+    )
 
 
 def test_poses_that_contradict_each_other_are_told_by_what_both_know(run: RecordedRun) -> None:
@@ -148,7 +152,7 @@ def test_poses_that_contradict_each_other_are_told_by_what_both_know(run: Record
 
 
 def test_in_a_larger_world_frames_are_placed_as_before(run: RecordedRun) -> None:
-    """A map whose lengths become three times as long, as a piece that joins another one: frames stand where they stood,
+    """Lengths of a map become three times as long, as a submap that joins another one: frames stand where they stood,
     three times as far, and agree with both keyframes as well as they did. Oracle: the poses before.
     """
     slam = run.slam

@@ -147,11 +147,11 @@ def test_segments_without_depth_get_it_from_other_views() -> None:
     baseline = np.array([1.0, 0.2, 0.1]) / np.linalg.norm([1.0, 0.2, 0.1])
     points = np.concatenate([_segments(40, rng), _segments(10, rng, baseline)])
     known = _keyframe(points, rng, 0.02)
-    unknown = np.full_like(known.samples.prior, np.nan)
+    unknown = np.full_like(known.samples.prior_mean, np.nan)
     blind = replace(
         known,
         line_depths=np.full((50, 2), np.nan),
-        samples=replace(known.samples, inverse_depth=unknown, prior=unknown, sigma=unknown),
+        samples=replace(known.samples, inverse_depth=unknown, prior_mean=unknown, prior_sigma=unknown),
     )
     views, edges = {0: blind}, []
     index, ones = np.arange(50), np.ones(50)
@@ -164,7 +164,7 @@ def test_segments_without_depth_get_it_from_other_views() -> None:
     assert has[:40].sum() > 20
     assert not has[40:].any(), "the motion does not tell the depth of a line along it"
     error = (1.0 / found.line_depths[has] - 1.0 / points[has, :, 2]).ravel()
-    stated = np.array([found.samples.sigma[found.sample_segment == s].mean() for s in np.nonzero(has)[0]])
+    stated = np.array([found.samples.prior_sigma[found.sample_segment == s].mean() for s in np.nonzero(has)[0]])
     assert 0.5 < np.std(error / np.repeat(stated, 2)) < 2.0
     one = with_segment_depths(views, edges[:1], INTRINSICS)[0]
     assert np.isnan(one.line_depths).all()

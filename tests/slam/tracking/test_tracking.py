@@ -21,17 +21,17 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.join_at_end import join_at_end
-from vggtgeo.slam.global_map.join_submaps import join_pieces, scaled_piece
-from vggtgeo.slam.pending_window import settled
+from vggtgeo.slam.global_map.join_submaps import join_submaps, scale_submap
+from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import step
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import RefinementSettings, WindowSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import updated
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking import relocalisation
@@ -42,7 +42,7 @@ SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
 SETTINGS = SlamSettings(
     window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
-    refinement=RefinementSettings(global_adjustment=False),
+    refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
 FREE_ROLES = replace(ROLES, depth=NoDepth())
@@ -58,7 +58,7 @@ def room() -> Room:
 
 
 def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES) -> Slam:
-    return settled(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
+    return merge_pending_window(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
 
 
 def _black(frame: Frame) -> Frame:
@@ -407,7 +407,7 @@ def test_a_place_that_drift_has_moved_is_used_again(
 
 
 @pytest.mark.long
-def test_pieces_join_where_they_meet(room: Room) -> None:
+def test_submaps_join_where_they_meet(room: Room) -> None:
     """Two parts of a room, the second begun without knowing the first, become one map when the camera comes back.
 
     Oracle: the renderer's poses, over both parts together.
@@ -420,7 +420,7 @@ def test_pieces_join_where_they_meet(room: Room) -> None:
     numbers = [*range(8), *range(away, 4, -2)]
     frames = [replace(sequence.frame(i), index=k, timestamp=k / 10) for k, i in enumerate(numbers)]
     slam = _run(frames, sequence.camera)
-    assert any("a new piece of map" in note for note in slam.notes), slam.notes
+    assert any("a new submap" in note for note in slam.notes), slam.notes
     assert any("is joined to the one before" in note for note in slam.notes), slam.notes
     assert len(slam.map.roots) == 1
     slam = finish(slam, ROLES, updated(SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 10}}))
@@ -448,7 +448,7 @@ def torn(room: Room) -> tuple[Slam, Slam]:
             factors=tuple(factor for factor in whole.map.factors if own(factor.keyframes)),
         ),
     )
-    apart = scaled_piece(torn_apart, 1.6, lambda number: number >= origin)
+    apart = scale_submap(torn_apart, 1.6, lambda number: number >= origin)
     moved = np.eye(4)
     moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
     moved[:3, 3] = [0.5, -1.0, 2.0]
@@ -456,7 +456,7 @@ def torn(room: Room) -> tuple[Slam, Slam]:
     return whole, replace(apart, map=replace(apart.map, keyframes=keyframes))
 
 
-def test_pieces_of_free_scale_join_by_a_similarity(room: Room, torn: tuple[Slam, Slam]) -> None:
+def test_submaps_of_free_scale_join_by_a_similarity(room: Room, torn: tuple[Slam, Slam]) -> None:
     """The last third of a map whose scale is free, 1.6 times too large and elsewhere, comes back where it was when its
     newest keyframe shows the rest. Oracle: the map before it was taken apart.
     """
@@ -464,10 +464,10 @@ def test_pieces_of_free_scale_join_by_a_similarity(room: Room, torn: tuple[Slam,
     newest = whole.keyframes[-1]
     shown = [*room[0][:16], *room[0][14:4:-1]][newest.frame]
     data = FrameData(replace(shown, index=newest.frame), Description.of(newest.features), None)
-    _check_joined(whole, join_pieces(apart, data, FREE_ROLES, SETTINGS))
+    _check_joined(whole, join_submaps(apart, data, FREE_ROLES, SETTINGS))
 
 
-def test_pieces_that_never_met_join_at_the_end(torn: tuple[Slam, Slam]) -> None:
+def test_submaps_that_never_met_join_at_the_end(torn: tuple[Slam, Slam]) -> None:
     """The same by all keyframes that look alike, when the run is over. Oracle: the map before it was taken apart."""
     whole, apart = torn
     _check_joined(whole, join_at_end(apart, FREE_ROLES))
@@ -478,7 +478,7 @@ def _check_joined(whole: Slam, joined: Slam) -> None:
     unit of the first.
     """
     assert len(joined.map.roots) == 1, joined.notes
-    assert len(set(piece_of(joined.map))) == 1
+    assert len(set(submap_of(joined.map))) == 1
     first, now = whole.keyframes[0], joined.keyframes[0]
     unit = float(np.nanmedian(now.points.inverse_depth / first.points.inverse_depth))
     for before, after in zip(whole.keyframes, joined.keyframes, strict=True):

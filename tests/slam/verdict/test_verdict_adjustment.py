@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from corner_walk import walk
 from scipy.stats import binom, chi2
-from witness import walk
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.adjustment import FOCAL, SIZE, Noise, Unknowns, linearise, reduce, solve, start_of

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from witness import SIZE, K, Walk, walk
+from corner_walk import SIZE, K, Walk, walk
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.adjustment import solve, start_of
 from vggtgeo.slam.verdict.alternatives import TABLE, explain, second_motion
 from vggtgeo.slam.verdict.claim import extent
 from vggtgeo.slam.verdict.consequence import confirmed
-from vggtgeo.slam.verdict.decision import contradiction
-from vggtgeo.slam.verdict.levels import DEPTH_NOISE, RIVAL
+from vggtgeo.slam.verdict.corner_findings import contradiction
+from vggtgeo.slam.verdict.thresholds import MAX_DEPTH_NOISE, MAX_SECOND_MOTION_SHARE
 
 COUNT = 20
 
@@ -142,7 +142,7 @@ def test_a_layer_at_rest_in_the_picture_is_a_second_motion(follows_overlay: bool
     here = _with_overlay(walk(COUNT), 0.35 if not follows_overlay else 0.6)
     still = np.tile(here.claim.poses[:1], (COUNT, 1, 1))
     found = here.explanation(poses=still if follows_overlay else here.claim.poses)
-    assert found.rival > RIVAL * (found.rival + found.share), (found.rival, found.share)
+    assert found.rival > MAX_SECOND_MOTION_SHARE * (found.rival + found.share), (found.rival, found.share)
     one = contradiction(found, True)
     assert one is not None
     assert one.cause == "second motion"
@@ -153,7 +153,7 @@ def test_depth_of_another_scene_contradicts_the_images() -> None:
     rng = np.random.default_rng(1)
     here = walk(COUNT, measured=lambda row, z: rng.permutation(z))
     found = here.explanation()
-    assert found.best.noise.depth > DEPTH_NOISE
+    assert found.best.noise.depth > MAX_DEPTH_NOISE
     one = contradiction(found, True)
     assert one is not None
     assert one.cause == "depth"

@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from conftest import ROOT
-from witness import K, walk
+from corner_walk import K, walk
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from witness import Walk
+from corner_walk import Walk
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty

@@ -8,19 +8,19 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from corner_walk import K, walk
 from recorded_run import recorded_run
 from scipy.spatial.transform import Rotation
-from witness import K, walk
 
 from vggtgeo.results.result import Result
 from vggtgeo.slam.verdict import judge as judge_module
 from vggtgeo.slam.verdict.adjustment import Noise, solve, start_of
-from vggtgeo.slam.verdict.decision import findings
+from vggtgeo.slam.verdict.corner_findings import findings
+from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
 from vggtgeo.slam.verdict.judge import check_unit, judge, judge_or_report
-from vggtgeo.slam.verdict.levels import MAX_REASONS
+from vggtgeo.slam.verdict.thresholds import MAX_REASONS
 from vggtgeo.slam.verdict.windows import WINDOW, linked, thinned, windows
-from vggtgeo.slam.verdict.witness import EvidenceRecorder
 
 
 def _turn(degrees: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Random graphs of keyframes, cut and whole: each connected piece that is solved is held at exactly one place."""
+"""Random graphs of keyframes, cut and whole: each connected component that is solved is held at exactly one place."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from vggtgeo.solvers.arrow import reduce
+from vggtgeo.solvers.arrow import dense_schur_complement
 
 from vggtgeo.bundle.linearise import free_coordinates, linearise
 from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit
@@ -34,7 +34,7 @@ SOLVE = eqx.filter_jit(solve)
 @eqx.filter_jit
 def _information(problem: Problem, state: State) -> tuple[jnp.ndarray, jnp.ndarray]:
     """Of the poses, landmarks eliminated; and which coordinates are free."""
-    reduced = reduce(linearise(prepared(problem), state))
+    reduced = dense_schur_complement(linearise(prepared(problem), state))
     return reduced.hessian - reduced.schur, free_coordinates(problem)
 
 
@@ -82,12 +82,12 @@ def _ties(window: SimulatedWindow, ends: np.ndarray, weight: np.ndarray) -> Rela
     )
 
 
-def _off(window: SimulatedWindow, state: State, pieces: Iterable[Iterable[int]]) -> float:
-    """Largest error of a relative pose between keyframes of one piece, metres or radians."""
+def _off(window: SimulatedWindow, state: State, components: Iterable[Iterable[int]]) -> float:
+    """Largest error of a relative pose between keyframes of one component, metres or radians."""
     true, found = rigid.to_matrix(window.poses), rigid.to_matrix(np.asarray(state.poses.wxyz_xyz)[: len(window.poses)])
     worst = 0.0
-    for piece in pieces:
-        for a, b in combinations(piece, 2):
+    for component in components:
+        for a, b in combinations(component, 2):
             error = found[b] @ rigid.invert(found[a]) @ rigid.invert(true[b] @ rigid.invert(true[a]))
             turned = np.linalg.norm(Rotation.from_matrix(error[:3, :3]).as_rotvec())
             worst = max(worst, float(np.linalg.norm(error[:3, 3])), float(turned))
@@ -95,27 +95,27 @@ def _off(window: SimulatedWindow, state: State, pieces: Iterable[Iterable[int]])
 
 
 @pytest.mark.parametrize("seed", range(24))
-def test_each_piece_of_a_random_graph_has_one_gauge(seed: int) -> None:
-    """Nothing is free, each piece given free has exactly six free directions, and each is solved right.
+def test_each_component_of_a_random_graph_has_one_gauge(seed: int) -> None:
+    """Nothing is free, each component given free has exactly six free directions, and each is solved right.
 
-    Oracle: eigenvalues of the dense information of all poses; the true relative poses within each piece. Every other
-    graph has links too weak to tie.
+    Oracle: eigenvalues of the dense information of all poses; the true relative poses within each component. Every
+    other graph has links too weak to tie.
     """
     few = 1 + 2 * (seed % 2)
     window, problem, initial = _random_graph(seed, few)
     held, gauge = with_one_gauge(problem, initial, KEYFRAMES, metric=True)
-    assert sorted(row for piece in gauge.pieces for row in piece) == list(range(KEYFRAMES))
+    assert sorted(row for component in gauge.components for row in component) == list(range(KEYFRAMES))
     fixed = np.asarray(held.fixed_pose)
-    assert [int(fixed[list(piece)].sum()) for piece in gauge.pieces] == [1] * len(gauge.pieces)
+    assert [int(fixed[list(component)].sum()) for component in gauge.components] == [1] * len(gauge.components)
     assert _null_dimensions(held, initial) == 0
     free = replace(held, fixed_pose=jnp.zeros(KEYFRAMES, bool))
-    assert _null_dimensions(free, initial) == 6 * len(gauge.pieces)
-    for piece in gauge.free:
-        assert not np.asarray(problem.fixed_pose)[list(piece)].any()
+    assert _null_dimensions(free, initial) == 6 * len(gauge.components)
+    for component in gauge.free:
+        assert not np.asarray(problem.fixed_pose)[list(component)].any()
     solution = SOLVE(held, initial)
     assert np.isfinite(np.asarray(solution.state.poses.wxyz_xyz)).all()
-    error = _off(window, solution.state, gauge.pieces)
-    assert error < 1e-4, f"{gauge.pieces}: {error:.2e}"
+    error = _off(window, solution.state, gauge.components)
+    assert error < 1e-4, f"{gauge.components}: {error:.2e}"
 
 
 def test_what_is_held_is_said() -> None:
@@ -133,7 +133,7 @@ def test_what_is_held_is_said() -> None:
     assert "keyframes 13 " in notes[0]
     solution = SOLVE(held, initial)
     np.testing.assert_array_equal(solution.state.poses.wxyz_xyz[3], initial.poses.wxyz_xyz[3])
-    assert _off(window, solution.state, gauge.pieces) < 1e-4
+    assert _off(window, solution.state, gauge.components) < 1e-4
 
 
 @pytest.mark.long
@@ -141,7 +141,7 @@ def test_what_is_held_is_said() -> None:
 def test_windows_whose_first_keyframe_leaves_keep_their_gauge(seed: int) -> None:
     """A window slides over a random chain; what left holds the rest by its prior, and what it did not know is held.
 
-    Oracle: the true relative poses within each piece, and eigenvalues of the dense information.
+    Oracle: the true relative poses within each component, and eigenvalues of the dense information.
     """
     window, problem, state = _random_graph(100 + seed, few=3)
     numbers: tuple[int, ...] = tuple(range(KEYFRAMES))
@@ -169,13 +169,13 @@ def test_windows_whose_first_keyframe_leaves_keep_their_gauge(seed: int) -> None
         moved = eqx.tree_at(lambda s: s.poses.wxyz_xyz, state, jnp.asarray(shaken))
         solution = SOLVE(problem, moved)
         state = solution.state
-        # Two pieces that were held apart at first stay so: the prior keeps both where they were.
-        error = _off(window, state, [[row for row in piece if row > leaving] for piece in first.pieces])
-        assert error < 1e-3, f"{first.pieces} without {leaving}: {error:.2e}"
+        # Two components that were held apart at first stay so: the prior keeps both where they were.
+        error = _off(window, state, [[row for row in component if row > leaving] for component in first.components])
+        assert error < 1e-3, f"{first.components} without {leaving}: {error:.2e}"
 
 
 def test_a_unit_that_nothing_tells_is_held() -> None:
-    """Without any depth the size of a piece is held by a second keyframe; oracle: the dense information's rank."""
+    """Without any depth the size of a component is held by a second keyframe; oracle: the dense information's rank."""
     window = simulate_window(KEYFRAMES, POINTS, 0, noise=0.0, depth_error=0.0, start_error=0.0)
     seen = replace(window.observations, depth_weight=np.zeros(KEYFRAMES * POINTS))
     bare = replace(window, observations=seen)

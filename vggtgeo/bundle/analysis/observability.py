@@ -49,8 +49,8 @@ from vggtgeo.solvers.arrow import (
     Reduced,
     couple,
     dense_gradient,
+    dense_schur_complement,
     inverse_landmark_hessian,
-    reduce,
 )
 from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
 from vggtgeo.solvers.finite import is_finite, unless
@@ -109,7 +109,7 @@ def observability(problem: Problem, state: State) -> Observability:
 @eqx.filter_jit
 def _observability_jit(problem: Problem, state: State) -> Observability:
     systems, everything, coordinates = _linearise_each(problem, state)
-    combined = lambda keep: reduce(_combine(systems, keep, problem.fraction))
+    combined = lambda keep: dense_schur_complement(_combine(systems, keep, problem.fraction))
     # One after the other: all matrices at once would take `2 k + 1` times the memory.
     spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), _selections(len(systems), state))
     found = _found(problem, state, systems, everything, coordinates, spectra)

@@ -88,7 +88,7 @@ class PoseTerm(AbstractTerm):
         return _differentiated(self, data, touched, poses, cameras)
 
     def touched(self) -> tuple[_Index, ...]:
-        """Keyframes of each observation."""
+        """Return the keyframes of each observation."""
         return (self.keyframe,)
 
     def observation_shape(self) -> tuple[int, ...]:
@@ -150,7 +150,7 @@ class PairTerm(AbstractTerm):
         return _differentiated(self, data, touched, poses, cameras)
 
     def touched(self) -> tuple[_Index, ...]:
-        """Keyframes of each observation."""
+        """Return the keyframes of each observation."""
         return self.first, self.second
 
     def observation_shape(self) -> tuple[int, ...]:

@@ -10,8 +10,8 @@ import numpy as np
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.camera.calibration import Refinement, Solve, keyframe_pairs, try_camera, without_surfaces
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
+from vggtgeo.slam.camera.given_camera import RefinedCamera, Solve, keyframe_pairs, refine_given_camera, without_surfaces
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair
 from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
@@ -43,25 +43,25 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
     """
     if len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA or not slam.map.pairs:
         return slam
-    whole, solved = _Whole.of(slam, settings), None
+    shared, solved = _SharedByRounds.of(slam, settings), None
     for number in range(settings.refinement.global_rounds):
         is_first = number == 0
-        adjustment, notes = whole.adjustment(slam, settings, finds_camera=is_first and not slam.camera.calibrated)
+        adjustment, notes = shared.adjustment(slam, settings, finds_camera=is_first and not slam.camera.calibrated)
         slam = replace(slam, notes=(*slam.notes, *notes)) if is_first else slam
         solution = solve_jit(adjustment.problem, adjustment.initial, global_solver(adjustment.problem, settings))
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
-        slam, solved = _taken(slam, adjustment, solution.state), (adjustment.problem, solution.state)
+        slam, solved = _apply_solution(slam, adjustment, solution.state), (adjustment.problem, solution.state)
         if is_first:
-            slam, adjustment, state = _with_its_readout(slam, adjustment, solution.state, settings)
-            slam, whole = whole.with_its_camera(slam, adjustment, state, settings)
+            slam, adjustment, state = _try_rolling_shutter(slam, adjustment, solution.state, settings)
+            slam, shared = shared.try_camera(slam, adjustment, state, settings)
             solved = adjustment.problem, state
     sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
     return replace(slam, map=replace(slam.map, pose_sigma=sigma))
 
 
 @dataclass(frozen=True, eq=False)
-class _Whole:
+class _SharedByRounds:
     """Data shared by all rounds: edges between keyframes, surfaces, the camera's prior, and the padded size."""
 
     edges: list[Directed]
@@ -70,7 +70,7 @@ class _Whole:
     shape: GlobalShape
 
     @classmethod
-    def of(cls, slam: Slam, settings: SlamSettings) -> _Whole:
+    def of(cls, slam: Slam, settings: SlamSettings) -> _SharedByRounds:
         edges = _edges(slam)
         degrees = np.bincount([edge.host for edge in edges])
         shape = shape_of(len(slam.keyframes), degrees.tolist(), slam.map.factors, len(slam.map.pairs), settings)
@@ -82,7 +82,7 @@ class _Whole:
 
         finds_camera: without measurements that depend on the current camera: tracked motions and surfaces.
         """
-        factors = _of_any_camera(slam) if finds_camera else slam.map.factors
+        factors = _factors_without_intrinsics(slam) if finds_camera else slam.map.factors
         adjustment = build(
             slam.keyframes,
             self.edges,
@@ -99,16 +99,16 @@ class _Whole:
         notes = gauge_notes(gauge, adjustment.keyframes, "global adjustment")
         return _without_readout(slam, replace(adjustment, problem=problem)), notes
 
-    def with_its_camera(
+    def try_camera(
         self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
-    ) -> tuple[Slam, _Whole]:
+    ) -> tuple[Slam, _SharedByRounds]:
         """Return the state after trying to refine its camera, and the data for the following rounds.
 
-        A guessed camera is fixed after its estimation (see `_of_any_camera`).
+        A guessed camera is fixed after its estimation (see `_factors_without_intrinsics`).
         """
         before = slam.intrinsics
         if settings.camera.refine_intrinsics != "never":
-            slam = _with_its_camera(slam, adjustment, state, self.edges, settings)
+            slam = _try_camera(slam, adjustment, state, self.edges, settings)
         if settings.refinement.global_rounds == 1 or (slam.camera.calibrated and slam.intrinsics is before):
             return slam, self
         camera = replace(self.camera, mean=slam.intrinsics)
@@ -136,7 +136,7 @@ def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:
     )
 
 
-def _with_its_readout(
+def _try_rolling_shutter(
     slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
 ) -> tuple[Slam, Adjustment, State]:
     """Return the state after a search for a rolling shutter, the last adjustment and its solution."""
@@ -148,22 +148,22 @@ def _with_its_readout(
     if found is None or not found.pays:
         return slam, adjustment, state
     adjustment = replace(adjustment, problem=found.problem)
-    slam = _taken(slam, adjustment, found.state)
+    slam = _apply_solution(slam, adjustment, found.state)
     return replace(slam, camera=replace(slam.camera, readout=found.readout)), adjustment, found.state
 
 
-def _with_its_camera(
+def _try_camera(
     slam: Slam, adjustment: Adjustment, state: State, edges: list[Directed], settings: SlamSettings
 ) -> Slam:
     """Return the state after trying to refine a given camera, or to undistort a guessed one."""
     again = _solves(settings)
     if slam.camera.calibrated:
-        found = try_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, again)
-        return _taken_camera(slam, adjustment, found, settings)
-    slam, adjustment, state = _with_its_pixels(slam, adjustment, state, again)
+        found = refine_given_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, again)
+        return _apply_refined_camera(slam, adjustment, found, settings)
+    slam, adjustment, state = _try_pixel_aspect(slam, adjustment, state, again)
     if slam.camera.lens is not None or not can_undistort(slam.keyframes):
         return slam
-    return _taken_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, again))
+    return _apply_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, again))
 
 
 def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
@@ -171,7 +171,7 @@ def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
     return keyframe_pairs(slam.map, slam.camera, edges, motions)
 
 
-def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
+def _try_pixel_aspect(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
     """Return the state after trying non-square pixels for a guessed camera, the last adjustment and its solution."""
     if not adjustment.problem.shared_focal:
         return slam, adjustment, state
@@ -179,7 +179,7 @@ def _with_its_pixels(slam: Slam, adjustment: Adjustment, state: State, solve: So
     if found is None or not found.pays:
         return slam, adjustment, state
     adjustment = replace(adjustment, problem=found.problem)
-    slam = _taken(slam, adjustment, found.state)
+    slam = _apply_solution(slam, adjustment, found.state)
     fx, fy = slam.intrinsics[:2]
     note = f"the unknown camera was estimated with pixels that are not square: fx, fy = {fx:.1f}, {fy:.1f} px"
     return replace(slam, notes=(*slam.notes, note)), adjustment, found.state
@@ -204,7 +204,7 @@ def _surfaces(slam: Slam) -> list[Surface]:
     return map_in_threads(of, slam.keyframes) if slam.metric else []
 
 
-def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
+def _apply_solution(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
     """Return the state with the result of an adjustment."""
     keyframes, intrinsics = write_back(slam.keyframes, adjustment, state)
     return replace(
@@ -215,14 +215,16 @@ def _taken(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
     )
 
 
-def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, settings: SlamSettings) -> Slam:
+def _apply_refined_camera(
+    slam: Slam, adjustment: Adjustment, found: RefinedCamera | None, settings: SlamSettings
+) -> Slam:
     """Return the state with a refined camera if it improves the fit or is required, and notes for the user."""
     if found is None:
         return slam
     notes = [*slam.notes, *_lens_note(found, slam.keyframes[0].size)]
     always = settings.camera.refine_intrinsics == "always"
     if found.state is not None and (found.pays or always):
-        slam = _taken(slam, adjustment, found.state)
+        slam = _apply_solution(slam, adjustment, found.state)
         if found.change > REPORTED_CHANGE:
             cameras = [", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted)]
             change = 100 * found.change
@@ -230,11 +232,11 @@ def _taken_camera(slam: Slam, adjustment: Adjustment, found: Refinement | None, 
     return replace(slam, notes=tuple(notes))
 
 
-def _taken_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
+def _apply_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
     """Return the state with its distortion removed if that improves the fit, and a note."""
     if found is None or np.isinf(found.warp) or not found.pays:
         return slam
-    adjusted = undistorted(_taken(slam, adjustment, found.state), found.camera)
+    adjusted = undistorted(_apply_solution(slam, adjustment, found.state), found.camera)
     k1, k2, *_ = found.camera.distortion
     note = (
         f"the unknown camera was estimated with lens distortion: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "
@@ -260,7 +262,7 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
     )
 
 
-def _lens_note(found: Refinement, shape: tuple[int, int]) -> list[str]:
+def _lens_note(found: RefinedCamera, shape: tuple[int, int]) -> list[str]:
     """Return a note on a significant distortion that moves the corners of the image beyond the noise of matches."""
     (k1, sigma), focal = found.distortion, float(found.given[0])
     # Displacement of a corner at normalised radius `r`: `f k1 r^3`.
@@ -282,7 +284,7 @@ def _terms(
     return (*terms, align_pairs(slam.keyframes, pairs, surfaces, settings.depth_terms.surface_points, shape.pairs))
 
 
-def _of_any_camera(slam: Slam) -> tuple[Factor, ...]:
+def _factors_without_intrinsics(slam: Slam) -> tuple[Factor, ...]:
     """Return the factors that do not depend on the intrinsics: all but tracked motions of keyframes that share matches.
 
     A motion was tracked with the intrinsics of that moment and would bias their estimate towards them. Once the

@@ -13,14 +13,14 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import can_search
-from vggtgeo.slam.global_map.join_submaps import scaled_piece
+from vggtgeo.slam.global_map.drift_correction import Loop
+from vggtgeo.slam.global_map.join_submaps import scale_submap
 from vggtgeo.slam.global_map.loops import verify
-from vggtgeo.slam.global_map.straightening import Loop
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.units import MAX_SCALE_ERROR, scaled_motion
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.threads import map_in_threads
 
 ALIKE = 2
@@ -34,7 +34,7 @@ def join_at_end(slam: Slam, roles: Roles) -> Slam:
     joined = None if slam.metric else slam
     while joined is not None:
         slam, joined = joined, None
-        main, *others = pieces_by_size(slam) or ((),)
+        main, *others = submaps_by_size(slam) or ((),)
         for other in others:
             joined = _joined(slam, main, other, roles)
             if joined is not None:
@@ -43,7 +43,7 @@ def join_at_end(slam: Slam, roles: Roles) -> Slam:
 
 
 def _joined(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Roles) -> Slam | None:
-    """The state with the submap `other` moved to where it belongs in `main`; None where that is not known."""
+    """Move the submap `other` to its place in `main`, and return the state; None if that place is unknown."""
 
     def verified(pair: tuple[int, int]) -> Loop | None:
         first, second = (slam.keyframes[number] for number in pair)
@@ -64,7 +64,7 @@ def _joined(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Ro
         return None
     joined, agreeing = best
     note = (
-        f"the piece of map that began at frame {slam.keyframes[other[0]].frame} is joined to the rest at the end: "
+        f"the submap that began at frame {slam.keyframes[other[0]].frame} is joined to the rest at the end: "
         f"{len(agreeing)} pairs of keyframes agree on its place"
     )
     motions = tuple(loop.motion for loop in agreeing if loop.motion.first in main)
@@ -81,7 +81,7 @@ def _joined(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Ro
 def _look_alike(
     keyframes: tuple[Keyframe, ...], main: tuple[int, ...], other: tuple[int, ...]
 ) -> list[tuple[int, int]]:
-    """Pairs of keyframes of two submaps, the earlier first, that look most alike."""
+    """Return pairs of keyframes of two submaps, the earlier first, that look most alike."""
     described = lambda numbers: [number for number in numbers if keyframes[number].place is not None]
     ours, theirs = described(main), described(other)
     if not ours or not theirs:
@@ -94,7 +94,7 @@ def _look_alike(
 
 
 def _moved(slam: Slam, loop: Loop, other: set[int]) -> Slam:
-    """The state with the submap of keyframes `other` where a loop says that it is, in the unit of the rest."""
+    """Move the submap of keyframes `other` to where a loop places it, in the scale of the rest."""
     first, second = loop.pair.key
     ratio = 1.0 if loop.scale is None else loop.scale.ratio
     if first in other:
@@ -104,7 +104,7 @@ def _moved(slam: Slam, loop: Loop, other: set[int]) -> Slam:
         number, place = first, motion @ slam.keyframes[second].pose
     else:
         number, place = second, loop.motion.pose @ slam.keyframes[first].pose
-    scaled = scaled_piece(slam, ratio, lambda own: own in other)
+    scaled = scale_submap(slam, ratio, lambda own: own in other)
     carried = rigid.invert(scaled.keyframes[number].pose) @ place
     keyframes = tuple(
         replace(keyframe, pose=rigid.orthonormal(keyframe.pose @ carried)) if keyframe.number in other else keyframe

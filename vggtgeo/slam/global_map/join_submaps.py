@@ -11,7 +11,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.units import longer, ratio_of_units, scaled_factor, scaled_keyframe
 from vggtgeo.slam.state import Slam
@@ -24,14 +24,14 @@ TRIED = 2
 """Keyframes of other submaps that are verified for each new keyframe."""
 
 
-def join_pieces(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Slam:
+def join_submaps(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettings) -> Slam:
     """Join the newest submap to an earlier one if the newest keyframe, with frame data `data`, shows a place of it.
 
     By a rigid motion if lengths are metres, else by a similarity: each submap without metric depth has its own scale.
     """
     if len(slam.map.roots) < 2:
         return slam
-    label = piece_of(slam.map)
+    label = submap_of(slam.map)
     others = [keyframe for keyframe in slam.keyframes if label[keyframe.number] != label[-1]]
     if not others:
         return slam
@@ -43,7 +43,7 @@ def join_pieces(slam: Slam, data: FrameData, roles: Roles, settings: SlamSetting
     ratio = unit_ratio(slam, place, roles)
     if ratio is None:
         return slam
-    return _joined(scaled_piece(slam, ratio, newest_piece(slam)), place, slam.window.members[:2])
+    return _joined(scale_submap(slam, ratio, newest_submap(slam)), place, slam.window.members[:2])
 
 
 def unit_ratio(slam: Slam, place: Track, roles: Roles) -> float | None:
@@ -53,7 +53,7 @@ def unit_ratio(slam: Slam, place: Track, roles: Roles) -> float | None:
     return ratio_of_units(old, new, matches.select(matches.index_j >= 0), place.relative, slam.intrinsics)
 
 
-def scaled_piece(slam: Slam, ratio: float, inside: Callable[[int], bool]) -> Slam:
+def scale_submap(slam: Slam, ratio: float, inside: Callable[[int], bool]) -> Slam:
     """Return the state with all lengths of a submap multiplied by `ratio`, without its own scale anchor (the baseline).
 
     inside: whether a keyframe, by its number, belongs to the submap.
@@ -73,9 +73,9 @@ def scaled_piece(slam: Slam, ratio: float, inside: Callable[[int], bool]) -> Sla
     )
 
 
-def newest_piece(slam: Slam) -> Callable[[int], bool]:
+def newest_submap(slam: Slam) -> Callable[[int], bool]:
     """Return a function that tells whether a keyframe, by its number, belongs to the newest submap."""
-    label = piece_of(slam.map)
+    label = submap_of(slam.map)
     return lambda number: bool(label[number] == label[-1])
 
 
@@ -84,7 +84,7 @@ def _joined(slam: Slam, place: Track, held: tuple[int, ...]) -> Slam:
 
     held: members of the window that are fixed; two for a map without metric depth, which fix the scale.
     """
-    inside, newest = newest_piece(slam), slam.keyframes[-1]
+    inside, newest = newest_submap(slam), slam.keyframes[-1]
     # World -> camera poses change their world from the right.
     carried = rigid.invert(newest.pose) @ place.pose
     keyframes = tuple(
@@ -92,7 +92,7 @@ def _joined(slam: Slam, place: Track, held: tuple[int, ...]) -> Slam:
         for keyframe in slam.keyframes
     )
     began = next(keyframe.frame for keyframe in slam.keyframes if inside(keyframe.number))
-    note = f"the piece of map that began at frame {began} is joined to the one before at frame {newest.frame}"
+    note = f"the submap that began at frame {began} is joined to the one before at frame {newest.frame}"
     tie = MeasuredRelativePose(place.keyframe.number, newest.number, place.relative, place.information)
     return replace(
         slam,

@@ -13,10 +13,10 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import inverse_information
 from vggtgeo.models.classical import can_search, pose_information
 from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
+from vggtgeo.slam.global_map.drift_correction import Loop, correct_drift
 from vggtgeo.slam.global_map.scale_graph import ScaleRatio
-from vggtgeo.slam.global_map.straightening import Loop, straightened
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import Pair, overlap, some_points
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -43,15 +43,15 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     If the loops contradict the map by more than its adjustment can correct, a pose graph corrects it first, and it is
     searched again.
     """
-    label, known = piece_of(slam.map), {pair.key for pair in slam.map.pairs}
+    label, known = submap_of(slam.map), {pair.key for pair in slam.map.pairs}
     proposed = list(dict.fromkeys([*_by_estimate(slam, settings, known), *_by_appearance(slam, settings, known)]))
     found = _verified(slam, proposed, label, roles)
-    before, (straight, accepted) = slam, straightened(slam, found)
-    slam = replace(straight, map=replace(straight.map, pairs=(*slam.map.pairs, *(loop.pair for loop in accepted))))
-    if straight is before:
+    before, (corrected, accepted) = slam, correct_drift(slam, found)
+    slam = replace(corrected, map=replace(corrected.map, pairs=(*slam.map.pairs, *(loop.pair for loop in accepted))))
+    if corrected is before:
         return slam
     known |= {loop.pair.key for loop in found}
-    more = _verified(slam, _by_estimate(slam, settings, known), piece_of(slam.map), roles)
+    more = _verified(slam, _by_estimate(slam, settings, known), submap_of(slam.map), roles)
     return replace(
         slam, map=replace(slam.map, pairs=(*slam.map.pairs, *(loop.pair for loop in more if loop.agrees(slam))))
     )

@@ -1,6 +1,6 @@
-"""Frames without a pose, tried again when all is known: against every keyframe, also those that came after them.
+"""Placement of lost frames without depth, at the end of a run: against every keyframe, also later ones.
 
-Only in maps of free scale. A frame that sees much of what no keyframe shows becomes a keyframe; its matches give depth
+A frame that sees much of what no keyframe shows becomes a keyframe; its matches give depth
 to points that place further frames. This is repeated until no frame is placed any more.
 """
 
@@ -14,13 +14,13 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.keyframe_decision import needs_keyframe
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.map_points import in_view
 from vggtgeo.slam.tracking.relocalisation import record_of, relocalise
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_to, track, track_by_map
-from vggtgeo.slam.tracking.tracker import FramePose, Waiting, frame_pose
+from vggtgeo.slam.tracking.tracker import FramePose, UnplacedFrame, frame_pose
 from vggtgeo.slam.window.window import Window
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
@@ -45,19 +45,19 @@ def place_lost(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     return replace(slam, notes=(*slam.notes, note))
 
 
-def _nearest_first(slam: Slam, waiting: dict[int, Waiting]) -> list[int]:
-    """The frames by how far the next frame with a pose is."""
+def _nearest_first(slam: Slam, waiting: dict[int, UnplacedFrame]) -> list[int]:
+    """Sort the frames by the distance in time to the next frame with a pose."""
     placed = np.array([record.frame for record in slam.frames if record.tracked])
     return sorted(waiting, key=lambda frame: int(np.abs(placed - frame).min(initial=np.iinfo(int).max)))
 
 
-def _data(waiting: Waiting) -> FrameData:
+def _data(waiting: UnplacedFrame) -> FrameData:
     frame = Frame(waiting.frame, waiting.timestamp, waiting.image, None, "")
     return FrameData(frame, Description.of(waiting.features), None)
 
 
-def _found(slam: Slam, waiting: Waiting, roles: Roles) -> Track | None:
-    """The frame's pose by a keyframe that looks like it, or near the frame that is next to it in time."""
+def _found(slam: Slam, waiting: UnplacedFrame, roles: Roles) -> Track | None:
+    """Track a frame by a keyframe that looks like it, or near the frame that is next to it in time."""
     given = TrackingInput(_data(waiting), slam.intrinsics, roles)
     certain = relocalise(given, slam.keyframes, slam.tracker)
     if certain is not None:
@@ -68,7 +68,7 @@ def _found(slam: Slam, waiting: Waiting, roles: Roles) -> Track | None:
     pose = frame_pose(slam.map, beside)
     prior = MotionPrior(pose, np.eye(4), waited=abs(beside.frame - waiting.frame) - 1)
     given = replace(given, prior=prior)
-    label = piece_of(slam.map)
+    label = submap_of(slam.map)
     own = [keyframe for keyframe in slam.keyframes if label[keyframe.number] == label[beside.reference]]
     near = in_view(own, pose)
     tried = [track(given, keyframe, None) for keyframe in near]
@@ -77,14 +77,14 @@ def _found(slam: Slam, waiting: Waiting, roles: Roles) -> Track | None:
     return max(accepted, key=lambda found: found.evidence.inliers, default=None)
 
 
-def _beside(slam: Slam, waiting: Waiting) -> FramePose | None:
-    """The frame with a pose that is nearest in time."""
+def _beside(slam: Slam, waiting: UnplacedFrame) -> FramePose | None:
+    """Return the frame with a pose that is nearest in time."""
     placed = [record for record in slam.frames if record.tracked]
     return min(placed, key=lambda record: abs(record.timestamp - waiting.timestamp), default=None)
 
 
-def _with_frame(slam: Slam, waiting: Waiting, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
-    """The state with the frame's pose, and the frame as a keyframe where it sees what others do not."""
+def _with_frame(slam: Slam, waiting: UnplacedFrame, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
+    """Add the frame's pose, and the frame as a keyframe if it sees what others do not."""
     record = record_of(_data(waiting).frame, found)
     if needs_keyframe(found.pose, found.keyframe.pose, found.evidence.inliers, settings.keyframes):
         slam, record = _with_keyframe(slam, waiting, found, record, roles, settings)
@@ -94,10 +94,10 @@ def _with_frame(slam: Slam, waiting: Waiting, found: Track, roles: Roles, settin
 
 
 def _with_keyframe(
-    slam: Slam, waiting: Waiting, found: Track, record: FramePose, roles: Roles, settings: SlamSettings
+    slam: Slam, waiting: UnplacedFrame, found: Track, record: FramePose, roles: Roles, settings: SlamSettings
 ) -> tuple[Slam, FramePose]:
-    """The state with a new keyframe, adjusted in a window of those nearest in time, which stay where they are."""
-    number, data, label = len(slam.keyframes), _data(waiting), piece_of(slam.map)
+    """Add a keyframe, adjusted in a window of those nearest in time, which are fixed."""
+    number, data, label = len(slam.keyframes), _data(waiting), submap_of(slam.map)
     keyframe = make_keyframe(number, data.frame, found.pose, data.description, roles, settings, slam.intrinsics)
     others = [other for other in slam.keyframes if label[other.number] == label[found.keyframe.number]]
     others.sort(key=lambda other: (other is not found.keyframe, abs(other.timestamp - waiting.timestamp)))

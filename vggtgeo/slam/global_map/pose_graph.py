@@ -36,7 +36,7 @@ from vggtgeo.solvers.kernels import Cauchy
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
 
-BELIEF = POSE_GATE
+LOOP_GATE = POSE_GATE
 """Squared Mahalanobis distance above which a loop is false: one true loop in 10,000 is lost."""
 GRADUATION = Graduation(factors=(256.0, 64.0, 16.0, 4.0), iterations=6)
 """A loop of 2 cm against 10 m of drift has a residual of 500 standard deviations, half of the first width."""
@@ -108,7 +108,7 @@ def solve_pose_graph(graph: PoseGraph) -> SolvedPoseGraph:
     poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64)[:count])
     if not np.isfinite(poses).all():
         return SolvedPoseGraph(graph.poses, np.zeros(len(graph.loops), bool))
-    return SolvedPoseGraph(poses, np.array([distance(loop, poses) < BELIEF for loop in graph.loops], bool))
+    return SolvedPoseGraph(poses, np.array([distance(loop, poses) < LOOP_GATE for loop in graph.loops], bool))
 
 
 def distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float:

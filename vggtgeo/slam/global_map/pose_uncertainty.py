@@ -23,7 +23,7 @@ from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
 from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
@@ -38,7 +38,7 @@ MOMENT = 0.01
 (uniform: 0.0096 s), and published image times are off by as much. A run cannot observe it: the poses absorb it."""
 CALIBRATION = 0.01
 """Relative standard deviation of the focal length, and so of each rotation since the first pose: that of manufacturers
-and calibration tools (`slam/camera/calibration.py`)."""
+and calibration tools (`slam/camera/given_camera.py`)."""
 CENTRE = 0.014
 """Standard deviation of an unmeasured principal point, in image widths and heights: root mean square of published ones.
 A principal point at the exact middle was not measured; its error rotates all cameras by one unknown angle."""
@@ -70,11 +70,11 @@ class PoseUncertainty(NamedTuple):
     rotation: Float[np.ndarray, " n"]
 
 
-def frame_uncertainty(slam: Slam, piece: int = 0) -> PoseUncertainty | None:
-    """Return the uncertainty of the frames of `frame_trajectory(slam, piece)`; None without a last adjustment."""
+def frame_uncertainty(slam: Slam, submap: int = 0) -> PoseUncertainty | None:
+    """Return the uncertainty of the frames of `frame_trajectory(slam, submap)`; None without a last adjustment."""
     if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
         return None
-    own = set(pieces_by_size(slam)[piece])
+    own = set(submaps_by_size(slam)[submap])
     records = [record for record in slam.frames if record.tracked and record.reference in own]
     sigma = slam.map.pose_sigma[[record.reference for record in records]].reshape(-1, 2)
     tracked = [(r.evidence.sigma_translation, r.evidence.sigma_rotation) for r in records]

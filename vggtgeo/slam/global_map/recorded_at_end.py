@@ -10,14 +10,14 @@ from itertools import pairwise, product
 import numpy as np
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.global_map.pose_graph import BELIEF, distance
-from vggtgeo.slam.global_map.straightening import at_poses
+from vggtgeo.slam.global_map.drift_correction import at_poses
+from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, distance
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.units import longer
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.tracking.recorded_motion import (
     Comparison,
     carried,
@@ -35,8 +35,9 @@ AROUND = 5
 
 
 def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
-    """The state before its last adjustment, with all recorded motions between keyframes; without any where the images
-    do not agree with them.
+    """Add all recorded motions between keyframes before the last adjustment, if the images agree with them.
+
+    Without agreement none is added.
 
     A map of free scale gets the unit of the recording. Submaps, and frames that no image has placed, are joined to the
     rest by the recorded motions.
@@ -57,19 +58,19 @@ def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
 
 
 def _with_ties(slam: Slam, ties: list[MeasuredRelativePose]) -> Slam:
-    """The state with these recorded motions and no others."""
+    """Replace the recorded motions of the state."""
     factors = [factor for factor in slam.map.factors if not getattr(factor, "recorded", False)]
     return replace(slam, map=replace(slam.map, factors=(*factors, *ties)))
 
 
 def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
-    """The state with lengths in the unit of the recording, in submaps where it is known at all.
+    """Scale lengths to the unit of the recording, in submaps where it is known.
 
     Scale drifts from keyframe to keyframe: each has the unit that the motions around it tell. The way from one to the
     next is then that of the map, or the recorded one where both disagree by more than the recording drifts.
     """
     poses, scales = np.array([keyframe.pose for keyframe in slam.keyframes]), np.ones(len(slam.keyframes))
-    for submap in pieces_by_size(slam):
+    for submap in submaps_by_size(slam):
         if not np.isfinite(units[submap[0]]):
             continue
         numbers = tuple(sorted(submap, key=lambda number: slam.keyframes[number].timestamp))
@@ -83,7 +84,7 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
         for row, (tie, (first, second)) in enumerate(zip(ties, pairwise(numbers), strict=True)):
             before, after = (slam.keyframes[number].pose for number in (first, second))
             poses[second] = longer(after @ rigid.invert(before), 1.0 / local[row]) @ poses[first]
-            if tie is not None and distance(tie, poses) > BELIEF:
+            if tie is not None and distance(tie, poses) > LOOP_GATE:
                 recorded_motion = tie.pose if tie.second == second else rigid.invert(tie.pose)
                 poses[second] = recorded_motion @ poses[first]
     factors = tuple(factor for factor in slam.map.factors if not isinstance(factor, MeasuredBaseline))
@@ -93,8 +94,10 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
 def _local_units(
     slam: Slam, ties: list[MeasuredRelativePose | None], numbers: tuple[int, ...], usual: float
 ) -> np.ndarray:
-    """What a unit of the recording is at each keyframe of a submap: the median over the motions around it of the ratio
-    of lengths, weighted by the recorded length; `usual` where no motion tells.
+    """Return the length of a unit of the recording at each keyframe of a submap.
+
+    It is the median of the ratio of lengths over the motions around it, weighted by the recorded length; `usual`
+    without any.
     """
     places = rigid.centres(np.array([slam.keyframes[number].pose for number in numbers]))
     lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
@@ -109,10 +112,11 @@ def _local_units(
 
 
 def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
-    """The state with submaps of a known unit placed by the recorded motion from the nearest keyframe of the largest
-    submap, or of those joined to it before.
+    """Place submaps of known unit by the recorded motion from the nearest keyframe of the largest submap.
+
+    Submaps that were joined to it before count as part of it.
     """
-    main, *others = [set(numbers) for numbers in pieces_by_size(slam) if np.isfinite(units[numbers[0]])]
+    main, *others = [set(numbers) for numbers in submaps_by_size(slam) if np.isfinite(units[numbers[0]])]
     for other in others:
         pairs = product((slam.keyframes[number] for number in main), (slam.keyframes[number] for number in other))
         near, own = min(pairs, key=lambda pair: abs(pair[0].timestamp - pair[1].timestamp))
@@ -140,7 +144,7 @@ def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
 
 
 def _with_carried_frames(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
-    """The state with each frame that no image has placed, carried on from the frame before."""
+    """Place each frame that no image has placed by the recorded motion from the frame before."""
     frames: list[FramePose] = []
     last: FramePose | None = None
     for record in slam.frames:
@@ -159,7 +163,7 @@ def _by_recording(record: FramePose, found: Track) -> FramePose:
 
 
 def _alone(slam: Slam, tie: MeasuredRelativePose) -> bool:
-    """Whether nothing else ties the later keyframe of a recorded motion to an earlier one."""
+    """Return whether no other factor connects the later keyframe of a recorded motion to an earlier one."""
     earlier = [pair.first for pair in slam.map.pairs if pair.second == tie.second and len(pair.points)]
     tracked = [other.first for other in slam.map.odometry_factors if other.second == tie.second]
     return not any(number < tie.second for number in (*earlier, *tracked))

@@ -1,8 +1,8 @@
 """Scale graph: the scale of each keyframe of a map without metric depth, from scale ratios measured by loops.
 
 Scale is a homomorphism of the similarities, so the scale part of a Sim(3) pose graph is a linear graph of its own over
-the logarithms of the scales. It is solved first, then the pose graph over SE(3) (`straightening.py`). This neglects the
-information of motion lengths about scale, which is small around a loop.
+the logarithms of the scales. It is solved first, then the pose graph over SE(3) (`drift_correction.py`). This neglects
+the information of motion lengths about scale, which is small around a loop.
 """
 
 from __future__ import annotations

@@ -40,7 +40,10 @@ _FLOW = {
 
 
 def follow(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where corners of one grey image are in the next, float32 [m, 2], and which of them came back when asked."""
+    """Follow corners from one grey image to the next; return where they are, and which came back to their start.
+
+    Positions are float32 [m, 2], pixels.
+    """
     start = pixels.reshape(-1, 1, 2)
     there, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None, **_FLOW)
     back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **_FLOW)
@@ -52,8 +55,9 @@ def follow(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[n
 
 
 def follow_through_bands(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `follow`, where lamps may have flickered while the rows (of a picture that was turned: the columns) were read:
-    without what most of a row has in common with the change, if that helps.
+    """As `follow`, without brightness changes that most of a row shares, if that helps.
+
+    Lamps may have flickered while the rows (of a rotated picture: the columns) were read.
     """
     moved, kept = follow(before, after, pixels)
     bands = common_to_rows(before, after)
@@ -65,14 +69,14 @@ def follow_through_bands(before: np.ndarray, after: np.ndarray, pixels: np.ndarr
 
 
 def common_to_rows(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """By how much most of each row (column, of an upright picture) became brighter: float64 [h, 1] ([1, w])."""
+    """Return by how much most of each row (column, of an upright picture) became brighter: float64 [h, 1] ([1, w])."""
     along = 1 if after.shape[1] >= after.shape[0] else 0
     some = (slice(None), slice(None, None, 4)) if along else (slice(None, None, 4), slice(None))
     return np.asarray(np.median(after[some].astype(np.int16) - before[some], axis=along, keepdims=True))
 
 
 def one_a_cell(ids: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The oldest track of each cell; ids grow with time, and rows are in their order."""
+    """Keep the oldest track of each cell; ids grow with time, and rows are in their order."""
     cells = (pixels // CELL).astype(int)
     _, first = np.unique(cells[:, 0] + 10_000 * cells[:, 1], return_index=True)
     kept = np.sort(first)
@@ -80,7 +84,7 @@ def one_a_cell(ids: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def new_corners(grey: np.ndarray, taken: np.ndarray) -> np.ndarray:
-    """The strongest corner of each cell that holds none of `taken`, float32 [m, 2]."""
+    """Return the strongest corner of each cell that contains none of `taken`, float32 [m, 2]."""
     strength = cv2.cornerMinEigenVal(grey, 5)
     rows, columns = grey.shape[0] // CELL, grey.shape[1] // CELL
     cells = strength[: rows * CELL, : columns * CELL].reshape(rows, CELL, columns, CELL)
@@ -95,14 +99,14 @@ def new_corners(grey: np.ndarray, taken: np.ndarray) -> np.ndarray:
 
 
 def small_size(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Width and height of the image that corners are followed in; shape: of the one that was read."""
+    """Return width and height of the image that corners are followed in. shape: of the image as read."""
     scale = max(shape) / WIDTH
     height, width = (max(round(side / scale), 2 * CELL) for side in shape)
     return width, height
 
 
 def small_grey(image: np.ndarray) -> np.ndarray:
-    """The image that corners are followed in, uint8.
+    """Return the image that corners are followed in, uint8.
 
     Lucas and Kanade compare grey levels, and a camera changes its exposure, a lamp flickers: so each pixel is compared
     with the brightness around it. Not with that of its row, which bands of light would call for: what enters a row far

@@ -49,7 +49,7 @@ class RecordedPoses:
         return float(np.median(np.diff(self.trajectory.timestamps))) if len(self.trajectory) > 1 else 0.0
 
     def pose(self, time: float) -> np.ndarray | None:
-        """World -> camera at a time, float64 [4, 4], interpolated; None where no recorded pose is near."""
+        """Return world -> camera at a time, float64 [4, 4], interpolated; None if no recorded pose is near."""
         times, poses = self.trajectory.timestamps, self.trajectory.poses
         after = int(np.searchsorted(times, time))
         if after < len(times) and times[after] == time:
@@ -61,12 +61,12 @@ class RecordedPoses:
         return np.asarray(rigid.fraction(step, share) @ rigid.invert(poses[after - 1]))
 
     def motion(self, first: float, second: float) -> np.ndarray | None:
-        """Camera at one time -> camera at another, float64 [4, 4]; None where the recording does not tell."""
+        """Return camera at one time -> camera at another, float64 [4, 4]; None if a recorded pose is missing."""
         one, other = self.pose(first), self.pose(second)
         return None if one is None or other is None else rigid.orthonormal(other @ rigid.invert(one))
 
     def covariance(self, motion: np.ndarray, seconds: float) -> np.ndarray:
-        """Covariance float64 [6, 6] of a motion in metres, translation first, over its left tangent."""
+        """Return the covariance of a motion in metres, float64 [6, 6], translation first, over its left tangent."""
         metres, radians = FLOOR
         along = self.drift * np.linalg.norm(motion[:3, 3]) + metres
         turned = self.turn * abs(seconds) + radians

@@ -131,7 +131,7 @@ class CameraSettings(CheckedSettings):
         static_overlay: Look for parts of the images that do not move with the scene (bars, a watermark, specks on
             the lens) before tracking, and mask them. Not where frames cannot be read twice, nor in rendered images.
         refine_intrinsics: Whether the last adjustment may change known intrinsics. "auto": if the images contradict
-            them significantly and the energy decreases (see `slam/camera/calibration.py`); "always": if the images
+            them significantly and the energy decreases (see `slam/camera/given_camera.py`); "always": if the images
             contradict them; "never". A guessed camera is always estimated, and its lens too
             (`slam/camera/lens.py`) except with "never".
 
@@ -190,7 +190,7 @@ class WindowSettings(CheckedSettings):
 
 
 @dataclass(frozen=True)
-class RefinementSettings(CheckedSettings):
+class GlobalMapSettings(CheckedSettings):
     """The adjustment of the whole map at the end, with edges between keyframes that saw the same place.
 
     Fields:
@@ -202,7 +202,7 @@ class RefinementSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.settings.RefinementSettings(global_adjustment=False).global_adjustment
+        >>> vg.settings.GlobalMapSettings(global_adjustment=False).global_adjustment
         False
 
     """

@@ -133,7 +133,7 @@ class Perception:
         return {"networks": described, "refused": refused, **warning}
 
     def warning(self) -> str:
-        """Warning about results of random weights."""
+        """Return a warning about results of random weights."""
         return f"the weights of {', '.join(self.random)} are random: this result means nothing"
 
 
@@ -156,7 +156,7 @@ def perception(
     memory_limit_gb: float | None = None,
     mixed: Mapping[str, str] | None = None,
 ) -> Perception:
-    """The role objects of a preset, for `vggtgeo.reconstruct`; every file is opened, checked and warmed up here.
+    """Return the roles of a preset, for `vggtgeo.reconstruct`; every file is opened, checked and warmed up here.
 
     Args:
         preset: classical, light or paper.

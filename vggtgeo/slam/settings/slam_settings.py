@@ -29,9 +29,9 @@ from vggtgeo.slam.settings.groups import (
     SEGMENT_SAMPLES,
     CameraSettings,
     DepthSettings,
+    GlobalMapSettings,
     KeyframeSettings,
     LineSettings,
-    RefinementSettings,
     WeightSettings,
     WindowSettings,
 )
@@ -113,7 +113,7 @@ class Roles:
         """
         if sensor_depth is None or not isinstance(self.depth, SensorDepth):
             return None
-        near, far = self.depth.nearest, self.depth.farthest
+        near, far = self.depth.min_depth, self.depth.max_depth
         with np.errstate(invalid="ignore"):
             depth = np.where((sensor_depth >= near) & (sensor_depth <= far), sensor_depth, np.float32(np.nan))
         return depth, self.depth.noise(depth)
@@ -176,7 +176,7 @@ class SlamSettings:
     weights: WeightSettings = field(default_factory=WeightSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
-    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    refinement: GlobalMapSettings = field(default_factory=GlobalMapSettings)
 
     @property
     def padded_samples(self) -> int | None:

@@ -10,7 +10,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRotation
 from vggtgeo.slam.sparse_map.map import Map
 
 
-def piece_of(known: Map) -> np.ndarray:
+def submap_of(known: Map) -> np.ndarray:
     """Return the connected component of each keyframe, int [n], numbered by their first keyframes.
 
     A pair with matches of points or lines connects its keyframes, and so does any factor between two.
@@ -22,7 +22,7 @@ def piece_of(known: Map) -> np.ndarray:
     graph = coo_array((np.ones(len(first)), (first, second)), (count, count))
     _, label = connected_components(graph, directed=False)
     _, start, inverse = np.unique(label, return_index=True, return_inverse=True)
-    # Rank of each piece by its first keyframe: scipy's labels have no documented order.
+    # Rank of each submap by its first keyframe: scipy's labels have no documented order.
     return np.asarray(np.argsort(np.argsort(start))[inverse])
 
 

@@ -24,32 +24,33 @@ MAX_DEPTH_ERROR = 0.2
 class Slots:
     """Pixels of one keyframe with an inverse depth: key points, or samples of its segments.
 
-    pixels: float [m, 2]. inverse_depth: float [m], 1/m, NaN = unknown. prior, sigma: float [m], metric inverse depth
-    and its standard deviation, 1/m, NaN = unknown. prior_confidence: float [m] in [0, 1]. confidence: float [m] in [0,
-    1], reliability of the image there. deviation: float [m], 1/m, standard deviation of `inverse_depth` from views of
-    other keyframes, NaN elsewhere. For a distant point it is as large as its inverse depth; such a point still
-    constrains the rotation of a frame, see `determined`.
+    pixels: float [m, 2]. inverse_depth: float [m], 1/m, NaN = unknown. prior_mean, prior_sigma: float [m], metric
+    inverse depth and its standard deviation, 1/m, NaN = unknown; a triangulated segment has no mean, but the standard
+    deviation of its triangulation. prior_confidence: float [m] in [0, 1]. confidence: float [m] in [0, 1], reliability
+    of the image there. estimate_sigma: float [m], 1/m, standard deviation of `inverse_depth` from views of other
+    keyframes, NaN elsewhere. For a distant point it is as large as its inverse depth; such a point still constrains the
+    rotation of a frame, see `determined`.
     """
 
     pixels: np.ndarray
     inverse_depth: np.ndarray
-    prior: np.ndarray
-    sigma: np.ndarray
+    prior_mean: np.ndarray
+    prior_sigma: np.ndarray
     prior_confidence: np.ndarray
     confidence: np.ndarray
-    deviation: np.ndarray
+    estimate_sigma: np.ndarray
 
     @property
     def determined(self) -> np.ndarray:
         """Whether the depth itself is known, bool [m]: its relative standard deviation is at most `MAX_DEPTH_ERROR`."""
-        return np.isfinite(self.inverse_depth) & ~(self.deviation > MAX_DEPTH_ERROR * self.inverse_depth)
+        return np.isfinite(self.inverse_depth) & ~(self.estimate_sigma > MAX_DEPTH_ERROR * self.inverse_depth)
 
     def known_for(self, length: float, focal: float, pixels: float) -> np.ndarray:
         """Return whether the depth predicts the projection within `pixels` after a motion of `length`, bool [m].
 
         Determined depths always count.
         """
-        return self.determined | (self.deviation * length * focal < pixels)
+        return self.determined | (self.estimate_sigma * length * focal < pixels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,9 +207,9 @@ def _with_line_depth(samples: Slots, on_line: np.ndarray) -> Slots:
     return Slots(
         pixels=samples.pixels,
         inverse_depth=np.where(known, on_line, np.nan),
-        prior=np.where(known, on_line, np.nan),
-        sigma=np.where(known, np.fmax(np.nan_to_num(samples.sigma), floor), np.nan),
+        prior_mean=np.where(known, on_line, np.nan),
+        prior_sigma=np.where(known, np.fmax(np.nan_to_num(samples.prior_sigma), floor), np.nan),
         prior_confidence=np.where(known, np.maximum(samples.prior_confidence, 0.3), 0.0),
         confidence=samples.confidence,
-        deviation=samples.deviation,
+        estimate_sigma=samples.estimate_sigma,
     )

@@ -61,7 +61,9 @@ def longer(motion: np.ndarray, ratio: float) -> np.ndarray:
 
 def scaled_keyframe(keyframe: Keyframe, ratio: float) -> Keyframe:
     """Return the keyframe with all lengths multiplied by `ratio`."""
-    nearer = lambda slots: replace(slots, inverse_depth=slots.inverse_depth / ratio, deviation=slots.deviation / ratio)
+    nearer = lambda slots: replace(
+        slots, inverse_depth=slots.inverse_depth / ratio, estimate_sigma=slots.estimate_sigma / ratio
+    )
     points: Slots = nearer(keyframe.points)
     samples: Slots = nearer(keyframe.samples)
     line_depths = keyframe.line_depths * ratio

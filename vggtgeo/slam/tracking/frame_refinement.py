@@ -31,18 +31,25 @@ from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, Tracker, fram
 
 FINEST = (4, 0, 0)
 """Iterations by level, the finest first: a frame starts within millimetres of its optimum."""
-MAX_WAITING = 16
-"""Frames whose images wait for the next keyframe, 2 MB each. If the reference stays longer, the nearest earlier
-keyframe is used."""
+MAX_FRAMES_BETWEEN_KEYFRAMES = 16
+"""Maximum number of frames whose images are kept for the next keyframe, 2 MB each. If the reference
+stays longer, the nearest earlier keyframe is used."""
 
 
 def with_view(known: Map, tracker: Tracker, view: RgbdView | None, intrinsics: np.ndarray, roles: Roles) -> Tracker:
-    """Return the tracker with the view of its last frame, kept for the next keyframe, at most `MAX_WAITING` frames."""
+    """Return the tracker with the view of its last frame, kept for the next keyframe.
+
+    At most `MAX_FRAMES_BETWEEN_KEYFRAMES` views are kept.
+    """
     measured = isinstance(roles.depth, SensorDepth) and roles.alignment is not None
     if view is None or not (measured and known.metric):
         return tracker
     tracker = replace(tracker, between=(*tracker.between, (len(tracker.frames) - 1, view)))
-    return against_nearest(known, tracker, intrinsics, roles) if len(tracker.between) == MAX_WAITING else tracker
+    return (
+        against_nearest(known, tracker, intrinsics, roles)
+        if len(tracker.between) == MAX_FRAMES_BETWEEN_KEYFRAMES
+        else tracker
+    )
 
 
 def against_reference(known: Map, tracker: Tracker) -> Tracker:

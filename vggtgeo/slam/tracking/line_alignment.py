@@ -61,13 +61,13 @@ class SpaceSegments:
     def of(cls, keyframe: Keyframe, intrinsics: np.ndarray) -> SpaceSegments:
         """Return the segments with ends from the current inverse depths of their samples: affine along a segment."""
         count, samples, segment = len(keyframe.lines), keyframe.samples, keyframe.sample_segment
-        known = np.isfinite(samples.inverse_depth) & np.isfinite(samples.sigma)
+        known = np.isfinite(samples.inverse_depth) & np.isfinite(samples.prior_sigma)
         start, along = _ends_of(keyframe, count)
         fraction = ((samples.pixels - start[segment]) * along[segment]).sum(1) / (along**2).sum(1)[segment]
         total = lambda values: np.bincount(segment[known], values[known], count)
         # Sums of the normal equations of all lines at once.
         n, t, tt = total(np.ones_like(fraction)), total(fraction), total(fraction**2)
-        d, td, s = total(samples.inverse_depth), total(fraction * samples.inverse_depth), total(samples.sigma)
+        d, td, s = total(samples.inverse_depth), total(fraction * samples.inverse_depth), total(samples.prior_sigma)
         spread = n * tt - t * t
         index = np.nonzero((n >= 2) & (spread > 1e-9))[0]
         n, t, tt, d, td, spread = (values[index] for values in (n, t, tt, d, td, spread))

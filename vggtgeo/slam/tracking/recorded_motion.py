@@ -25,7 +25,7 @@ from scipy.special import logsumexp
 from vggtgeo.geometry import rigid
 from vggtgeo.models.roles import GeometryResult
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map
@@ -73,8 +73,9 @@ def compare(recorded: RecordedPoses, known: Map) -> Comparison:
 
 
 def recorded_units(recorded: RecordedPoses, known: Map) -> np.ndarray:
-    """What a unit of the recording is at each keyframe, float64 [n]: in its submap, or in metres; NaN where no measured
-    motion tells.
+    """Return the length of a unit of the recording at each keyframe, float64 [n], in the map's unit or metres.
+
+    NaN if no measured motion determines it.
     """
     record = _Record.of(recorded, known)
     return np.full(len(known.keyframes), np.nan) if record is None else record.units()
@@ -83,8 +84,9 @@ def recorded_units(recorded: RecordedPoses, known: Map) -> np.ndarray:
 def recorded_tie(
     recorded: RecordedPoses, first: Keyframe, second: Keyframe, unit: float
 ) -> MeasuredRelativePose | None:
-    """The recorded motion between two keyframes in the unit of the map, from the one of the smaller number; None where
-    the recording does not tell.
+    """Return the recorded motion between two keyframes in the unit of the map, from the smaller number.
+
+    None if it is unknown.
     """
     if first.number > second.number:
         first, second = second, first
@@ -97,10 +99,11 @@ def recorded_tie(
 
 
 def recorded_ties(recorded: RecordedPoses, known: Map, units: np.ndarray) -> list[MeasuredRelativePose]:
-    """Those between keyframes that follow each other in time, in one submap. units: of the recording at each keyframe,
-    float64 [n], NaN = not known.
+    """Return the recorded motions between consecutive keyframes of one submap.
+
+    units: of the recording at each keyframe, float64 [n], NaN = unknown.
     """
-    label = piece_of(known)
+    label = submap_of(known)
     placed = [keyframe for keyframe in known.keyframes if np.isfinite(units[keyframe.number])]
     placed.sort(key=lambda keyframe: keyframe.timestamp)
     ties = [
@@ -112,8 +115,9 @@ def recorded_ties(recorded: RecordedPoses, known: Map, units: np.ndarray) -> lis
 
 
 def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, unit: float) -> Track | None:
-    """A frame that images do not place, carried on from the last one that has a pose; None where the recording does not
-    tell.
+    """Place a frame that images do not place, by the recorded motion from the last one with a pose.
+
+    None if that motion is unknown.
     """
     motion = recorded.motion(last.timestamp, time)
     if motion is None:
@@ -128,7 +132,7 @@ def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, u
 
 
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    """The value [n] that half of the weight is below."""
+    """Return the value [n] that half of the weight is below."""
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
@@ -149,8 +153,8 @@ class _Record:
 
     @classmethod
     def of(cls, recorded: RecordedPoses, known: Map) -> _Record | None:
-        """Of the record so far; None where the recording tells none of its motions."""
-        label, rows = np.zeros(len(known.keyframes), int) if known.metric else piece_of(known), []
+        """Collect the measured motions so far; None if the recording has none of them."""
+        label, rows = np.zeros(len(known.keyframes), int) if known.metric else submap_of(known), []
         for factor in known.odometry_factors:
             first, second = (known.keyframes[number] for number in factor.keyframes)
             motion = recorded.motion(first.timestamp, second.timestamp)
@@ -163,8 +167,9 @@ class _Record:
         return cls(measured, np.array(motions), np.array(seconds), np.array(ends), label)
 
     def units(self) -> np.ndarray:
-        """Of each keyframe, float64 [n]: the median over the motions of its submap of the ratios of lengths, measured
-        over recorded, weighted by the recorded length, which no wrong match changes.
+        """Return the ratio of measured to recorded lengths at each keyframe, float64 [n].
+
+        It is the median over the motions of its submap, weighted by the recorded length, which no wrong match changes.
         """
         measured = np.array([0.0 if own.by_rays else np.linalg.norm(own.pose[:3, 3]) for own in self.measured])
         lengths = np.linalg.norm(self.motions[:, :3, 3], axis=1)
@@ -175,7 +180,7 @@ class _Record:
         return found
 
     def evidence(self, recorded: RecordedPoses, units: np.ndarray) -> float:
-        """Logarithm of the ratio of likelihoods. Motions in a unit that is not known say nothing."""
+        """Return the logarithm of the ratio of likelihoods; motions in an unknown unit are left out."""
         rows = np.flatnonzero(np.isfinite(units[self.second]))
         if len(rows) < 2:
             return 0.0
@@ -202,13 +207,13 @@ class _Record:
 
 
 def _longer(motions: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-    """Motions [..., 4, 4] whose translations are multiplied by ratios that broadcast to [...]."""
+    """Multiply translations of motions [..., 4, 4] by ratios that broadcast to [...]."""
     found = np.broadcast_to(motions, (*np.broadcast_shapes(motions.shape[:-2], ratios.shape), 4, 4)).copy()
     found[..., :3, 3] *= ratios[..., None]
     return found
 
 
 def _tangents(motions: np.ndarray) -> np.ndarray:
-    """Translation and rotation vector of motions [n, m, 4, 4], float64 [n, m, 6]."""
+    """Return translation and rotation vector of motions [n, m, 4, 4], float64 [n, m, 6]."""
     turned = Rotation.from_matrix(motions[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*motions.shape[:2], 3)
     return np.concatenate([motions[..., :3, 3], turned], -1)

@@ -19,7 +19,7 @@ from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.tracking.evidence import STEP_GATE
 from vggtgeo.slam.tracking.odometry import Odometry
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_between, track
-from vggtgeo.slam.tracking.tracker import FramePose, Tracker, Waiting, frame_pose, given_up
+from vggtgeo.slam.tracking.tracker import FramePose, Tracker, UnplacedFrame, frame_pose, given_up
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
@@ -39,7 +39,9 @@ def relocalise(
     return None
 
 
-def revisit(given: TrackingInput, current: Track, known: Map, tracker: Tracker, members: Sequence[int]) -> Track | None:
+def close_loop_while_tracking(
+    given: TrackingInput, current: Track, known: Map, tracker: Tracker, members: Sequence[int]
+) -> Track | None:
     """Return the frame's pose by an old keyframe of the same place, whatever the drift: a loop closed during the run.
 
     Tracking continues from there, and the last adjustment distributes the error of the loop. At most one keyframe is
@@ -93,9 +95,9 @@ def view_of(keyframe: Keyframe, tracker: Tracker, intrinsics: np.ndarray, roles:
     return RgbdView.of(keyframe.image, depth, intrinsics)
 
 
-def wait(tracker: Tracker, frame: Frame, features: Features, most: int) -> tuple[Waiting, ...]:
+def wait(tracker: Tracker, frame: Frame, features: Features, most: int) -> tuple[UnplacedFrame, ...]:
     """Return the waiting frames with this one; the oldest are dropped beyond `most`."""
-    return (*tracker.waiting, Waiting(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
+    return (*tracker.waiting, UnplacedFrame(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
 
 
 def place_waiting(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> Tracker:

@@ -62,7 +62,7 @@ class FramePose:
 
 
 @dataclass(frozen=True, eq=False)
-class Waiting:
+class UnplacedFrame:
     """A frame without a pose, before initialisation or while tracking was lost. It is tracked once a map exists."""
 
     frame: int
@@ -92,13 +92,13 @@ class Tracker:
     velocity: np.ndarray = field(default_factory=lambda: np.eye(4))
     reference: tuple[int, RgbdView | None] | None = None
     lost: int = 0
-    waiting: tuple[Waiting, ...] = ()
-    unplaced: tuple[Waiting, ...] = ()
+    waiting: tuple[UnplacedFrame, ...] = ()
+    unplaced: tuple[UnplacedFrame, ...] = ()
     between: tuple[tuple[int, RgbdView], ...] = ()
 
 
-def given_up(tracker: Tracker, frames: Iterable[Waiting]) -> tuple[Waiting, ...]:
-    """The unplaced frames with these."""
+def given_up(tracker: Tracker, frames: Iterable[UnplacedFrame]) -> tuple[UnplacedFrame, ...]:
+    """Append frames to the unplaced ones, of which the last `MAX_UNPLACED` are kept."""
     return (*tracker.unplaced, *frames)[-MAX_UNPLACED:]
 
 

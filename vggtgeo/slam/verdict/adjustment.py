@@ -78,7 +78,7 @@ class Tracks:
 
     @cached_property
     def depths(self) -> np.ndarray:
-        """How many measured depths the track of each observation has, at least 1, float64 [m]."""
+        """The number of measured depths of each observation's track, at least 1, float64 [m]."""
         return np.maximum(self.sums(np.isfinite(self.depth).astype(np.float64)), 1.0)[self.track]
 
     @cached_property
@@ -94,11 +94,11 @@ class Tracks:
         return bool(np.isfinite(self.depth).any())
 
     def sums(self, values: np.ndarray) -> np.ndarray:
-        """Sums over the observations of each track: [t, ...] of [m, ...]."""
+        """Sum values [m, ...] over the observations of each track: [t, ...]."""
         return np.asarray(np.add.reduceat(values, self.first, axis=0))
 
     def subset(self, kept: np.ndarray) -> Tracks:
-        """The tracks of which `kept`, bool [t], is true."""
+        """Return the tracks of which `kept`, bool [t], is true."""
         rows = kept[self.track]
         parts = {name: getattr(self, name)[rows] for name in ("frame", "pixels", "depth", "readout")}
         return replace(self, **parts, track=(np.cumsum(kept) - 1)[self.track[rows]])
@@ -136,7 +136,7 @@ class Linear:
 
 
 def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
-    """Residuals and their derivatives there."""
+    """Return residuals and their derivatives at a point."""
     theta, knots, count = unknowns.theta, tracks.knots, len(tracks.frame)
     relative = unknowns.poses[tracks.frame] @ tracks.from_anchor
     a, b, log_inverse = unknowns.points[tracks.track].T
@@ -209,7 +209,7 @@ class Reduced:
         return np.asarray((np.swapaxes(self.inverse, 1, 2) @ right[:, :, None])[:, :, 0])
 
     def gain(self, step: np.ndarray) -> float:
-        """Decrease of the energy that this step, [n], promises."""
+        """Return the decrease of the energy that this step, [n], promises."""
         return float(np.sum(self.point_side**2) + self.side @ step)
 
 
@@ -256,7 +256,7 @@ class Fit:
     columns: np.ndarray
 
     def part(self, kept: np.ndarray) -> tuple[Tracks, Unknowns, Noise]:
-        """What `solve` needs to go on with the tracks of which `kept`, bool [t], is true."""
+        """Return the arguments with which `solve` continues for the tracks of which `kept`, bool [t], is true."""
         return self.tracks.subset(kept), replace(self.unknowns, points=self.unknowns.points[kept]), self.noise
 
 
@@ -298,15 +298,17 @@ def solve(
 
 
 def _with_own_points(tracks: Tracks, unknowns: Unknowns, linear: Linear) -> Unknowns:
-    """After a step of the points alone: points follow a long step of poses and focal length on a curve, and without
-    this the iteration creeps along it (embedded point iterations, Jeong et al. 2012).
+    """Take a step of the points alone.
+
+    Points follow a long step of poses and focal length on a curve; without this the iteration creeps along it (embedded
+    point iterations, Jeong et al. 2012).
     """
     reduced = reduce(tracks, linear, HELD, False, FIRST_DAMPING)
     return replace(unknowns, points=unknowns.points + np.clip(reduced.points(np.zeros(0)), -1.0, 1.0))
 
 
 def start_of(tracks: Tracks) -> Unknowns:
-    """Points triangulated with the claimed poses, in front of the cameras."""
+    """Triangulate points with the claimed poses, in front of the cameras."""
     relative = tracks.poses[tracks.frame] @ tracks.from_anchor
     rays = np.column_stack(
         [(tracks.pixels - tracks.intrinsics[2:]) / tracks.intrinsics[:2], np.ones(len(tracks.frame))]

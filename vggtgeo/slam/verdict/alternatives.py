@@ -27,8 +27,8 @@ from vggtgeo.slam.verdict.adjustment import (
     solve,
     start_of,
 )
-from vggtgeo.slam.verdict.levels import LEVEL, MIN_SHARE
 from vggtgeo.slam.verdict.noise import scores, with_own_noise
+from vggtgeo.slam.verdict.thresholds import MAX_UNPREDICTED, MIN_INLIER_WEIGHT, MIN_SECOND_MOTION_SHARE, SIGNIFICANCE
 
 WIDE = 20.0
 """Times the noise in the first steps towards a second motion, which begin far from it."""
@@ -40,8 +40,10 @@ START = Noise(0.6, 0.03)
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """A name, and which combinations of the calibration it frees: float64 [SIZE, k]; what its estimate is multiplied
-    by to be in which unit.
+    """One hypothesis.
+
+    columns: float64 [SIZE, k], directions of `theta` that it frees. factor, unit: the estimate times `factor` is in
+    `unit`, for messages. needs_depth: only tried with measured depth.
     """
 
     name: str
@@ -78,9 +80,9 @@ class Added:
 
     @property
     def significant(self) -> bool:
-        """By its robust covariance (Wald)."""
+        """Whether the estimate is significant by its robust covariance (Wald)."""
         wald = float(self.estimate @ np.linalg.pinv(self.covariance, hermitian=True) @ self.estimate)
-        return wald > float(chi2.isf(LEVEL, len(self.estimate)))
+        return wald > float(chi2.isf(SIGNIFICANCE, len(self.estimate)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,30 +100,30 @@ class Explanation:
 
     @property
     def tracks(self) -> Tracks:
-        """That the first motion explains."""
+        """The tracks that the first motion explains."""
         return self.best.tracks
 
 
 def explain(tracks: Tracks) -> Explanation:
-    """The preferred explanation of the tracks of a window."""
+    """Return the preferred explanation of the tracks of a window."""
     noise = Noise(START.pixel * max(tracks.size) / 320.0, START.depth)
     held = solve(tracks, start_of(tracks), noise, poses_free=False, iterations=4)
     free = with_own_noise(solve(tracks, held.unknowns, noise))
     best, added = _selected(free)
     rival = 0.0
-    if np.mean(_outliers(best)[tracks.track]) > MIN_SHARE:
+    if np.mean(_outliers(best)[tracks.track]) > MIN_SECOND_MOTION_SHARE:
         theirs = second_motion(free, _outliers(free))
         if theirs.any():
             rival = float(np.mean(theirs[tracks.track]))
             free = with_own_noise(solve(*free.part(~theirs)))
             best, added = _selected(free)
-    return Explanation(best, added, float(np.mean(free.linear.weight[:, 0] > 0.5)) * (1.0 - rival), rival)
+    return Explanation(best, added, float(np.mean(free.linear.weight[:, 0] > MIN_INLIER_WEIGHT)) * (1.0 - rival), rival)
 
 
 def _selected(fit: Fit) -> tuple[Fit, Added | None]:
-    """The fit with the alternative that is significant, and that; the same fit and None where there is none."""
+    """Return the fit with the significant alternative, and that alternative; else the same fit and None."""
     around = scores(fit)
-    chance = lambda one: float(chi2.isf(LEVEL, one.columns.shape[1]))
+    chance = lambda one: float(chi2.isf(SIGNIFICANCE, one.columns.shape[1]))
     known = [one for one in TABLE if fit.tracks.with_depth or not one.needs_depth]
     one = max(known, key=lambda one: around.gain(one.columns) / around.as_one - chance(one))
     # Before the solution, as if all observations were independent: a linear step is not exact enough for more.
@@ -134,14 +136,15 @@ def _selected(fit: Fit) -> tuple[Fit, Added | None]:
 
 
 def _outliers(fit: Fit) -> np.ndarray:
-    """Tracks that a fit does not explain, bool [t]."""
+    """Return the tracks that a fit does not explain, bool [t]."""
     sums = fit.tracks.sums(np.column_stack([fit.linear.weight[:, 0], np.ones(len(fit.tracks.frame))]))
-    return np.asarray(sums[:, 0] < 0.5 * sums[:, 1])
+    return np.asarray(sums[:, 0] < MIN_INLIER_WEIGHT * sums[:, 1])
 
 
 def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
-    """Tracks, bool [t], that one other motion explains, of those that contradict the first; none where there is no such
-    motion. Depth has no say: it may be that of either.
+    """Return the tracks, bool [t], of those that contradict the first motion, that one other motion explains.
+
+    All false if there is no such motion. Depth is ignored: it may be that of either motion.
     """
     own = replace(fit.tracks, depth=np.full(len(fit.tracks.depth), np.nan)).subset(outliers)
     still = np.tile(own.poses[:1], (len(own.poses), 1, 1))
@@ -150,7 +153,7 @@ def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
     other = max(fits, key=lambda one: float(one.linear.weight[:, 0].sum()))
     theirs = np.zeros(len(outliers), bool)
     theirs[np.flatnonzero(outliers)[~_outliers(other)]] = True
-    confirmed = np.mean(theirs[fit.tracks.track]) >= MIN_SHARE and _predicts(other)
+    confirmed = np.mean(theirs[fit.tracks.track]) >= MIN_SECOND_MOTION_SHARE and _predicts(other)
     return theirs if confirmed else np.zeros(len(outliers), bool)
 
 
@@ -160,11 +163,12 @@ def _fit_from_afar(tracks: Tracks, noise: Noise) -> Fit:
 
 
 def _predicts(motion: Fit) -> bool:
-    """Whether the motion, fitted to one half of the tracks, explains most of the other: few tracks have free poses that
-    fit them, whatever they do.
+    """Return whether the motion, fitted to one half of the tracks, explains most of the other half.
+
+    Free poses fit few tracks in any case.
     """
     half = np.arange(len(motion.tracks.first)) % 2 == 0
     first = solve(*motion.part(half))
     tracks, start, noise = motion.part(~half)
     second = solve(tracks, replace(start, poses=first.unknowns.poses), noise, poses_free=False)
-    return float(np.mean(_outliers(second))) < 0.5
+    return float(np.mean(_outliers(second))) < MAX_UNPREDICTED

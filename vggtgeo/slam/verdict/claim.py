@@ -11,7 +11,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA, Readout
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import pieces_by_size
+from vggtgeo.slam.submaps import submaps_by_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,9 +19,9 @@ class Claim:
     """The claim of a run.
 
     frames: int [n]. times: float64 [n], s. poses: float64 [n, 4, 4], world -> camera. tracked: bool [n]. intrinsics:
-    fx, fy, cx, cy, pixels. metric: lengths are metres. pieces: number of parts of the map. started: there was a map.
-    in_known_map: the run began in the map of an earlier one. guessed: the camera is unknown, and too little was seen to
-    estimate it. readout: of the rolling shutter that the last adjustment found.
+    fx, fy, cx, cy, pixels. metric: lengths are metres. submaps: their number. started: there was a map.
+    began_in_known_map: the run began in the map of an earlier one. guessed: the camera is unknown, and too little was
+    seen to estimate it. readout: of the rolling shutter that the last adjustment found.
     """
 
     frames: np.ndarray
@@ -30,15 +30,15 @@ class Claim:
     tracked: np.ndarray
     intrinsics: np.ndarray
     metric: bool
-    pieces: int = 1
+    submaps: int = 1
     started: bool = True
-    in_known_map: bool = False
+    began_in_known_map: bool = False
     guessed: bool = False
     readout: Readout | None = None
 
     @classmethod
     def of(cls, slam: Slam) -> Self:
-        """The claim of a state."""
+        """Return the claim of a state."""
         times, poses = frame_poses(slam)
         return cls(
             frames=np.array([record.frame for record in slam.frames], int),
@@ -47,9 +47,9 @@ class Claim:
             tracked=np.array([record.tracked for record in slam.frames], bool),
             intrinsics=np.asarray(slam.intrinsics, np.float64),
             metric=slam.metric,
-            pieces=max(len(pieces_by_size(slam)), 1),
+            submaps=max(len(submaps_by_size(slam)), 1),
             started=any(np.isfinite(keyframe.points.inverse_depth).any() for keyframe in slam.keyframes),
-            in_known_map=any(keyframe.frame < 0 for keyframe in slam.keyframes),
+            began_in_known_map=any(keyframe.frame < 0 for keyframe in slam.keyframes),
             guessed=not (slam.camera.calibrated or slam.camera.self_calibrated)
             and len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA,
             readout=slam.camera.readout,
@@ -60,5 +60,5 @@ class Claim:
 
 
 def extent(poses: np.ndarray) -> float:
-    """RMS distance of the places from their mean, of poses world -> camera [n, 4, 4]."""
+    """Return the RMS distance of the places from their mean, of poses world -> camera [n, 4, 4]."""
     return float(np.sqrt(np.sum(rigid.centres(poses).var(0))))

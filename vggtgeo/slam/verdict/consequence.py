@@ -26,7 +26,7 @@ class Consequence:
 
 
 def differences(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """From the claim: of the places after alignment [f, 3], of the turns from frame to frame, rad [f - 1, 3]."""
+    """Return the differences from the claim: places after alignment [f, 3], turns between frames, rad [f - 1, 3]."""
     poses, claimed = fit.unknowns.poses, fit.tracks.poses
     places, theirs = rigid.centres(poses), rigid.centres(claimed)
     fitted = umeyama(places, theirs, not fit.tracks.with_depth)
@@ -36,12 +36,14 @@ def differences(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def difference(fit: Fit) -> Consequence:
-    """Of a fit from the claim, noise included."""
+    """Return the difference of a fit from the claim, noise included."""
     return Consequence(*(float(np.sqrt(np.mean(np.sum(one**2, 1)))) for one in differences(fit)))
 
 
 def confirmed(best: Fit) -> Consequence:
-    """What two halves of the tracks confirm, each fitted by itself with what is free in `best`.
+    """Return the difference from the claim that two halves of the tracks confirm.
+
+    Each half is fitted by itself with what is free in `best`.
 
     Errors of tracks, mistracked corners among them, are independent between the halves: the mean product of what both
     differ from the claim by is free of their noise, and half of what they differ from each other by is the standard

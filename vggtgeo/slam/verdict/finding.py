@@ -41,7 +41,7 @@ class Segment:
     checks: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
+        """Return plain values, for JSON."""
         return {
             "frames": [self.start, self.end],
             "seconds": [round(self.start_time, 6), round(self.end_time, 6)],
@@ -51,7 +51,7 @@ class Segment:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The inverse of `to_dict`."""
+        """Invert `to_dict`."""
         (start, end), (begin, stop) = values["frames"], values["seconds"]
         return cls(start, end, begin, stop, values["level"], tuple(values["checks"]))
 
@@ -81,7 +81,7 @@ class Verdict:
         return f"Verdict({': '.join((self.level, '; '.join(self.reasons))) if self.reasons else self.level})"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as `summary.json` has them."""
+        """Return plain values, as in `summary.json`."""
         return {
             "level": self.level,
             "reasons": list(self.reasons),
@@ -91,13 +91,13 @@ class Verdict:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], metric: bool = True) -> Self:
-        """The inverse of `to_dict`."""
+        """Invert `to_dict`."""
         segments = tuple(Segment.from_dict(segment) for segment in values["segments"])
         return cls(values["level"], tuple(values["reasons"]), segments, metric, tuple(values.get("noted", ())))
 
 
 def worst(levels: Iterable[Level]) -> Level:
-    """The worst of some levels; "good" where there are none."""
+    """Return the worst of some levels; "good" if there are none."""
     return max(levels, key=LEVELS.index, default="good")
 
 
@@ -115,7 +115,7 @@ def conclude(findings: Iterable[Finding], frames: Sequence[int], times: Sequence
 
 
 def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence[float]) -> tuple[Segment, ...]:
-    """Frames in a row that the same findings concern."""
+    """Group consecutive frames that the same findings concern."""
     found: list[Segment] = []
     for frame, time in zip(frames, times, strict=True):
         here = [
@@ -132,7 +132,7 @@ def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence
 
 
 def spans(rows: np.ndarray, join: int = 1) -> list[tuple[int, int]]:
-    """First and last row of each run of True values of bool [n]; runs at most `join` rows apart are merged."""
+    """Return first and last row of each run of True values of bool [n]; runs at most `join` rows apart are merged."""
     marked = np.nonzero(rows)[0]
     if not len(marked):
         return []

@@ -12,15 +12,15 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.adjustment import Tracks
 from vggtgeo.slam.verdict.alternatives import explain
 from vggtgeo.slam.verdict.claim import Claim, extent
-from vggtgeo.slam.verdict.decision import findings
+from vggtgeo.slam.verdict.corner_findings import findings
+from vggtgeo.slam.verdict.corner_recorder import CornerTracks, FrameEvidence
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
-from vggtgeo.slam.verdict.levels import MAX_UNKNOWN, NEAREST
-from vggtgeo.slam.verdict.record import check_frozen, check_record
+from vggtgeo.slam.verdict.thresholds import MAX_UNKNOWN, MIN_SENSOR_DEPTH
+from vggtgeo.slam.verdict.tracking_findings import check_frozen, check_record
 from vggtgeo.slam.verdict.windows import linked, thinned, tracks_of, windows
-from vggtgeo.slam.verdict.witness import Evidence, FrameEvidence
 
 
-def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
+def judge(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
     """Judge the state after the last adjustment.
 
     Args:
@@ -39,7 +39,7 @@ def judge(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ..
     return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
 
 
-def judge_or_report(slam: Slam, evidence: Evidence = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
+def judge_or_report(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
     """Call `judge`; an error in it becomes a finding, so that the result of a long run is not lost."""
     try:
         return judge(slam, evidence, input_findings)
@@ -51,14 +51,14 @@ def judge_or_report(slam: Slam, evidence: Evidence = (), input_findings: tuple[F
 
 
 def stated_share(claim: Claim, known: PoseUncertainty | None) -> float:
-    """Median standard deviation of the places, as the run states it, over their spread; 0 where it is unknown."""
+    """Return the median standard deviation of the places, as the run states it, over their spread; 0 if unknown."""
     if known is None or not np.isfinite(known.translation).any():
         return 0.0
     return float(np.nanmedian(known.translation)) / max(extent(claim.poses[claim.tracked]), 1e-12)
 
 
 def check_extent(claim: Claim, share: float) -> list[Finding]:
-    """Whether a path without depth is longer than its stated error. share: as `stated_share` returns it."""
+    """Check whether a path without depth is longer than its stated error. share: as `stated_share` returns it."""
     if claim.metric or share < MAX_UNKNOWN:
         return []
     text = (
@@ -69,13 +69,13 @@ def check_extent(claim: Claim, share: float) -> list[Finding]:
 
 
 def check_unit(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
-    """Whether measured depths are in the range of sensors for rooms: images alone cannot tell a wrong unit."""
+    """Check that measured depths are in the range of sensors for rooms: images alone cannot show a wrong unit."""
     depths = np.concatenate([frame.depth for frame in corners])
     depths = depths[np.isfinite(depths)]
     if not claim.metric or not len(depths):
         return []
     near, middle = np.quantile(depths, [0.1, 0.5])
-    if near >= NEAREST and PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
+    if near >= MIN_SENSOR_DEPTH and PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
         return []
     text = (
         f"the median depth of the corners is {middle:.2g} m, and a tenth of them is within {near:.2g} m, outside the "
@@ -85,7 +85,7 @@ def check_unit(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
 
 
 def tracks_of_windows(slam: Slam, claim: Claim, corners: Sequence[FrameEvidence]) -> list[Tracks]:
-    """The corner tracks of each window."""
+    """Return the corner tracks of each window."""
     height, width = slam.keyframes[0].size
     stretches = linked(corners, claim.tracked)
     rows = (rows for stretch in stretches for rows in windows(thinned(corners, stretch)))
@@ -93,8 +93,8 @@ def tracks_of_windows(slam: Slam, claim: Claim, corners: Sequence[FrameEvidence]
     return [tracks for tracks in found if tracks is not None]
 
 
-def aligned(slam: Slam, claim: Claim, evidence: Evidence) -> Sequence[FrameEvidence] | None:
-    """The corners of each frame of the run, without the distortion that it estimated; None where some are missing."""
+def aligned(slam: Slam, claim: Claim, evidence: CornerTracks) -> Sequence[FrameEvidence] | None:
+    """Return the corners of each frame of the run, undistorted as it estimated; None if some are missing."""
     by_frame = {noted.frame: noted for noted in evidence}
     if any(frame not in by_frame for frame in claim.frames):
         return None

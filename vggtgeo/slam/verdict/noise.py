@@ -19,18 +19,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.slam.verdict.adjustment import SIZE, Fit, Noise, reduce, solve
-
-MIN_PIXEL, MIN_DEPTH = 0.05, 0.003
-"""Pixels and relative: below these a simulated recording without noise would find everything significant."""
+from vggtgeo.slam.verdict.thresholds import MIN_PIXEL_NOISE, MIN_RELATIVE_DEPTH_NOISE
 
 
 def with_own_noise(fit: Fit) -> Fit:
-    """The fit once more, with the noise that its residuals show."""
+    """Repeat a fit with the noise that its residuals show."""
     return solve(fit.tracks, fit.unknowns, estimated(fit), fit.columns)
 
 
 def estimated(fit: Fit) -> Noise:
-    """The noise by the residuals of a fit with free poses."""
+    """Estimate the noise from the residuals of a fit with free poses."""
     tracks, noise, residual = fit.tracks, fit.noise, fit.linear.residual
     count = 2 * len(tracks.frame)
     freedom = max(count - 3 * len(tracks.first) - 6 * len(tracks.rows), 0.15 * count)
@@ -38,7 +36,7 @@ def estimated(fit: Fit) -> Noise:
     known = np.isfinite(tracks.depth)
     shared = residual[known, 2] * np.sqrt(tracks.depths[known])  # the error of a depth is common to its track
     depth = noise.depth * _deviation(shared) if known.any() else noise.depth
-    return Noise(max(float(pixel), MIN_PIXEL), max(depth, MIN_DEPTH))
+    return Noise(max(float(pixel), MIN_PIXEL_NOISE), max(depth, MIN_RELATIVE_DEPTH_NOISE))
 
 
 def _deviation(values: np.ndarray) -> float:
@@ -57,12 +55,12 @@ class Scores:
     clustered: np.ndarray
 
     def gain(self, columns: np.ndarray) -> float:
-        """Decrease of minus twice the log likelihood that a linear step of the calibration's `columns` promises."""
+        """Return the decrease of minus twice the log likelihood that a linear step of `columns` promises."""
         side = columns.T @ self.side
         return float(side @ np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True) @ side)
 
     def covariance(self, columns: np.ndarray) -> np.ndarray:
-        """Robust covariance of the calibration's `columns` [SIZE, k], float64 [k, k]."""
+        """Return the robust covariance of the calibration's `columns` [SIZE, k], float64 [k, k]."""
         inverse = np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True)
         return np.asarray(inverse @ (columns.T @ self.clustered @ columns) @ inverse + 1e-3 * inverse)
 
@@ -76,7 +74,7 @@ class Scores:
 
 
 def scores(fit: Fit) -> Scores:
-    """The scores of the calibration at a fit, all of it, whatever was free there."""
+    """Return the scores of the whole calibration at a fit, whatever was free there."""
     tracks, linear = fit.tracks, fit.linear
     reduced = reduce(tracks, linear, np.eye(SIZE), True, 0.0)
     width = 6 * len(tracks.rows)

@@ -9,27 +9,22 @@ import numpy as np
 
 from vggtgeo.slam.verdict.adjustment import Tracks
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.witness import FrameEvidence
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
+from vggtgeo.slam.verdict.thresholds import MIN_COMMON, MIN_FRAMES, MIN_VIEWS
 
 WINDOW = 24
 """Frames that are adjusted together."""
-MIN_VIEWS = 3
-"""Frames of a window that a track is seen in; two of them determine its point."""
-MIN_FRAMES = 4
-"""Frames of a window; in fewer, free poses explain nearly all."""
-MIN_COMMON = 10
-"""Corners that link a frame to the next: twenty numbers for six unknowns."""
 SHARED, MAX_STEP = 0.5, 3
 """The next frame of a window is the farthest one that still shows this share of the corners, at most so many on."""
 
 
 def common(first: FrameEvidence, second: FrameEvidence) -> int:
-    """How many tracks both frames saw."""
+    """Count the tracks that both frames saw."""
     return len(np.intersect1d(first.ids, second.ids, assume_unique=True))
 
 
 def linked(evidence: Sequence[FrameEvidence], tracked: np.ndarray) -> list[np.ndarray]:
-    """Stretches of tracked frames, each linked to the next by corners: rows, increasing."""
+    """Split tracked frames into stretches, each linked to the next frame by corners: rows, increasing."""
     rows = np.flatnonzero(tracked)
     if not len(rows):
         return []
@@ -42,7 +37,7 @@ def linked(evidence: Sequence[FrameEvidence], tracked: np.ndarray) -> list[np.nd
 
 
 def thinned(evidence: Sequence[FrameEvidence], rows: np.ndarray) -> np.ndarray:
-    """The frames of a stretch between which corners move enough to tell, first and last included."""
+    """Select the frames of a stretch between which corners move enough, first and last included."""
     chosen, place = [0], 0
     while place < len(rows) - 1:
         here = evidence[rows[place]]
@@ -57,7 +52,7 @@ def thinned(evidence: Sequence[FrameEvidence], rows: np.ndarray) -> np.ndarray:
 
 
 def windows(rows: np.ndarray) -> list[np.ndarray]:
-    """Windows of at most `WINDOW` of these rows, evenly spread, that overlap by a third at least."""
+    """Return windows of at most `WINDOW` of these rows, evenly spread, that overlap by a third at least."""
     last = max(len(rows) - WINDOW, 0)
     starts = np.linspace(0, last, int(np.ceil(last / (WINDOW * 2 / 3))) + 1).astype(int)
     return [rows[start : start + WINDOW] for start in starts]
@@ -66,7 +61,7 @@ def windows(rows: np.ndarray) -> list[np.ndarray]:
 def tracks_of(
     claim: Claim, evidence: Sequence[FrameEvidence], rows: np.ndarray, size: tuple[int, int]
 ) -> Tracks | None:
-    """The tracks that at least `MIN_VIEWS` of these frames see; None where there are none, or few frames.
+    """Return the tracks that at least `MIN_VIEWS` of these frames see; None without any, or for few frames.
 
     rows: int [f], increasing, of tracked frames.
     """
@@ -101,7 +96,7 @@ def tracks_of(
 
 
 def _velocities(evidence: Sequence[FrameEvidence], row: int) -> np.ndarray:
-    """Pixels a second of the corners of a frame, from the frames before and after."""
+    """Return the velocity of a frame's corners from the frames before and after, pixels a second."""
     here = evidence[row]
     moved, seconds = np.zeros(here.pixels.shape), np.zeros(len(here.ids))
     for other, sign in ((row - 1, -1.0), (row + 1, 1.0)):

@@ -61,7 +61,7 @@ class Adjustment:
     is_line: np.ndarray
     informed: np.ndarray
     """Whether the landmark's depth is constrained well enough to be used elsewhere, `[D]`."""
-    deviation: np.ndarray
+    estimate_sigma: np.ndarray
     """Standard deviation of its inverse depth by views of other keyframes, `[D]`, NaN where it has another source."""
 
 
@@ -88,7 +88,7 @@ def build(
     points = Selection.points(keyframes, edges, local, settings)
     lines = Selection.lines(keyframes, edges, local, settings)
     selected = points, lines
-    observations, depths, informed, deviation = _observed(keyframes, edges, local, selected, intrinsics, settings)
+    observations, depths, informed, estimate_sigma = _observed(keyframes, edges, local, selected, intrinsics, settings)
     problem, initial, index = pack(
         observations,
         rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
@@ -111,7 +111,7 @@ def build(
         slot=np.concatenate([points.slot, lines.slot]),
         is_line=np.arange(len(observations.host)) >= len(points.host),
         informed=informed,
-        deviation=deviation,
+        estimate_sigma=estimate_sigma,
     )
 
 
@@ -127,10 +127,10 @@ def _observed(
     constrained, and the standard deviations by views.
     """
     points, lines = selected
-    depths, informed, deviation = _initial_depths(keyframes, edges, local, points, intrinsics)
+    depths, informed, estimate_sigma = _initial_depths(keyframes, edges, local, points, intrinsics)
     key_points, samples = [keyframe.points for keyframe in keyframes], [keyframe.samples for keyframe in keyframes]
     read = lambda name: np.concatenate([points.read(key_points, name), lines.read(samples, name)])
-    prior, sigma = read("prior"), read("sigma")
+    prior, sigma = read("prior_mean"), read("prior_sigma")
     has_prior = np.isfinite(prior) & np.isfinite(sigma)
     depths = np.concatenate([depths, read("inverse_depth")[len(points.host) :]])
     # A slot without a prior needs finite placeholders; weight 0 removes its residual.
@@ -148,8 +148,8 @@ def _observed(
         segment=_segments(keyframes, points, lines) if settings.line.two_ends_lines else None,
     )
     informed = np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
-    deviation = np.concatenate([deviation, np.full(len(lines.host), np.nan)])
-    return observations, depths, informed, np.where(has_prior, np.nan, deviation)
+    estimate_sigma = np.concatenate([estimate_sigma, np.full(len(lines.host), np.nan)])
+    return observations, depths, informed, np.where(has_prior, np.nan, estimate_sigma)
 
 
 def write_back(
@@ -171,10 +171,10 @@ def write_back(
 
 
 def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.ndarray) -> Slots:
-    inverse, deviation = slots.inverse_depth.copy(), slots.deviation.copy()
+    inverse, estimate_sigma = slots.inverse_depth.copy(), slots.estimate_sigma.copy()
     inverse[adjustment.slot[here]] = np.maximum(depths[here], MIN_INVERSE_DEPTH)
-    deviation[adjustment.slot[here]] = adjustment.deviation[here]
-    return replace(slots, inverse_depth=inverse, deviation=deviation)
+    estimate_sigma[adjustment.slot[here]] = adjustment.estimate_sigma[here]
+    return replace(slots, inverse_depth=inverse, estimate_sigma=estimate_sigma)
 
 
 def _segments(keyframes: Sequence[Keyframe], points: Selection, lines: Selection) -> np.ndarray:
@@ -283,21 +283,21 @@ def _initial_depths(
     parallax is left, and change the scale of a map without metric depth.
     """
     slots = [keyframe.points for keyframe in keyframes]
-    current, before = points.read(slots, "inverse_depth"), points.read(slots, "deviation")
+    current, before = points.read(slots, "inverse_depth"), points.read(slots, "estimate_sigma")
     triangulated, information, longest = _triangulated(keyframes, edges, local, points, intrinsics)
     seen = information > 0
-    deviation = np.where(seen, 1.0 / np.sqrt(np.maximum(information, 1e-12)), np.nan)
-    determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (deviation < MAX_DEPTH_ERROR * triangulated)
+    estimate_sigma = np.where(seen, 1.0 / np.sqrt(np.maximum(information, 1e-12)), np.nan)
+    determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (estimate_sigma < MAX_DEPTH_ERROR * triangulated)
     # Where a depth camera measures nothing there may be glass or a mirror: do not triangulate there.
-    free = seen & ~np.array([np.isfinite(own.prior).any() for own in slots])[points.host]
+    free = seen & ~np.array([np.isfinite(own.prior_mean).any() for own in slots])[points.host]
     # Far points whose depth is not determined still fix rotations, as long as their projection does not depend on
     # depth.
-    steady = free & (deviation * longest * intrinsics[0] < STEP_PIXELS) & ~(deviation > before)
+    steady = free & (estimate_sigma * longest * intrinsics[0] < STEP_PIXELS) & ~(estimate_sigma > before)
     known = np.isfinite(current)
     some = current[known] if known.any() else triangulated[determined]
     typical = np.median(some) if len(some) else 1.0
     depths = np.where(known, current, np.where(determined | free, triangulated, typical))
-    return depths.astype(np.float64), determined | steady, deviation
+    return depths.astype(np.float64), determined | steady, estimate_sigma
 
 
 def _triangulated(

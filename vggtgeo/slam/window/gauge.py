@@ -32,11 +32,11 @@ rounding errors that marginalisation cuts off are 1e-12 of it."""
 class Gauge:
     """The gauge of a problem.
 
-    pieces: rows of the keyframes of each connected component. free: components that had no fixed pose; their first
+    components: rows of the keyframes of each connected component. free: components that had no fixed pose; their first
     keyframe is fixed now. loose: components without a known scale; a second keyframe is fixed now.
     """
 
-    pieces: tuple[tuple[int, ...], ...]
+    components: tuple[tuple[int, ...], ...]
     free: tuple[tuple[int, ...], ...]
     loose: tuple[tuple[int, ...], ...]
 
@@ -51,32 +51,32 @@ def with_one_gauge(problem: Problem, state: State, keyframes: int, metric: bool)
     label = _labels(problem, keyframes, known)
     fixed = np.array(problem.fixed_pose)
     sized = _sized(problem, keyframes, known, label)
-    pieces: list[tuple[int, ...]] = []
+    components: list[tuple[int, ...]] = []
     free: list[tuple[int, ...]] = []
     loose: list[tuple[int, ...]] = []
-    for piece in (np.nonzero(label == number)[0] for number in range(label.max(initial=-1) + 1)):
-        held = piece[fixed[piece]]
-        rows = tuple(int(row) for row in piece)
-        pieces.append(rows)
+    for component in (np.nonzero(label == number)[0] for number in range(label.max(initial=-1) + 1)):
+        held = component[fixed[component]]
+        rows = tuple(int(row) for row in component)
+        components.append(rows)
         if metric:
             # With a known scale a second fixed pose would keep the error between both.
             fixed[held[1:]] = False
-        if not len(held) and not known.placed[piece].any():
-            fixed[piece[0]] = True
+        if not len(held) and not known.placed[component].any():
+            fixed[component[0]] = True
             free.append(rows)
-        if len(piece) > 1 and not sized[label[piece[0]]] and np.count_nonzero(fixed[piece]) < 2:
+        if len(component) > 1 and not sized[label[component[0]]] and np.count_nonzero(fixed[component]) < 2:
             # The longest baseline: its relative error, which becomes that of the scale, is the smallest.
-            fixed[_farthest(state, piece, fixed)] = True
+            fixed[_farthest(state, component, fixed)] = True
             loose.append(rows)
     held_problem = replace(problem, fixed_pose=jnp.asarray(fixed))
     # Links too weak to connect two components would only bend them, since their relative pose is a guess.
-    whole = held_problem if len(pieces) < 2 else _without_links(held_problem, label)
-    return whole, Gauge(tuple(pieces), tuple(free), tuple(loose))
+    whole = held_problem if len(components) < 2 else _without_links(held_problem, label)
+    return whole, Gauge(tuple(components), tuple(free), tuple(loose))
 
 
 def gauge_notes(gauge: Gauge, numbers: tuple[int, ...], problem_name: str) -> tuple[str, ...]:
     """Return warnings for the user; `numbers` are those of the keyframes by row."""
-    name = lambda piece: ", ".join(str(numbers[row]) for row in piece)
+    name = lambda component: ", ".join(str(numbers[row]) for row in component)
     # A single keyframe is a component by itself and needs no fixed pose.
     alone = len(numbers) == 1
     free = (
@@ -90,15 +90,15 @@ def gauge_notes(gauge: Gauge, numbers: tuple[int, ...], problem_name: str) -> tu
 
 def _without_links(problem: Problem, label: np.ndarray) -> Problem:
     """Return the problem without observations between keyframes of different components."""
-    piece = np.full(problem.num_keyframes, -1)
-    piece[: len(label)] = label
+    component = np.full(problem.num_keyframes, -1)
+    component[: len(label)] = label
     source, target = (np.asarray(end) for end in problem.edges.ends)
-    within = jnp.asarray(piece[source] == piece[target])
+    within = jnp.asarray(component[source] == component[target])
     for term in problem.terms:
         if isinstance(term, EdgeTerm):
             problem = problem.with_term(term.restricted(within), replace=True)
         elif isinstance(term, PairTerm):
-            inside = piece[np.asarray(term.first)] == piece[np.asarray(term.second)]
+            inside = component[np.asarray(term.first)] == component[np.asarray(term.second)]
             lighter = term.reweighted(jnp.where(inside, term.weight, 0.0))
             problem = problem.with_term(lighter, replace=True)
     return problem
@@ -220,9 +220,9 @@ def _sized(problem: Problem, keyframes: int, known: _PriorKnowledge, label: np.n
     return np.array([constrained[label == number].any() for number in range(label.max(initial=-1) + 1)])
 
 
-def _farthest(state: State, piece: np.ndarray, fixed: np.ndarray) -> int:
+def _farthest(state: State, component: np.ndarray, fixed: np.ndarray) -> int:
     """Return the keyframe of a component that is farthest from the fixed one."""
-    centres = np.array([rigid.centre(pose) for pose in rigid.to_matrix(np.asarray(state.poses.wxyz_xyz)[piece])])
-    held = fixed[piece]
+    centres = np.array([rigid.centre(pose) for pose in rigid.to_matrix(np.asarray(state.poses.wxyz_xyz)[component])])
+    held = fixed[component]
     start = centres[np.argmax(held)]
-    return int(piece[np.argmax(np.where(held, -1.0, np.linalg.norm(centres - start, axis=1)))])
+    return int(component[np.argmax(np.where(held, -1.0, np.linalg.norm(centres - start, axis=1)))])

@@ -102,6 +102,6 @@ def _with_depths(keyframe: Keyframe, new: np.ndarray, inverse: np.ndarray, sigma
     own = replace(
         samples,
         inverse_depth=np.where(here, on_line, samples.inverse_depth),
-        sigma=np.where(here, sigma[segment].mean(1), samples.sigma),
+        prior_sigma=np.where(here, sigma[segment].mean(1), samples.prior_sigma),
     )
     return replace(keyframe, line_depths=depths, samples=own)

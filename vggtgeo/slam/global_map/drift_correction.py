@@ -13,9 +13,9 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import BELIEF, PoseGraph, distance, solve_pose_graph
+from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, PoseGraph, distance, solve_pose_graph
 from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
-from vggtgeo.slam.sparse_map.connected import piece_of
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion
@@ -49,22 +49,22 @@ class Loop:
         return bool(np.median(np.where(np.isfinite(off), off, np.inf)) < MAX_LOOP_ERROR)
 
 
-def straightened(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
-    """Return the map corrected by a pose graph, and the accepted loops.
+def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
+    """Correct the map by a pose graph; return it and the accepted loops.
 
     It is unchanged unless loops contradict it by more than its adjustment can correct.
     """
     motions, closing = odometry(slam)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     drifted = [loop for loop in loops if not loop.agrees(slam)]
-    torn = [tie for tie in closing if distance(tie, poses) > BELIEF and _pixels(tie, slam) > MAX_LOOP_ERROR]
+    torn = [tie for tie in closing if distance(tie, poses) > LOOP_GATE and _pixels(tie, slam) > MAX_LOOP_ERROR]
     if not drifted and not torn:
         return slam, list(loops)
     measured = (*closing, *(loop.motion for loop in loops))
     graph = _graph(slam, motions, measured, _units(slam, motions, loops))
     tracked = graph.motions if slam.metric else [motion.of_free_length() for motion in graph.motions]
     # Before the solve: with several wrong loops even a robust kernel may settle on their consensus.
-    sure = consistent_loops(graph.loops, tracked, BELIEF, alone=np.arange(len(measured)) < len(closing))
+    sure = consistent_loops(graph.loops, tracked, LOOP_GATE, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
         return _noted(_without(slam, closing), len(loops) - len(agreeing)), agreeing
@@ -103,7 +103,7 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
         if number in tree:
             tie = tree[number]
             # Adjusted poses are more accurate than the tracked motion, unless an adjustment went wrong.
-            agrees = distance(tie, poses) < BELIEF
+            agrees = distance(tie, poses) < LOOP_GATE
             motions.append(replace(tie, pose=between(tie.first, tie.second)) if agrees else tie)
         elif (number - 1, number) in matched:
             motions.append(MeasuredRelativePose(number - 1, number, between(number - 1, number), loose))
@@ -126,7 +126,7 @@ def _graph(
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])
     whole = replace(slam, map=replace(slam.map, factors=(*slam.map.factors, *loops)))
-    label = piece_of(whole.map)
+    label = submap_of(whole.map)
     held = np.zeros(len(poses), bool)
     held[np.unique(label, return_index=True)[1]] = True
     return PoseGraph(start, scaled_motions, scaled_loops, held)
@@ -178,7 +178,7 @@ def _noted(slam: Slam, refused: int, before: Slam | None = None) -> Slam:
             for new, old in zip(slam.keyframes, before.keyframes, strict=True)
         )
         unit = "m" if slam.metric else "of its unit"
-        notes.append(f"places seen again straightened the map: a keyframe moved by up to {moved:.2f} {unit}")
+        notes.append(f"loop closures corrected the drift of the map: a keyframe moved by up to {moved:.2f} {unit}")
     if refused:
         places = "1 place that looks" if refused == 1 else f"{refused} places that look"
         notes.append(f"{places} the same as others contradict the rest of the map, and are left out")

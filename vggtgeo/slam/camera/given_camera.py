@@ -61,7 +61,7 @@ Solve = Callable[[Problem, State], State]
 
 
 @dataclass(frozen=True, eq=False)
-class Refinement:
+class RefinedCamera:
     """The result of a trial.
 
     state: the map with the new camera; None if no trial was made. given, wanted: float64 [4], fx, fy, cx, cy before and
@@ -87,7 +87,7 @@ class Refinement:
         return float(np.abs(self.wanted - self.given).max() / self.given[0])
 
 
-def try_camera(pairs: list[CameraPair], problem: Problem, state: State, solve: Solve) -> Refinement | None:
+def refine_given_camera(pairs: list[CameraPair], problem: Problem, state: State, solve: Solve) -> RefinedCamera | None:
     """Try a refined camera, from a map that was adjusted with fixed intrinsics; return None if there are too few pairs.
 
     pairs: of keyframes, see `keyframe_pairs`. problem: the adjustment. solve: adjusts any problem of its shape.
@@ -99,7 +99,7 @@ def try_camera(pairs: list[CameraPair], problem: Problem, state: State, solve: S
     wanted, reason = _averaged(estimate, given)
     distortion = float(estimate.value[3]), float(estimate.sigma[3])
     if not reason:
-        return Refinement(given, given, distortion)
+        return RefinedCamera(given, given, distortion)
     held_out = _held_out(problem)
     weight = jnp.asarray(np.where(held_out, 0.0, problem.points.weight))
     training = without_surfaces(problem.with_term(problem.points.reweighted(weight)))
@@ -108,7 +108,7 @@ def try_camera(pairs: list[CameraPair], problem: Problem, state: State, solve: S
     moved = solve(camera_held_at(training, wanted), start)
     # Weights of the whole problem: in training the held-out matches have weight zero.
     found, needed = gain((problem, held), (problem, moved), held_out)
-    return Refinement(given, wanted, distortion, moved, found, needed)
+    return RefinedCamera(given, wanted, distortion, moved, found, needed)
 
 
 def camera_held_at(problem: Problem, intrinsics: np.ndarray) -> Problem:
@@ -131,7 +131,7 @@ def keyframe_pairs(
     chosen = np.unique(np.linspace(0, max(len(edges) - 1, 0), MAX_PAIRS).astype(int))
     for edge in (edges[row] for row in chosen if row < len(edges)):
         host, target = by_number[edge.host], by_number[edge.target]
-        inverse = (host.points.prior if known.metric else host.points.inverse_depth)[edge.slots]
+        inverse = (host.points.prior_mean if known.metric else host.points.inverse_depth)[edge.slots]
         seen = np.isfinite(inverse) & (inverse > 0)
         before, after = host.points.pixels[edge.slots[seen]], edge.pixels[seen]
         if len(before) < MIN_MATCHES or np.median(np.linalg.norm(after - before, axis=1)) < MIN_FLOW:

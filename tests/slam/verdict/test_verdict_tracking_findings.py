@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from witness import Walk, walk
+from corner_walk import Walk, walk
 
-from vggtgeo.slam.verdict.record import check_frozen, check_record
+from vggtgeo.slam.verdict.tracking_findings import check_frozen, check_record
 
 
 def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
@@ -20,7 +20,7 @@ def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
     assert [(f.start, f.end, f.local) for f in check_record(lose([7, 8]))] == [(7, 8, True)]
     assert [f.local for f in check_record(lose(np.arange(10, 16)))] == [True, False]
     assert "failed" in {f.level for f in check_record(lose(np.arange(8, 40)))}
-    assert [f.check for f in check_record(replace(healthy.claim, pieces=2))] == ["parts"]
+    assert [f.check for f in check_record(replace(healthy.claim, submaps=2))] == ["submaps"]
 
 
 def test_many_losses_are_one_sentence(healthy: Walk) -> None:
@@ -47,14 +47,14 @@ def test_a_single_frame_is_no_run(healthy: Walk) -> None:
         **{name: getattr(healthy.claim, name)[:count] for name in ("frames", "times", "poses", "tracked")},
     )
     assert [f.level for f in check_record(first(1))] == ["degraded"]
-    assert not check_record(replace(first(1), in_known_map=True))
+    assert not check_record(replace(first(1), began_in_known_map=True))
     assert not check_record(first(2))
 
 
 def test_a_run_that_is_found_nowhere_in_a_map_says_so(healthy: Walk) -> None:
     """In a known map the reason is that no frame, or one alone, was found there; oracle: the sentence."""
     for found in (0, 1):
-        claim = replace(healthy.claim, tracked=np.arange(40) < found, in_known_map=True)
+        claim = replace(healthy.claim, tracked=np.arange(40) < found, began_in_known_map=True)
         (finding,) = check_record(claim)
         assert finding.level == "failed"
         assert finding.text.startswith(f"{found} of 40 frames were found in the known map")

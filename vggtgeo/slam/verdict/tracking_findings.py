@@ -1,4 +1,4 @@
-"""What the tracker recorded: whether the run started, which frames were lost, how many parts the map has.
+"""Findings about tracking: a run that never started, lost frames, submaps that are not connected, repeated pictures.
 
 A lost stretch of `T` seconds is bridged by assuming a smooth motion. A hand-held camera's acceleration has a standard
 deviation of about `ACCELERATION`, so the middle of a bridge is off by `a T^2 / 8`, the end of a run that is not
@@ -14,31 +14,38 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.claim import Claim, extent
+from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.finding import Finding, Level, spans
-from vggtgeo.slam.verdict.levels import ACCELERATION, MAX_BRIDGED, MAX_LOST, MIN_TRACKED, SHARE, UNMOVED
-from vggtgeo.slam.verdict.windows import MIN_COMMON
-from vggtgeo.slam.verdict.witness import FrameEvidence
+from vggtgeo.slam.verdict.thresholds import (
+    ACCELERATION,
+    MAX_BRIDGED,
+    MAX_LOST,
+    MAX_PLACE_ERROR_SHARE,
+    MAX_UNMOVED,
+    MIN_COMMON,
+    MIN_TRACKED,
+)
 
 
 def check_record(claim: Claim) -> list[Finding]:
-    """Lost frames, parts of the map, a run that never started."""
+    """Check for lost frames, unconnected submaps, and a run that never started."""
     if not len(claim):
         return []
     if not claim.started or (len(claim) > 2 and np.count_nonzero(claim.tracked) <= 1):
         return [Finding("start", "failed", _never_started(claim))]
     found = []
-    if len(claim) == 1 and not claim.in_known_map:
+    if len(claim) == 1 and not claim.began_in_known_map:
         found.append(Finding("start", "degraded", "the run has one frame: nothing can confirm its pose and its map"))
     if claim.guessed:
         text = "the camera is unknown, and too little was seen to estimate it; pass `--intrinsics`"
         found.append(Finding("camera", "degraded", text))
     found += _lost(claim)
-    if claim.pieces > 1:
+    if claim.submaps > 1:
         text = (
-            f"the map is in {claim.pieces} parts that are not connected; trajectory.txt and map.ply hold the one with "
+            f"the map has {claim.submaps} submaps that are not connected; trajectory.txt and map.ply hold the one with "
             "most frames, trajectory-2.txt the next"
         )
-        found.append(Finding("parts", "degraded", text))
+        found.append(Finding("submaps", "degraded", text))
     return found
 
 
@@ -57,7 +64,7 @@ def _lost(claim: Claim) -> list[Finding]:
 
 
 def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
-    """Pictures that were shown again while the camera moved on, at its usual speed.
+    """Check for pictures that were repeated while the camera moved on, at its usual speed.
 
     Where a camera is at rest, the noise of a new picture still moves its corners a little: all of them in the very
     same place have no likelihood but that of the same picture.
@@ -71,7 +78,7 @@ def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding
     )
     squares = [(last - first + 1) * (claim.times[last] - claim.times[first - 1]) ** 2 / 3 for first, last in stretches]
     off = float(np.median(speeds[~repeated[1:]]) * np.sqrt(sum(squares) / len(claim)))
-    if off <= (MAX_BRIDGED if claim.metric else SHARE * extent(claim.poses[claim.tracked])):
+    if off <= (MAX_BRIDGED if claim.metric else MAX_PLACE_ERROR_SHARE * extent(claim.poses[claim.tracked])):
         return []
     first, last = max(stretches, key=lambda ends: ends[1] - ends[0])
     start, end = int(claim.frames[first]), int(claim.frames[last])
@@ -80,14 +87,14 @@ def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding
 
 
 def _same(before: FrameEvidence, after: FrameEvidence) -> bool:
-    """Whether two frames show one picture: most of their corners did not move at all."""
+    """Return whether two frames show one picture: most of their corners did not move at all."""
     _, first, second = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
     moved = np.abs(before.pixels[first] - after.pixels[second]).max(1, initial=0.0)
-    return len(first) >= MIN_COMMON and bool(np.median(moved) < UNMOVED)
+    return len(first) >= MIN_COMMON and bool(np.median(moved) < MAX_UNMOVED)
 
 
 def _never_started(claim: Claim) -> str:
-    if not claim.in_known_map:
+    if not claim.began_in_known_map:
         return "the map was never started: not enough parallax or texture; the poses are meaningless"
     found, count = np.count_nonzero(claim.tracked), len(claim)
     return (
@@ -97,7 +104,7 @@ def _never_started(claim: Claim) -> str:
 
 
 def bridging_error(claim: Claim) -> float:
-    """Metres, RMS over all frames, that the lost ones may be off."""
+    """Return the error that lost frames may have, metres, RMS over all frames."""
     squares = 0.0
     for first, last in spans(~claim.tracked):
         before, after = max(first - 1, 0), min(last + 1, len(claim) - 1)

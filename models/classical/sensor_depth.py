@@ -15,8 +15,8 @@ from vggtgeo.models.roles import DepthEstimate
 class SensorDepth:
     """A depth camera's own depth, with the noise of a Kinect.
 
-    sigma_z = axial + quadratic (z - near)^2 metres: Nguyen, Izadi, Lovell, "Modeling Kinect sensor noise for improved
-    3D reconstruction and tracking", 3DIMPVT 2012; its growth with z^2 is that of triangulation from disparity
+    sigma_z = axial + quadratic (z - noise_offset)^2 metres: Nguyen, Izadi, Lovell, "Modeling Kinect sensor noise for
+    improved 3D reconstruction and tracking", 3DIMPVT 2012; its growth with z^2 is that of triangulation from disparity
     (Khoshelham and Oude Elberink, "Accuracy and resolution of Kinect depth data", Sensors 2012). `floor` adds, in
     quadrature and relative to z, what calibration leaves behind between views; what it leaves in all of them alike is
     no noise. With 0.3 %, surfaces of pairs of frames differ by 0.2 to 0.4 of the stated sigma on two HoloLens clips, a
@@ -24,21 +24,21 @@ class SensorDepth:
     are a third less accurate (6.1 instead of 4.5 mm, 6.9 instead of 5.2). Near a jump of depth the pixel may belong to
     either side, so confidence falls there and sigma_rel grows with the jump.
 
-    nearest, farthest: depths outside are dropped, metres. edge: relative jump between neighbours at which confidence
+    min_depth, max_depth: depths outside are dropped, metres. edge: relative jump between neighbours at which confidence
     has fallen to one half. reach: how far from a jump it is felt, pixels.
     """
 
     axial: float = 0.0012
     quadratic: float = 0.0019
-    near: float = 0.4
+    noise_offset: float = 0.4
     floor: float = 0.003
-    nearest: float = 0.2
-    farthest: float = 8.0
+    min_depth: float = 0.2
+    max_depth: float = 8.0
     edge: float = 0.05
     reach: int = 2
 
     def __post_init__(self) -> None:
-        check_fields(self, nearest="[0, inf)", farthest=f"({self.nearest}, inf)")
+        check_fields(self, min_depth="[0, inf)", max_depth=f"({self.min_depth}, inf)")
         check_fields(self, floor="[0, inf)", edge="(0, inf)", reach="[0, inf)")
 
     def estimate(
@@ -53,7 +53,7 @@ class SensorDepth:
             return no_depth(image.shape[:2])
         check_array("sensor_depth", sensor_depth, image.shape[:2], finite=False)
         depth = sensor_depth.astype(np.float32)
-        valid = (depth >= self.nearest) & (depth <= self.farthest)
+        valid = (depth >= self.min_depth) & (depth <= self.max_depth)
         jump = _relative_jump(np.where(valid, depth, np.nan), self.reach)
         confidence = np.where(valid, 1.0 / (1.0 + (jump / self.edge) ** 2), 0.0)
         sigma = np.where(valid, np.hypot(self.noise(np.where(valid, depth, np.float32(1.0))), 0.5 * jump), np.nan)
@@ -66,7 +66,7 @@ class SensorDepth:
     def noise(self, depth: np.ndarray) -> np.ndarray:
         """Return relative standard deviation of a depth (metres, any shape) away from jumps."""
         # In place, and not by np.hypot: a third of the time, and nothing here is near the ends of the numbers.
-        away = depth - self.near
+        away = depth - self.noise_offset
         away *= away
         away *= self.quadratic
         away += self.axial
@@ -86,7 +86,7 @@ class NoDepth:
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        """NaN everywhere, whatever the sensor says."""
+        """Return NaN everywhere, whatever the sensor says."""
         check_image("image", image)
         return no_depth(image.shape[:2])
 
@@ -117,7 +117,7 @@ def _relative_jump(depth: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _without_border(values: np.ndarray, width: int, axis: int) -> np.ndarray:
-    """`values` with 0 along the two borders of `axis`, where `np.roll` has wrapped around."""
+    """Set `values` to 0 along the two borders of `axis`, where `np.roll` has wrapped around."""
     inside = np.zeros(values.shape[axis], dtype=bool)
     inside[width:-width] = True
     return values * (inside[:, None] if axis == 0 else inside[None, :])

@@ -1,4 +1,4 @@
-"""The witness of the verdict: corners followed from image to image, and the measured depth there.
+"""Recorder of the corner tracks with which the verdict tests a run, and of the measured depth at them.
 
 The tracks (Lucas & Kanade, 1981, on images of 320 pixels) are independent of the map, its features and its poses. About
 4 ms a frame (640 x 480), 4 kB a frame.
@@ -32,8 +32,8 @@ from vggtgeo.slam.state import Slam
 
 STRIDE = 8
 """Pixels between the depths that are kept of the last frame."""
-MAX_WAITING = 4
-"""Frames that wait to be looked at; they hold their images."""
+MAX_QUEUED_FRAMES = 4
+"""Maximum number of frames that wait for the recorder's thread; they hold their images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class FrameEvidence:
     depth: np.ndarray
 
     def through(self, lens: Camera) -> FrameEvidence:
-        """The same corners without the distortion of `lens`."""
+        """Return the same corners without the distortion of `lens`."""
         return replace(self, pixels=lens.undistorted(self.pixels).astype(np.float32))
 
 
@@ -90,19 +90,19 @@ class EvidenceRecorder(Callback):
 
     @property
     def frames(self) -> list[FrameEvidence]:
-        """Evidence of each frame so far."""
+        """The corners of each frame so far."""
         while self._waiting:
             self._waiting.popleft().result()
         return self._frames
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         """Follow the corners in a thread of its own, beside the run."""
-        while len(self._waiting) > MAX_WAITING:
+        while len(self._waiting) > MAX_QUEUED_FRAMES:
             self._waiting.popleft().result()
         self._waiting.append(self._pool.submit(self._add, frame))
 
     def so_far(self) -> tuple[object, ...]:
-        """State to resume from."""
+        """Return the state to resume from."""
         return tuple(self.frames), self._image, self._depth, self._ids, self._pixels, self._next
 
     def on_resume(self, so_far: Any, slam: Slam) -> None:
@@ -136,7 +136,7 @@ class EvidenceRecorder(Callback):
         self._frames.append(FrameEvidence(frame.index, frame.timestamp, self._ids.copy(), ideal, depth))
 
     def _read(self, depth: np.ndarray | None, grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Depths at pixels; NaN where the image repeats that of another picture: the run does not use it either."""
+        """Return depths at pixels; NaN if the image repeats that of another picture: the run does not use it either."""
         some = slice(STRIDE // 2, None, STRIDE)
         before, self._depth = self._depth, None if depth is None else depth[some, some].copy()
         if before is None or self._depth is None or not np.array_equal(before, self._depth, equal_nan=True):
@@ -149,11 +149,12 @@ class EvidenceRecorder(Callback):
         return depth[row, column].astype(np.float32)
 
     def _of_the_world(self, pixels: np.ndarray) -> np.ndarray:
-        """Which corners of the small image may be followed."""
+        """Return which corners of the small image may be followed."""
         if self._left_out is None:
             return np.ones(len(pixels), bool)
         column, row = np.clip(np.rint(pixels), 0, np.array(self._left_out.shape[::-1]) - 1).astype(int).T
         return ~self._left_out[row, column]
 
 
-Evidence = Sequence[FrameEvidence]
+CornerTracks = Sequence[FrameEvidence]
+"""The corners of each frame of a run; equal ids are one track."""

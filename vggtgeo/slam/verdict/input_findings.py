@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping
 
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.slam.perception.still_parts import StillParts
+from vggtgeo.slam.perception.static_overlay import StaticOverlay
 from vggtgeo.slam.verdict.finding import Finding
-from vggtgeo.slam.verdict.levels import MAX_LOST
+from vggtgeo.slam.verdict.thresholds import MAX_LOST
 
 
 def check_refusals(refusals: Mapping[str, Refusals]) -> tuple[Finding, ...]:
-    """Roles whose network gave invalid answers, or none."""
+    """Check for roles whose network gave invalid answers, or none."""
     return tuple(
         Finding(
             "network",
@@ -27,7 +27,7 @@ def check_refusals(refusals: Mapping[str, Refusals]) -> tuple[Finding, ...]:
 
 
 def check_input(warned: Iterable[Warning | str], frames: int) -> tuple[Finding, ...]:
-    """Frames that a reader skipped, beside `frames` that it gave."""
+    """Check for frames that a reader skipped, beside `frames` that it gave."""
     missing = sum(warning.frames for warning in warned if isinstance(warning, LeftOutWarning))
     if missing <= MAX_LOST * (missing + frames):
         return ()
@@ -35,8 +35,8 @@ def check_input(warned: Iterable[Warning | str], frames: int) -> tuple[Finding, 
     return (Finding("input", "degraded", text),)
 
 
-def check_still_parts(seen: StillParts | None, left_out: bool) -> tuple[Finding, ...]:
-    """A static part of the picture: whether it was masked, and whether it belongs to the camera beyond doubt."""
+def check_static_overlay(seen: StaticOverlay | None, left_out: bool) -> tuple[Finding, ...]:
+    """Check for a static part of the picture that was not masked, or may not belong to the camera."""
     if seen is None or (left_out and seen.sure):
         return ()
     text = f"{100 * seen.share:.0f} % of the picture stays in its place while the rest moves; "

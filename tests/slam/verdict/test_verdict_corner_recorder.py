@@ -12,7 +12,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.simulation.degradations import in_bands_of_light
-from vggtgeo.slam.verdict.witness import EvidenceRecorder
+from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 
 
 def test_the_recorder_follows_a_real_picture() -> None:

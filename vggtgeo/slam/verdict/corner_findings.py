@@ -1,12 +1,12 @@
-"""What is reported: an explanation that is significant and matters.
+"""Findings that the corners give: explanations that contradict the run significantly, and matter.
 
 An explanation of a window (`alternatives.py`) is reported where
 
 - it is significant: two halves of the tracks, fitted apart, confirm its consequence by more than `SIGMAS` standard
   deviations, those that the run itself states for its places included; an alternative beside free poses is added only
-  at the level of `LEVEL`; and
-- it has a consequence: places differ from those of the run by more than `PLACES` (without depth `SHARE` of the path's
-  extent), or turns from frame to frame by more than `TURN`.
+  at the level of `SIGNIFICANCE`; and
+- it has a consequence: places differ from those of the run by more than `MAX_PLACE_ERROR` (without depth
+  `MAX_PLACE_ERROR_SHARE` of the path's extent), or turns from frame to frame by more than `MAX_TURN_ERROR`.
 
 The cause is a second motion, the alternative that was added, or poses alone. Reasons are exclusive: one a
 cause, at most `MAX_REASONS`, the largest consequence first.
@@ -23,7 +23,15 @@ from vggtgeo.slam.verdict.alternatives import Added, Explanation
 from vggtgeo.slam.verdict.claim import Claim, extent
 from vggtgeo.slam.verdict.consequence import Consequence, confirmed, difference
 from vggtgeo.slam.verdict.finding import Finding
-from vggtgeo.slam.verdict.levels import DEPTH_NOISE, MAX_REASONS, PLACES, RIVAL, SHARE, SIGMAS, TURN
+from vggtgeo.slam.verdict.thresholds import (
+    MAX_DEPTH_NOISE,
+    MAX_PLACE_ERROR,
+    MAX_PLACE_ERROR_SHARE,
+    MAX_REASONS,
+    MAX_SECOND_MOTION_SHARE,
+    MAX_TURN_ERROR,
+    SIGMAS,
+)
 
 CALIBRATE = "calibrate the camera, or leave it to the run (`--intrinsics` off)"
 CHECK_DEPTH = "check the depth camera, or leave its depth out (`--rgb-only`)"
@@ -56,17 +64,17 @@ class Contradiction:
 
 
 def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contradiction | None:
-    """What the explanation of a window contradicts; None where it is what the run claims.
+    """Return how the explanation of a window contradicts the run; None if it does not.
 
     stated: standard deviation of the places that the run itself states, as a share of their extent.
     """
     cause = None
-    if one.rival > RIVAL * (one.rival + one.share):
+    if one.rival > MAX_SECOND_MOTION_SHARE * (one.rival + one.share):
         cause = "second motion"
-    elif one.tracks.with_depth and one.best.noise.depth > DEPTH_NOISE:
+    elif one.tracks.with_depth and one.best.noise.depth > MAX_DEPTH_NOISE:
         cause = "depth"
     around = max(extent(one.tracks.poses), 1e-12)
-    limits = np.array([PLACES if metric else SHARE * around, TURN])
+    limits = np.array([MAX_PLACE_ERROR if metric else MAX_PLACE_ERROR_SHARE * around, MAX_TURN_ERROR])
     found, size = difference(one.best), 0.0
     if cause or found.places >= limits[0] or found.turn >= limits[1]:  # else small even with its noise
         found = confirmed(one.best)
@@ -80,7 +88,7 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
 
 
 def findings(claim: Claim, explanations: Sequence[Explanation], stated: float = 0.0) -> list[Finding]:
-    """One finding a cause, the largest consequence first; then those that do not matter, of the level "good".
+    """Return one finding a cause, the largest consequence first; then those of no consequence, of level "good".
 
     stated: as in `contradiction`.
     """
