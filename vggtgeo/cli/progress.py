@@ -215,8 +215,10 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
         )
     if "truth" in summary:
         lines.append(errors_line(summary["truth"], free=summary["scale"].startswith("free")))
-    points = f"({len(result.cloud)} points)"
-    lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply {points} report.html")
+    mesh = " mesh.ply" if (folder / "mesh.ply").is_file() else ""
+    lines.append(
+        f"outputs in {folder}: report.html trajectory.txt map.ply ({len(result.cloud)} points){mesh} summary.json"
+    )
     lines += [f"- {reason}" for reason in verdict.reasons]
     lines.append(verdict_line(verdict))
     for line in lines:
