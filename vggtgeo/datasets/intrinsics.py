@@ -199,8 +199,8 @@ def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float =
     focal = " and ".join(dict.fromkeys(f"{value:.0f}" for value in camera.intrinsics[:2]))
     warnings.warn(
         f"`{name}`: no camera file found, so the camera is estimated (normal for a phone video), beginning with a "
-        f"focal length of {focal} pixels. To give it: --intrinsics fx,fy,cx,cy, or a file `{CALIBRATION}` with "
-        "`fx fy cx cy` beside the images",
+        f"focal length of {focal} pixels. To give it: --intrinsics fx,fy,cx,cy (in Python: `camera`), or a file "
+        f"`{CALIBRATION}` with `fx fy cx cy` beside the images",
         GuessedCameraWarning,
         stacklevel=3,
     )
