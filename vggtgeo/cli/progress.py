@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column
@@ -185,6 +186,22 @@ def errors_line(truth: Mapping[str, Any], free: bool) -> str:
     return f"{line} with scale {scale:.3g}: are depth and ground truth in the same unit?" if other else line
 
 
+def uncertainty_line(stated: Mapping[str, Any] | None, result: Result) -> str:
+    """Return the line with the standard deviations of the poses; without a scale as shares of the path's extent."""
+    if stated is None:
+        return "standard deviation of poses: unknown, since there was no last adjustment or it did not determine them"
+    metric = "translation_m" in stated
+    translation, rotation = stated["translation_m" if metric else "translation_unit"], stated["rotation_deg"]
+    extent = float(np.linalg.norm(np.ptp(result.trajectory.positions, axis=0)))
+    lengths = {name: 100 * value / (1.0 if metric else max(extent, 1e-12)) for name, value in translation.items()}
+    unit = "cm" if metric else "% of the extent of the path"
+    return (
+        f"standard deviation of poses relative to the first: median {lengths['median']:.1f} {unit} and "
+        f"{rotation['median']:.2f} deg, maximum {lengths['largest']:.1f} {unit} and {rotation['largest']:.2f} deg "
+        "(uncertainty.txt)"
+    )
+
+
 def print_result(console: Console, result: Result, summary: Mapping[str, Any], folder: Path) -> None:
     """Print the report of a run; its last line is the verdict. summary: as written to `summary.json`."""
     verdict, (fx, fy, cx, cy) = result.verdict, result.intrinsics_as_read
@@ -205,14 +222,7 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
         lines.append("scale: doubtful, lengths may not be metres")
     else:
         lines.append(f"scale: metric, by {summary['scale_basis']}")
-    stated = summary.get("pose_sigma", {})
-    if "translation_m" in stated:
-        translation, rotation = stated["translation_m"], stated["rotation_deg"]
-        lines.append(
-            f"standard deviation of poses relative to the first: median {100 * translation['median']:.1f} cm and "
-            f"{rotation['median']:.2f} deg, maximum {100 * translation['largest']:.1f} cm and "
-            f"{rotation['largest']:.2f} deg (uncertainty.txt)"
-        )
+    lines.append(uncertainty_line(summary.get("pose_sigma"), result))
     if "truth" in summary:
         lines.append(errors_line(summary["truth"], free=summary["scale"].startswith("free")))
     mesh = " mesh.ply" if (folder / "mesh.ply").is_file() else ""

@@ -109,6 +109,7 @@ def write_page(
         interrupted=bool(summary.get("interrupted")),
         scale_is_free=not slam.metric,
         unit=" m" if slam.metric else "",
+        no_uncertainty="pose_sigma" not in summary,
         verdict=verdict,
         verdict_line=VERDICT_LINES[verdict.level],
         timeline=_timeline(verdict),
