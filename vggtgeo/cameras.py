@@ -1,4 +1,8 @@
-"""Camera models: how a point in front of a camera becomes a pixel."""
+"""Camera models: how a point in front of a camera becomes a pixel.
+
+`Pinhole` (fx, fy, cx, cy), `RadialTangential` (with k1, k2, p1, p2), `KannalaBrandt` (fisheye); your own is a
+subclass of `AbstractCamera`.
+"""
 
 from vggtgeo.geometry.camera_models import AbstractCamera as AbstractCamera
 from vggtgeo.geometry.camera_models import KannalaBrandt as KannalaBrandt

@@ -1,4 +1,8 @@
-"""Robust kernels: how much a large residual counts."""
+"""Robust kernels: how much a large residual counts.
+
+`Square` (none), `Huber`, `Cauchy`, `GemanMcClure`, `Barron` (a family of them); your own is a subclass of
+`AbstractKernel`.
+"""
 
 from vggtgeo.solvers.kernels import AbstractKernel as AbstractKernel
 from vggtgeo.solvers.kernels import Barron as Barron

@@ -1,4 +1,14 @@
-"""The terms of a problem: what observations say about poses, landmarks and cameras, and how to write your own."""
+"""The terms of a problem: what observations say about poses, landmarks and cameras, and how to write your own.
+
+Base classes for your own residual, by what one observation touches: `ImageTerm` (the pixel of a landmark in
+another image), `EdgeTerm` (a landmark and two poses), `SlotTerm` (the inverse depth of a landmark),
+`PoseTerm` (a pose and its camera), `PairTerm` (two poses, `first` and `second`), `CameraTerm` (the parameters of the
+camera), `DenseTerm` (all poses and the camera). `FlatTerm` holds rows before packing; `View` is the argument of an
+`EdgeTerm`.
+
+Ready terms: `PointTerm`, `LineTerm`, `DepthPrior`, `HostPixel`, `BaselinePrior` (distance of two cameras),
+`RelativePose`, `RotationPrior`, `IntrinsicsPrior`, `MarginalPrior`.
+"""
 
 from vggtgeo.bundle.observations import FlatTerm as FlatTerm
 from vggtgeo.bundle.terms.baseline import BaselinePrior as BaselinePrior

@@ -78,6 +78,7 @@ def test_all_blocks_are_those_of_the_dense_inverse(estimated: Estimate) -> None:
     assert np.all(np.asarray(found.poses[0]) == 0)
     assert np.all(np.asarray(found.intrinsics[3]) == 0)
     assert float(found.variance_factor) < 1e-20
+    assert not bool(found.scale_is_free)
 
 
 def test_a_free_scale_is_held(estimated: Estimate) -> None:
@@ -85,7 +86,10 @@ def test_a_free_scale_is_held(estimated: Estimate) -> None:
     # the space orthogonal to the scale direction.
     problem, truth = packed(lacking.without(WELL, "depth"), at_truth=True, **OPTIONS)
     scale = np.asarray(scale_direction(problem, truth))[:, 0]
-    check(estimated(problem, truth), dense_covariance(problem, truth, held=scale), 1e-6)
+    found = estimated(problem, truth)
+    check(found, dense_covariance(problem, truth, held=scale), 1e-6)
+    assert bool(found.scale_is_free)
+    assert bool(found.scaled().scale_is_free)
 
 
 def test_what_nothing_determines(estimated: Estimate) -> None:

@@ -137,7 +137,7 @@ def _no_camera(folder: Path) -> None:
         (_other_clock, "no frame lies within the times of the truth"),
         (_jump, "m/s at 10."),
         (_cut_off, "10.100000.png"),
-        (_no_camera, "no intrinsics found"),
+        (_no_camera, "--intrinsics"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

@@ -34,7 +34,7 @@ def test_a_run_that_never_begins_says_so(tmp_path: Path, kind: str) -> None:
     summary = json.loads((out / "summary.json").read_text())
     assert next(iter(summary)) == "verdict"
     assert summary["verdict"]["level"] == "failed"
-    assert "the map was never started" in summary["verdict"]["reasons"][0]
+    assert "start" in summary["verdict"]["segments"][0]["checks"]
     assert "Failed:" in (out / "report.html").read_text()
     # A frame without a pose is left out: the first alone is where the world begins.
     assert len((out / "trajectory.txt").read_text().splitlines()) == 2

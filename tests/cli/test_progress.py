@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+import re
+from typing import Any
 
 import pytest
 from recorded_run import recorded_run
 from rich.console import Console
 
 from vggtgeo.cli import progress
-from vggtgeo.cli.progress import ProgressBar
+from vggtgeo.cli.progress import ProgressBar, duration, verdict_line
+from vggtgeo.slam.verdict.finding import Level, Segment, Verdict
 
 
 class Clock:
@@ -61,3 +64,64 @@ def test_a_pipe_gets_whole_lines_at_once(terminal: bool, monkeypatch: pytest.Mon
     assert lines[0] == "compiling"
     assert any(line.startswith(f"{count} of {count} frames: ") for line in lines), lines
     assert file.getvalue().splitlines() == lines
+
+
+def test_bars_and_clocks_stay_in_80_columns() -> None:
+    """Names longer than the line, a count of a stage and the state of tracking leave each row its count and its clock.
+    Oracle: the rendered lines, by hand.
+    """
+    run, file = recorded_run(), io.StringIO()
+    bar = ProgressBar(Console(file=file, force_terminal=True, color_system=None, width=80))
+    with bar:
+        bar.on_stage("calibration " * 10)
+        bar.on_stage_frame(37, 150)
+        bar.on_begin("clip" * 30, 12345)
+        bar.on_frame(run.states[0], run.frames[0])
+        page = Console(width=80, color_system=None, record=True, file=io.StringIO())
+        page.print(*bar._progress.get_renderables(), sep="\n")
+        lines = page.export_text().rstrip().splitlines()
+    assert len(lines) == 3
+    assert all(len(line) <= 80 for line in lines)
+    for line, count in zip(lines, ("37/150", "1/12345"), strict=False):
+        assert re.search(rf" {count} +\d:\d\d:\d\d$", line.rstrip()), lines
+
+
+def test_a_stage_that_counts_no_frames_has_no_count() -> None:
+    """A clock alone, while it goes on and when it is over; oracle: no stroke of a count in its row."""
+    bar = ProgressBar(Console(file=io.StringIO(), force_terminal=True, width=80))
+    with bar:
+        for name in ("compiling", "writing"):
+            bar.on_stage(name)
+        page = Console(width=80, color_system=None, record=True, file=io.StringIO())
+        page.print(*bar._progress.get_renderables())
+        assert "/" not in page.export_text()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (59.6, "1 min 0 s"), (378.2, "6 min 18 s"), (3900, "1 h 5 min")]
+)
+def test_a_duration_has_two_units(seconds: float, text: str) -> None:
+    """Oracle: by hand."""
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("level", "parts", "named"),
+    [
+        ("good", [("good", 0, 9)], []),
+        ("failed", [("failed", 0, 9)], []),
+        ("degraded", [("good", 0, 91), ("degraded", 92, 137), ("good", 138, 139)], ["0 to 91", "138 to 139"]),
+        (
+            "degraded",
+            [("good", 0, 9), ("degraded", 10, 10), ("good", 11, 11), ("degraded", 12, 12), ("good", 13, 15)]
+            + [("degraded", 16, 16), ("good", 17, 30)],
+            ["0 to 9", "13 to 15", "17 to 30"],
+        ),
+    ],
+)
+def test_the_last_line_names_the_frames_to_use(level: Level, parts: Any, named: list[str]) -> None:
+    """The level, and unless it is good the three longest stretches that are, in order. Oracle: by hand."""
+    segments = tuple(Segment(start, end, 0.1 * start, 0.1 * end, own, ()) for own, start, end in parts)
+    line = verdict_line(Verdict(level, segments=segments))
+    assert line.startswith(f"verdict: {level}")
+    assert re.findall(r"\d+ to \d+", line) == named

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,6 +19,7 @@ import vggtgeo as vg
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.results.summary import RESERVED_KEYS
+from vggtgeo.results.unfinished import EXPORTS
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.settings.table import changed
 
@@ -101,12 +103,18 @@ def test_the_notebook_and_the_command_line_write_the_same_folder(folder: Path, t
     ):
         del first[changing], second[changing]
     assert first == second
-    again = tmp_path / "again"
+    again, exported = tmp_path / "again", tmp_path / "again" / EXPORTS / "mine.txt"
+    shutil.copytree(program, again)
+    exported.parent.mkdir()
+    exported.write_text("kept")
     done = CliRunner().invoke(
         make_app(), ["run", "--settings", str(program / "settings.toml"), "-o", str(again), "--no-quiet"]
     )
     assert done.exit_code == 0, done.output
-    assert done.stdout.strip().splitlines()[-1] == f"verdict: {result.verdict.level}"
+    assert done.stdout.strip().splitlines()[-1].startswith(f"verdict: {result.verdict.level}")
+    # An earlier result is replaced, exports of it stay, and both are said.
+    assert exported.read_text() == "kept"
+    assert all(f"`{place}`" in done.stdout for place in (again, exported.parent))
     assert (again / "trajectory.txt").read_bytes() == (program / "trajectory.txt").read_bytes()
     written = [tomllib.loads((place / "settings.toml").read_text()) for place in (program, again)]
     assert written[1] == {**written[0], "output": str(again), "quiet": False}

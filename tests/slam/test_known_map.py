@@ -171,7 +171,7 @@ def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     slam = run(0, 6, seed=3, settings=FIXED, known_map=known)
     assert not any(record.tracked for record in slam.frames)
     assert len(slam.tracker.waiting) == 6
-    assert "0 of 6 frames were found in the known map" in judge(slam).reasons[0]
+    assert judge(slam).reasons[0].startswith("0 of 6 ")
     assert not Claim.of(first_half()).began_in_known_map
 
 

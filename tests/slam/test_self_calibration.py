@@ -169,7 +169,7 @@ class _Passes:
         self.counts: list[int] = []
         self._camera = camera
 
-    def __call__(self, frames: Callable[[], Iterable[Frame]], camera: Camera, roles: Any, settings: Any) -> Slam | None:
+    def __call__(self, frames: Callable[[], Iterable[Frame]], camera: Camera, roles: Any, *_: Any) -> Slam | None:
         self.counts.append(len(list(frames())))
         if self._camera is None:
             return None

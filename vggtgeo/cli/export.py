@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from vggtgeo.cli.options import JsonOption, QuietOption
-from vggtgeo.results.unfinished import check_is_run
+from vggtgeo.results.unfinished import EXPORTS, check_is_run
 
 
 def export(
@@ -27,7 +27,7 @@ def export(
     check_is_run(folder)
     from vggtgeo.export import export as write
 
-    target = output or folder / "export" / to
+    target = output or folder / EXPORTS / to
     written = write(folder, to, target)
     if as_json:
         typer.echo(json.dumps({"folder": str(target), "format": to, **written}))

@@ -22,7 +22,7 @@ from vggtgeo.cli.environment import (
     show_unknown_characters,
 )
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
-from vggtgeo.io.errors import InputError, one_line
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one_line
 from vggtgeo.io.interruption import end_on_signals, ignore_signals
 
 EXIT_INPUT = 2
@@ -317,7 +317,8 @@ def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
         line: str | None = None,
     ) -> None:
         if issubclass(category, UserWarning):
-            print(f"warning: {one_line(str(message))}", file=file or sys.stderr)
+            kind = "note" if issubclass(category, NoteWarning | GuessedCameraWarning) else "warning"
+            print(f"{kind}: {one_line(str(message))}", file=file or sys.stderr)
         else:
             show_others(message, category, filename, lineno, file, line)
 

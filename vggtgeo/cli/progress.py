@@ -3,25 +3,57 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+import numpy as np
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Column
+from rich.text import Text
 
 from vggtgeo.datasets import Frame
 from vggtgeo.evaluation.report import ABSURD_SCALE
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import one_line
 from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.finding import Verdict
 
 MIN_PAUSE, MAX_PAUSE = 5.0, 60.0
 """Seconds between two log lines: few lines for short runs, a sign of life for long ones."""
 PARTS = 10
 """Of a run: a log line for each, at least `MIN_PAUSE` apart."""
+NAME_WIDTH, BAR_WIDTH = 40, 16
+"""Characters: beside both, a count of five digits and a clock fit into 80 columns."""
+MAX_NAMED = 3
+"""Stretches of frames that the line of the verdict names."""
+
+
+class _Count(ProgressColumn):
+    """Frames done of how many; empty for a stage that does not count frames."""
+
+    def render(self, task: Task) -> Text:
+        if not task.fields["counts"]:
+            return Text("")
+        return Text(f"{int(task.completed)}/{'?' if task.total is None else int(task.total)}")
+
+
+class _Bars(Progress):
+    """Bars of equal layout; the state of tracking has a line of its own, so that it does not displace bars and clocks.
+
+    state: text of that line.
+    """
+
+    state = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        yield self.make_tasks_table(self.tasks)
+        if self.state:
+            yield Text(self.state, no_wrap=True, overflow="ellipsis")
 
 
 class ProgressBar(Callback):
@@ -31,10 +63,10 @@ class ProgressBar(Callback):
     """
 
     def __init__(self, console: Console) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        name = Column(no_wrap=True, overflow="ellipsis", max_width=NAME_WIDTH)
+        columns = (TextColumn("{task.description}", table_column=name, markup=False), BarColumn(bar_width=BAR_WIDTH))
         self._lines = not console.is_terminal
-        state = TextColumn("{task.fields[state]}")
-        self._progress = Progress(*columns, state, console=console, disable=self._lines)
+        self._progress = _Bars(*columns, _Count(), TimeElapsedColumn(), console=console, disable=self._lines)
         self._notes = self._resumed = 0
         self._began = self._last_line = 0.0
         self._total: int | None = None
@@ -49,7 +81,7 @@ class ProgressBar(Callback):
         self._progress.stop()
 
     def on_begin(self, name: str, total: int | None) -> None:
-        self._task = self._progress.add_task(name, total=total, state="")
+        self._task = self._progress.add_task(name, total=total, counts=True)
         self._began = self._last_line = time.perf_counter()
         self._total = total
         self._progress.start()
@@ -57,12 +89,11 @@ class ProgressBar(Callback):
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         rate = (len(slam.frames) - self._resumed) / (time.perf_counter() - self._began)
         state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {_state(slam)}"
-        self._progress.update(self._task, advance=1, state=state)
+        self._progress.state = state
+        self._progress.update(self._task, advance=1)
         if self._lines and self._is_due(len(slam.frames)):
             self._print(f"{len(slam.frames)}{f' of {self._total}' if self._total else ''} frames: {state}")
-        for note in slam.notes[self._notes :]:
-            self._print(f"warning: {note}")
-        self._notes = len(slam.notes)
+        self._print_new_notes(slam)
 
     def on_resume(self, so_far: None, slam: Slam) -> None:
         self._progress.update(self._task, completed=len(slam.frames))
@@ -72,10 +103,18 @@ class ProgressBar(Callback):
     def on_stage(self, name: str) -> None:
         """Show a stage in its own line, with a clock."""
         self._end_stage()
-        self._stage = self._progress.add_task(name, total=None, state="")
+        self._progress.state = ""
+        self._stage = self._progress.add_task(name, total=None, counts=False)
         self._progress.start()
         if self._lines:
             self._print(name)
+
+    def on_stage_frame(self, done: int, total: int) -> None:
+        if self._stage is not None:
+            self._progress.update(self._stage, completed=done, total=total, counts=True)
+
+    def on_finish(self, slam: Slam, cloud: PointCloud) -> None:
+        self._print_new_notes(slam)
 
     def _is_due(self, done: int) -> bool:
         """Return whether it is time for a log line."""
@@ -88,8 +127,15 @@ class ProgressBar(Callback):
 
     def _end_stage(self) -> None:
         if self._stage is not None:
-            self._progress.update(self._stage, total=1, completed=1)
+            task = next(task for task in self._progress.tasks if task.id == self._stage)
+            total = 1 if task.total is None else task.total
+            self._progress.update(self._stage, total=total, completed=total)
             self._stage = None
+
+    def _print_new_notes(self, slam: Slam) -> None:
+        for note in slam.notes[self._notes :]:
+            self._print(f"note: {note}")
+        self._notes = len(slam.notes)
 
     def on_message(self, message: str) -> None:
         self._print(message)
@@ -102,6 +148,29 @@ def _state(slam: Slam) -> str:
     if slam.tracker.lost:
         return "lost"
     return "waiting for parallax" if slam.tracker.waiting else "tracking"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in words: "48 s", "6 min 18 s", "1 h 5 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes = whole // 60
+    return f"{minutes} min {whole % 60} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def verdict_line(verdict: Verdict) -> str:
+    """Return the level of the verdict; if it is not good, also the frames that are."""
+    good = [part for part in verdict.segments if part.level == "good"]
+    if verdict.level == "good" or not good:
+        return f"verdict: {verdict.level}"
+    longest = sorted(good, key=lambda part: part.start - part.end)[:MAX_NAMED]
+    named = [f"{part.start} to {part.end}" for part in sorted(longest, key=lambda part: part.start)]
+    return f"verdict: {verdict.level} (good: frames {_listed(named)}{', among others' * (len(good) > MAX_NAMED)})"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def errors_line(truth: Mapping[str, Any], free: bool) -> str:
@@ -117,13 +186,29 @@ def errors_line(truth: Mapping[str, Any], free: bool) -> str:
     return f"{line} with scale {scale:.3g}: are depth and ground truth in the same unit?" if other else line
 
 
+def uncertainty_line(stated: Mapping[str, Any] | None, result: Result) -> str:
+    """Return the line with the standard deviations of the poses; without a scale as shares of the path's extent."""
+    if stated is None:
+        return "standard deviation of poses: unknown, since there was no last adjustment or it did not determine them"
+    metric = "translation_m" in stated
+    translation, rotation = stated["translation_m" if metric else "translation_unit"], stated["rotation_deg"]
+    extent = float(np.linalg.norm(np.ptp(result.trajectory.positions, axis=0)))
+    lengths = {name: 100 * value / (1.0 if metric else max(extent, 1e-12)) for name, value in translation.items()}
+    unit = "cm" if metric else "% of the extent of the path"
+    return (
+        f"standard deviation of poses relative to the first: median {lengths['median']:.1f} {unit} and "
+        f"{rotation['median']:.2f} deg, maximum {lengths['largest']:.1f} {unit} and {rotation['largest']:.2f} deg "
+        "(uncertainty.txt)"
+    )
+
+
 def print_result(console: Console, result: Result, summary: Mapping[str, Any], folder: Path) -> None:
     """Print the report of a run; its last line is the verdict. summary: as written to `summary.json`."""
     verdict, (fx, fy, cx, cy) = result.verdict, result.intrinsics_as_read
-    rate, whole = summary["frames_per_second"], summary["frames_per_second_whole_run"]
+    rate, whole = summary["frames_per_second"], duration(summary["seconds_by_stage"]["all"])
     lines = [
-        f"{summary['frames']} frames ({summary['frames_tracked']} tracked), {summary['keyframes']} keyframes, "
-        f"{rate:.1f} frames/s, {whole:.1f} including compilation and writing",
+        f"{summary['frames']} frames in {whole} (tracking {rate:.1f} frames/s): {summary['frames_tracked']} tracked, "
+        f"{summary['keyframes']} keyframes",
         f"intrinsics fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}",
     ]
     if "images_reduced" in summary:
@@ -137,19 +222,14 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
         lines.append("scale: doubtful, lengths may not be metres")
     else:
         lines.append(f"scale: metric, by {summary['scale_basis']}")
-    stated = summary.get("pose_sigma", {})
-    if "translation_m" in stated:
-        translation, rotation = stated["translation_m"], stated["rotation_deg"]
-        lines.append(
-            f"standard deviation of poses relative to the first: median {100 * translation['median']:.1f} cm and "
-            f"{rotation['median']:.2f} deg, maximum {100 * translation['largest']:.1f} cm and "
-            f"{rotation['largest']:.2f} deg (uncertainty.txt)"
-        )
+    lines.append(uncertainty_line(summary.get("pose_sigma"), result))
     if "truth" in summary:
         lines.append(errors_line(summary["truth"], free=summary["scale"].startswith("free")))
-    points = f"({len(result.cloud)} points)"
-    lines.append(f"outputs in {folder}: trajectory.txt keyframes.txt map.ply {points} report.html")
+    mesh = " mesh.ply" if (folder / "mesh.ply").is_file() else ""
+    lines.append(
+        f"outputs in {folder}: report.html trajectory.txt map.ply ({len(result.cloud)} points){mesh} summary.json"
+    )
     lines += [f"- {reason}" for reason in verdict.reasons]
-    lines.append(f"verdict: {verdict.level}")
+    lines.append(verdict_line(verdict))
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -18,7 +18,7 @@ from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.datasets.views import reduced
 from vggtgeo.io.checkpoint_pace import EVERY
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, one_line
 from vggtgeo.io.files import whole_path
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.network_files import as_input_errors
@@ -28,6 +28,7 @@ from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
+from vggtgeo.results.unfinished import EXPORTS, SUMMARY
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -91,6 +92,9 @@ def run_and_write(
     start, end, stride = arguments.selection
     # From the first frame to the last file, a signal ends the run early; the results so far are written completely.
     with interruption() as stop, open_run_folder(output.folder, output.source, RESERVE, output.resume) as folder:
+        replaces = (output.folder / SUMMARY).is_file()
+        if replaces:
+            _print_note(console, f"the result in `{output.folder}` is replaced at the end of this run")
         checkpoints = Checkpoints(folder.checkpoint, bool(output.resume), output.checkpoint_every)
         if output.resume and not folder.checkpoint.is_file():
             typer.echo(f"nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)
@@ -121,6 +125,9 @@ def run_and_write(
             unsaved = _save_map(result, output.save_map)  # last: an error must not prevent the other results
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: all results are complete and written", err=True)
+    if replaces and (output.folder / EXPORTS).is_dir():
+        # Exports are not written by a run, and may hold a user's files: they stay.
+        _print_note(console, f"`{output.folder / EXPORTS}` is of an earlier result; `vggtgeo export` renews it")
     print_result(console, result, summary, output.folder)
     if output.as_json:
         typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
@@ -134,6 +141,10 @@ def run_and_write(
         raise typer.Exit(EXIT_INTERRUPTED)
     if result.verdict.level == "failed":
         raise typer.Exit(EXIT_FAILED)
+
+
+def _print_note(console: Console, text: str) -> None:
+    console.print(f"note: {one_line(text)}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _save_map(result: Result, file: Path | None) -> str:

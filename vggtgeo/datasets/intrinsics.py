@@ -199,8 +199,9 @@ def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float =
     camera = Camera.guess(width, height, pixel_aspect)
     focal = " and ".join(dict.fromkeys(f"{value:.0f}" for value in camera.intrinsics[:2]))
     warnings.warn(
-        f"`{name}`: no intrinsics found; starting from a guess, f = {focal} pixels: put "
-        f"`fx fy cx cy` into a file `{CALIBRATION}` beside the images, or give --intrinsics fx,fy,cx,cy",
+        f"`{name}`: no camera file found, so the camera is estimated (normal for a phone video), beginning with a "
+        f"focal length of {focal} pixels. To give it: --intrinsics fx,fy,cx,cy (in Python: `camera`), or a file "
+        f"`{CALIBRATION}` with `fx fy cx cy` beside the images",
         GuessedCameraWarning,
         stacklevel=3,
     )

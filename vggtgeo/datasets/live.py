@@ -13,7 +13,7 @@ import cv2
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
 
 _WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
 """Digits of a webcam's number."""
@@ -57,9 +57,9 @@ class LiveCamera:
             )
         camera = Camera.guess(width, height)
         warnings.warn(
-            f"`{_public(source)}`: no intrinsics found; starting from a guess, f = {camera.intrinsics[0]:.0f} pixels: "
-            "give --intrinsics fx,fy,cx,cy",
-            InputWarning,
+            f"`{_public(source)}`: the camera is unknown and is estimated, beginning with a focal length of "
+            f"{camera.intrinsics[0]:.0f} pixels. To give it: --intrinsics fx,fy,cx,cy",
+            GuessedCameraWarning,
             stacklevel=3,
         )
         return cls(source, camera)

@@ -30,7 +30,7 @@ from vggtgeo.io.locks import LockedError, locked, not_written
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.summary import load_poses, read_summary
-from vggtgeo.results.unfinished import check_is_run
+from vggtgeo.results.unfinished import EXPORTS, check_is_run
 
 MILLI = 1000.0
 
@@ -135,7 +135,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     if to not in tuple(FORMATS):  # `to` may be unhashable
         raise InputError(f"`to` must be one of {', '.join(FORMATS)}, got {to!r}")
     check_is_run(place)
-    output = path_of("target", target) if target is not None else place / "export" / to
+    output = path_of("target", target) if target is not None else place / EXPORTS / to
     _check_target(output, place)
     verdict = read_summary(place)[1]
     failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""
@@ -144,7 +144,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
             written = FORMATS[to](place, stage)
             names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
             with _locked(output):
-                _record(output, names, ours=whole_path(output) == whole_path(place / "export" / to))
+                _record(output, names, ours=whole_path(output) == whole_path(place / EXPORTS / to))
                 for name in names:
                     (output / name).parent.mkdir(parents=True, exist_ok=True)
                     (stage / name).replace(output / name)

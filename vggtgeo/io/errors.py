@@ -38,7 +38,7 @@ class NoteWarning(InputWarning):
 
 
 class GuessedCameraWarning(InputWarning):
-    """The camera is unknown; the run starts from a guess."""
+    """The camera is unknown and will be estimated: normal for a video, a defect of a recording with a known camera."""
 
 
 class UnusableDepthWarning(InputWarning):

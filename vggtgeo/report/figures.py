@@ -31,6 +31,17 @@ COLOURS = {
 """Colours of the figures, and the variables of the style sheet that replace them."""
 _TERMS = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8e5fb0", "#b0413e")
 """Colours of the terms of a window, repeated if there are more."""
+_LABELS = {
+    "points": "points",
+    "lines": "lines",
+    "depth": "measured depth",
+    "relative_poses": "motion between keyframes",
+    "baselines": "distance between keyframes",
+    "rotations": "rotation between keyframes",
+    "surfaces": "alignment of depth images",
+}
+"""Names of terms for a reader of the report; other terms keep theirs."""
+_UNITS = {"px": "pixels", "sigma": "standard deviations"}
 _WIDTH = 4.6
 """Inches: legible at its own size on a desktop and on a phone."""
 
@@ -54,9 +65,9 @@ def residuals_svg(records: Sequence[WindowRecord]) -> str:
     for number, (name, unit) in enumerate(units.items()):
         values = np.array([record.rms.get(name, np.nan) for record in records])
         colour = _TERMS[number % len(_TERMS)]
-        rows[unit].plot(time, values, color=colour, lw=1.4, marker=".", ms=3, label=name)
+        rows[unit].plot(time, values, color=colour, lw=1.4, marker=".", ms=3, label=_LABELS.get(name, name))
     for unit, axes in rows.items():
-        axes.set_ylabel("pixels" if unit == "px" else unit)
+        axes.set_ylabel(_UNITS.get(unit, unit))
         axes.set_ylim(bottom=0)
         calm(axes)
         if axes.get_legend_handles_labels()[0]:

@@ -32,7 +32,7 @@ SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""
 VERDICT_LINES = {
     "good": "Good: no check contradicts this result.",
-    "degraded": "Degraded: a check contradicts this result, or parts of it are missing.",
+    "degraded": "Degraded: parts of this result are wrong or missing, as listed here; use the rest.",
     "failed": "Failed: do not use this result.",
 }
 _SAMPLE_WIDTH = 300
@@ -108,6 +108,8 @@ def write_page(
         simulated=bool(summary.get("simulated")),
         interrupted=bool(summary.get("interrupted")),
         scale_is_free=not slam.metric,
+        unit=" m" if slam.metric else "",
+        no_uncertainty="pose_sigma" not in summary,
         verdict=verdict,
         verdict_line=VERDICT_LINES[verdict.level],
         timeline=_timeline(verdict),

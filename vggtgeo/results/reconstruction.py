@@ -43,7 +43,7 @@ from vggtgeo.slam.perception.static_overlay import (
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
-from vggtgeo.slam.self_calibration import self_calibrate
+from vggtgeo.slam.self_calibration import MAX_PASSES, self_calibrate
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
@@ -288,15 +288,29 @@ def _calibrate(
     if source.camera.known or not count or not settings.refinement.global_adjustment:
         return None
     end = start + count * stride
-    hooks.each("on_stage", f"calibrating the camera on the first {count} frames")
     refused = {role: replace(counts) for role, counts in perception.refusals.items()}
     with hooks.clock.measure("self-calibration"), stop.at_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         frames = lambda: source.frames.frames(start, end, stride)
-        found = self_calibrate(frames, source.camera, perception.roles, settings)
+        found = self_calibrate(
+            frames,
+            source.camera,
+            perception.roles,
+            settings,
+            lambda passes, done: _calibrating(hooks, passes, done, count),
+        )
     for role, counts in refused.items():
         vars(perception.refusals[role]).update(vars(counts))
     return found
+
+
+def _calibrating(hooks: RunCallbacks, passes: int, done: int | None, count: int) -> None:
+    """Report the progress of self-calibration, see `self_calibrate`."""
+    name = f"camera calibration, pass {passes}"
+    if not done:
+        hooks.each("on_stage", f"{name}: adjusting" if done is None else f"{name} of at most {MAX_PASSES}")
+    if done is not None:
+        hooks.each("on_stage_frame", done, count)
 
 
 def _without_overlay(

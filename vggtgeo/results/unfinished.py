@@ -9,6 +9,8 @@ from vggtgeo.io.errors import InputError
 UNFINISHED = "unfinished"
 """Subfolder for the files of a run that is still going on."""
 SUMMARY = "summary.json"
+EXPORTS = "export"
+"""Default folder of `vggtgeo export` in the folder of a run, which no run writes or removes."""
 CHECKPOINT = "checkpoint.npz"
 """In `unfinished/`: the state from which a killed run can be resumed."""
 

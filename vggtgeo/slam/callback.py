@@ -44,7 +44,10 @@ class Callback:
         """Called with the state after the last frame, before the global adjustment."""
 
     def on_stage(self, name: str) -> None:
-        """Called when a stage after the last frame starts, which may take some seconds."""
+        """Called when a stage before the first or after the last frame starts, which may take some seconds."""
+
+    def on_stage_frame(self, done: int, total: int) -> None:
+        """Called in a stage that counts frames (self-calibration), after each: `done` of `total`."""
 
     def on_message(self, message: str) -> None:
         """Called with an urgent message for the user."""

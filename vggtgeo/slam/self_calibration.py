@@ -7,7 +7,6 @@ tracked and adjusted first, and the run begins with the camera that was found (`
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -36,22 +35,32 @@ MIN_TRACKED = 0.5
 
 
 def self_calibrate(
-    frames: Callable[[], Iterable[Frame]], camera: Camera, roles: Roles, settings: SlamSettings
+    frames: Callable[[], Iterable[Frame]],
+    camera: Camera,
+    roles: Roles,
+    settings: SlamSettings,
+    progress: Callable[[int, int | None], None] = lambda passes, done: None,
 ) -> Slam | None:
     """Return the state before the first frame with a self-calibrated camera; None if the frames do not determine it.
 
     The frames are tracked again while the camera changes much from one pass to the next.
 
     frames: returns the calibration frames, from the first on, each time it is called. camera: the initial guess.
+    progress: called with the number of the pass, and of its frames that are tracked; None: they are adjusted now.
     """
     before = None
     for passes in range(1, MAX_PASSES + 1):
-        last = deque(run_frames(frames(), camera, roles, settings, Clock(), before), maxlen=1)
-        if not last or not _determines_camera(last[0]):
+        progress(passes, 0)
+        last = None
+        for done, slam in enumerate(run_frames(frames(), camera, roles, settings, Clock(), before), 1):
+            progress(passes, done)
+            last = slam
+        if last is None or not _determines_camera(last):
             return None
+        progress(passes, None)
         # Later rounds do not change the camera.
         once = replace(settings, refinement=replace(settings.refinement, global_rounds=1))
-        found = finish(last[0], roles, once)
+        found = finish(last, roles, once)
         if not _is_plausible(found, camera):
             return None
         before = begin(camera, roles)
@@ -66,8 +75,8 @@ def self_calibrate(
             ),
             notes=(_note(found, passes, camera),),
         )
-        moved = np.abs(found.intrinsics[:2] / last[0].intrinsics[:2] - 1).max()
-        if moved < SETTLED and (found.camera.lens is None) == (last[0].camera.lens is None):
+        moved = np.abs(found.intrinsics[:2] / last.intrinsics[:2] - 1).max()
+        if moved < SETTLED and (found.camera.lens is None) == (last.camera.lens is None):
             break
     return before
 

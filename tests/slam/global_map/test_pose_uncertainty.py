@@ -6,8 +6,10 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
+from degenerate_scenes import packed, without_matches_of
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
@@ -34,6 +36,22 @@ def test_keyframes_have_the_deviations_of_their_covariances() -> None:
     for column, part in enumerate((slice(0, 3), slice(3, 6))):
         worst = np.linalg.eigvalsh(np.asarray(known.poses)[:3, part, part])[:, -1]
         np.testing.assert_allclose(sigma[:, column], np.sqrt(factor * np.maximum(worst, 0.0)), rtol=1e-9, atol=1e-15)
+
+
+def test_an_undetermined_keyframe_leaves_the_others_known() -> None:
+    """NaN for the keyframe without matches alone; None if no free keyframe is determined. Oracle: the same problem with
+    that keyframe fixed.
+    """
+    problem, state = packed(without_matches_of(2), at_truth=True, fixed_intrinsics=True)
+    found = keyframe_sigma(problem, state, 3)
+    held = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[2].set(True))
+    expected = keyframe_sigma(held, state, 3)
+    assert found is not None
+    assert expected is not None
+    assert np.isnan(found[2]).all()
+    np.testing.assert_allclose(found[:2], expected[:2], rtol=1e-9, atol=1e-15)
+    alone = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[1].set(True))
+    assert keyframe_sigma(alone, state, 3) is None
 
 
 def test_a_sparse_factor_gives_the_same_deviations() -> None:

@@ -117,7 +117,7 @@ def test_what_has_no_consequence_is_a_number() -> None:
     here = walk(20, noise=0.1, seen=seen)
     (one,) = findings(here.claim, [here.explanation()])
     assert (one.check, one.level) == ("distortion", "good")
-    assert "by -0.01 +- " in one.text
+    assert "-0.01 +- " in one.text
     verdict = conclude([one], range(20), here.claim.times.tolist(), True)
     assert (verdict.level, verdict.reasons, verdict.noted) == ("good", (), (one.text,))
     assert [(part.start, part.end, part.checks) for part in verdict.segments] == [(0, 19, ())]

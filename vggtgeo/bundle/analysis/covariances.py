@@ -35,6 +35,7 @@ from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.finite import is_finite, unless
+from vggtgeo.solvers.flat_directions import flat_stiffness
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600
@@ -47,7 +48,8 @@ class Covariances(Readable):
     """Marginal covariances at a solution, by the given weights; they are not scaled by the variance factor.
 
     Undetermined coordinates have infinite variance (and zero covariance with the rest), fixed coordinates have zero.
-    Without metric depth the scale is free: the covariances are then conditional on the current scale. All are NaN where
+    Without metric depth the scale is free (`scale_is_free`): the covariances are then conditional on the current scale,
+    so lengths are relative to each other, and the printed line says so. All are NaN where
     the linearisation is not finite; outside `jit` this is an error.
 
     The covariances are only as good as the weights. A variance factor far above 1 means that residuals are larger than
@@ -77,6 +79,8 @@ class Covariances(Readable):
     the weights are right; 4 to 7 % low under Huber with delta 1.5, which caps large residuals."""
     parameters: tuple[str, ...] = eqx.field(static=True, default=Pinhole.names)
     """Names of the rows of `intrinsics`."""
+    scale_is_free: Bool[Array, ""] | bool = False
+    """Whether no observation determines the scale: it stays near that of the initial state."""
 
     def scaled(self) -> Covariances:
         """Return the covariances times the variance factor, for weights that are known up to a common factor."""
@@ -88,6 +92,7 @@ class Covariances(Readable):
             times(self.neighbours),
             jnp.ones_like(self.variance_factor),
             self.parameters,
+            self.scale_is_free,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -104,6 +109,7 @@ class Covariances(Readable):
             "intrinsics_sigma_px": dict(zip(self.parameters, plain(intrinsics), strict=True)),
             "inverse_depths_determined": int(np.isfinite(np.asarray(self.inverse_depth)).sum()),
             "variance_factor": float(self.variance_factor),
+            "scale_is_free": bool(self.scale_is_free),
         }
 
     def _line(self) -> str:
@@ -116,7 +122,8 @@ class Covariances(Readable):
         else:
             centres = f"centres of {(~known).sum()} undetermined"
             centres += f", of {len(moving)} known to {worst:.1f} mm at worst" if len(moving) else ""
-        return f"Covariances({len(blocks)} keyframes, {centres}, variance factor {factor:.2f})"
+        relative = ", lengths are relative: no observation determines the scale" if self.scale_is_free else ""
+        return f"Covariances({len(blocks)} keyframes, {centres}, variance factor {factor:.2f}{relative})"
 
 
 def covariances(
@@ -213,6 +220,7 @@ def _covariances_jit(
         neighbours=found.neighbours,
         variance_factor=variance_factor(ready, state, found.rank),
         parameters=problem.parameter_names,
+        scale_is_free=jnp.any(flat_stiffness(system) > 0),
     )
     return unless(is_finite(system), known)
 

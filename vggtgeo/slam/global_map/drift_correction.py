@@ -67,7 +67,7 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     sure = consistent_loops(graph.loops, tracked, LOOP_GATE, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
-        return _noted(_without(slam, closing), len(loops) - len(agreeing)), agreeing
+        return _noted(_without(slam, closing), len(loops) - len(agreeing), len(loops)), agreeing
     units = _units(slam, motions, tuple(compress(loops, sure[len(closing) :])))
     found = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), units))
     true = np.zeros(len(measured), bool)
@@ -77,7 +77,7 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     # A loop that took no part (refused, or alone) is used where the corrected map agrees with it.
     own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
     believed = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
-    return _noted(moved, len(loops) - len(believed), slam), believed
+    return _noted(moved, len(loops) - len(believed), len(loops), slam), believed
 
 
 def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelativePose]]:
@@ -169,17 +169,25 @@ def at_poses(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
     )
 
 
-def _noted(slam: Slam, refused: int, before: Slam | None = None) -> Slam:
-    """Return the state with notes for the user."""
+def _noted(slam: Slam, refused: int, proposed: int, before: Slam | None = None) -> Slam:
+    """Return the state with notes for the user: the corrected drift since `before`, and the refused loops."""
     notes = []
     if before is not None:
-        moved = max(
-            float(np.linalg.norm(rigid.centre(new.pose) - rigid.centre(old.pose)))
-            for new, old in zip(slam.keyframes, before.keyframes, strict=True)
-        )
-        unit = "m" if slam.metric else "of its unit"
-        notes.append(f"loop closures corrected the drift of the map: a keyframe moved by up to {moved:.2f} {unit}")
+        notes.append(f"loop closures corrected the drift of the map, by up to {_largest_move(slam, before)}")
     if refused:
-        places = "1 place that looks" if refused == 1 else f"{refused} places that look"
-        notes.append(f"{places} the same as others contradict the rest of the map, and are left out")
+        were = "loop closure was" if proposed == 1 else "loop closures were"
+        notes.append(
+            f"{refused} of {proposed} proposed {were} refused, since they contradict the rest of the map (other places "
+            "may look the same); the map does not use them"
+        )
     return replace(slam, notes=(*slam.notes, *notes))
+
+
+def _largest_move(slam: Slam, before: Slam) -> str:
+    """Return by how much a keyframe moved at most: metres, or a share of the path's extent if the scale is free."""
+    centres, old = (rigid.centres(np.array([one.pose for one in each.keyframes])) for each in (slam, before))
+    moved = float(np.linalg.norm(centres - old, axis=1).max())
+    if slam.metric:
+        return f"{moved:.2f} m"
+    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    return f"{100 * moved / max(extent, 1e-12):.0f} % of the extent of the path"

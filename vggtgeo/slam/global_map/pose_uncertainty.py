@@ -62,7 +62,7 @@ class PoseUncertainty(NamedTuple):
     """Standard deviations of the poses of a submap in their worst direction, relative to its first keyframe.
 
     timestamps: s. translation: of the camera centre, in the unit of the map (metres if metric). rotation: rad. NaN if
-    tracking did not measure a frame.
+    tracking did not measure a frame, or nothing determines its keyframe.
     """
 
     timestamps: Float[np.ndarray, " n"]
@@ -140,8 +140,9 @@ def _speeds(times: np.ndarray, poses: np.ndarray, places: np.ndarray) -> tuple[n
 def keyframe_sigma(problem: Problem, state: State, keyframes: int) -> np.ndarray | None:
     """Return the standard deviations of translation and rotation (rad) of the first poses, float64 [keyframes, 2].
 
-    In the worst direction, at a solution; None if not finite. They are scaled by the variance factor if that is above
-    1. On a large graph without a band `SPREAD` keyframes, evenly spaced, represent the others.
+    In the worst direction, at a solution. NaN for an undetermined keyframe; None if all that may move are undetermined.
+    They are scaled by the variance factor if that is above 1. On a large graph without a band `SPREAD` keyframes,
+    evenly spaced, represent the others.
     """
     solver = DenseCholesky() if problem.num_keyframes <= DENSE_KEYFRAMES else choose_reduced_solver(problem)
     if isinstance(solver, ConjugateGradients):
@@ -154,7 +155,9 @@ def keyframe_sigma(problem: Problem, state: State, keyframes: int) -> np.ndarray
         worst, factor = np.asarray(variances, np.float64), float(found)
     # The variance factor only enlarges: few residuals, or residuals of a good fit, do not prove a smaller noise.
     sigma = np.sqrt(np.maximum(worst[:keyframes] * max(factor, 1.0), 0.0))
-    return sigma if np.isfinite(sigma).all() else None
+    sigma = np.where(np.isfinite(sigma), sigma, np.nan)
+    moving = ~np.asarray(problem.fixed_pose)[:keyframes]
+    return sigma if np.isfinite(sigma[moving]).any() else None
 
 
 def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.ndarray, float]:
@@ -209,8 +212,15 @@ def _sigma(
 ) -> tuple[Array, Array]:
     """Return the largest variances of translation and of rotation of some keyframes [h, 2], and the variance factor."""
     found = covariances(problem, state, reduced_solver=solver, keyframes=asked)
-    worst = [jnp.linalg.eigvalsh(found.poses[:, part, part])[:, -1] for part in (slice(0, 3), slice(3, 6))]
+    worst = [_largest_variance(found.poses[:, part, part]) for part in (slice(0, 3), slice(3, 6))]
     return jnp.stack(worst, axis=1), found.variance_factor
+
+
+def _largest_variance(blocks: Float[Array, "h 3 3"]) -> Float[Array, " h"]:
+    """Return the largest eigenvalue of each block; infinite if a direction is undetermined (`eigvalsh` gives NaN)."""
+    known = jnp.all(jnp.isfinite(blocks), axis=(1, 2))
+    largest = jnp.linalg.eigvalsh(jnp.where(known[:, None, None], blocks, jnp.eye(3, dtype=blocks.dtype)))[:, -1]
+    return jnp.where(known, largest, jnp.inf)
 
 
 sigma_jit = KeptProgram(_sigma, lambda problem, state, solver, asked: (asked, asked))

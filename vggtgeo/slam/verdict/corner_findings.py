@@ -33,20 +33,33 @@ from vggtgeo.slam.verdict.thresholds import (
     SIGMAS,
 )
 
-CALIBRATE = "calibrate the camera, or leave it to the run (`--intrinsics` off)"
-CHECK_DEPTH = "check the depth camera, or leave its depth out (`--rgb-only`)"
+CALIBRATE = "Calibrate the camera, or let the run estimate it (leave out `--intrinsics`)"
+CHECK_DEPTH = "Check the depth camera, or leave its depth out (`--rgb-only`)"
 CAUSES: dict[str, tuple[str, str, bool]] = {
-    "poses": ("the corners contradict the poses", "do not use these frames, or film them again, slower", False),
-    "second motion": (
-        "corners follow a second motion, an overlay or something large that moves: {rival:.0f} % of them",
-        "mask it, or film without it",
+    "poses": (
+        "corners followed in the images do not fit them",
+        "Film this part again, slower, or do not use it",
         False,
     ),
-    "focal length": ("the corners contradict the focal length", CALIBRATE, True),
-    "principal point": ("the corners contradict the principal point", CALIBRATE, False),
-    "distortion": ("the corners show a radial distortion that the camera lacks", CALIBRATE, False),
-    "rolling shutter": ("the corners show a rolling shutter", "move slower, or use a shorter readout", False),
-    "depth": ("the depth contradicts the motion of the corners, with a noise of {noise:.0f} %", CHECK_DEPTH, True),
+    "second motion": (
+        "{rival:.0f} % of the corners followed in the images move by themselves (an overlay, or something large that "
+        "moves)",
+        "Mask it, or film without it",
+        False,
+    ),
+    "focal length": ("corners followed in the images contradict the focal length", CALIBRATE, True),
+    "principal point": ("corners followed in the images contradict the principal point", CALIBRATE, False),
+    "distortion": ("corners followed in the images show a lens distortion that the camera lacks", CALIBRATE, False),
+    "rolling shutter": (
+        "corners followed in the images show a rolling shutter",
+        "Move slower, or use a camera mode with a shorter readout",
+        False,
+    ),
+    "depth": (
+        "the measured depth does not fit the motion of corners in the images; it scatters by {noise:.0f} %",
+        CHECK_DEPTH,
+        True,
+    ),
 }
 """Of each cause: what it is, what to do, and whether it puts the unit of length in doubt."""
 
@@ -114,13 +127,15 @@ def _finding(claim: Claim, ones: Sequence[Contradiction]) -> Finding:
     differ, sigma, unit = 100 * found.places, 100 * found.places_sigma, "cm"
     if not claim.metric:
         around = max(extent(window.tracks.poses), 1e-12)
-        differ, sigma, unit = differ / around, sigma / around, "% of the path's extent"
-    parts.append(f"; poses that allow for it differ by {differ:.0f} +- {sigma:.0f} {unit}")
-    parts.append(f", turns from frame to frame by {np.degrees(found.turn):.1f} degrees")
-    text = f"frames {start} to {end}: {''.join(parts)}"
+        differ, sigma, unit = differ / around, sigma / around, "% of the extent of the path there"
+    seconds = f"{claim.times[rows.min()]:.1f} to {claim.times[rows.max()]:.1f} s"
+    text = (
+        f"frames {start} to {end} ({seconds}): the camera positions may be wrong by {differ:.0f} +- {sigma:.0f} "
+        f"{unit}, turns from frame to frame by {np.degrees(found.turn):.1f} degrees; {''.join(parts)}"
+    )
     if worst.size < 1.0:
         return Finding(worst.cause, "good", text, start, end)
-    return Finding(worst.cause, "degraded", f"{text}; {advice}", start, end, scale=scale and claim.metric)
+    return Finding(worst.cause, "degraded", f"{text}. {advice}", start, end, scale=scale and claim.metric)
 
 
 def _estimate(added: Added) -> str:

@@ -62,8 +62,9 @@ def check_extent(claim: Claim, share: float) -> list[Finding]:
     if claim.metric or share < MAX_UNKNOWN:
         return []
     text = (
-        f"the places are known to {min(100 * share, 100):.0f} % of their spread only: the camera turns more than it "
-        "moves, and without depth the path is not determined"
+        f"the camera positions are uncertain by {min(100 * share, 100):.0f} % of the extent of the path: the camera "
+        "turns more than it moves, and without depth the path is not determined. Film more sideways motion, or record "
+        "depth"
     )
     return [Finding("extent", "degraded", text)]
 
@@ -78,8 +79,8 @@ def check_unit(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding]:
     if near >= MIN_SENSOR_DEPTH and PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
         return []
     text = (
-        f"the median depth of the corners is {middle:.2g} m, and a tenth of them is within {near:.2g} m, outside the "
-        "range of sensors for rooms: check the unit of the depth images"
+        f"lengths may not be metres: the median depth of the corners is {middle:.2g} m, and a tenth of them is within "
+        f"{near:.2g} m, outside the range of sensors for rooms. Check the unit of the depth images"
     )
     return [Finding("depth unit", "degraded", text, scale=True)]
 

@@ -37,13 +37,14 @@ def check_record(claim: Claim) -> list[Finding]:
     if len(claim) == 1 and not claim.began_in_known_map:
         found.append(Finding("start", "degraded", "the run has one frame: nothing can confirm its pose and its map"))
     if claim.guessed:
-        text = "the camera is unknown, and too little was seen to estimate it; pass `--intrinsics`"
+        text = "the camera is unknown, and too little was seen to estimate it. Pass `--intrinsics`"
         found.append(Finding("camera", "degraded", text))
     found += _lost(claim)
     if claim.submaps > 1:
         text = (
-            f"the map has {claim.submaps} submaps that are not connected; trajectory.txt and map.ply hold the one with "
-            "most frames, trajectory-2.txt the next"
+            f"the map is in {claim.submaps} submaps whose relative position and scale are unknown, because tracking was "
+            "lost between them; trajectory.txt and map.ply hold the one with most frames, trajectory-2.txt the next. "
+            "Film again with overlap, or use each submap by itself"
         )
         found.append(Finding("submaps", "degraded", text))
     return found
@@ -57,7 +58,7 @@ def _lost(claim: Claim) -> list[Finding]:
     if count > MAX_LOST * len(claim) or bridging_error(claim) > MAX_BRIDGED:
         start, end = max(named, key=lambda ends: ends[1] - ends[0])
         times = "once" if len(named) == 1 else f"{len(named)} times, longest"
-        text = f"{count} of {len(claim)} frames were lost, {times} from frame {start} to {end}; they have no pose"
+        text = f"{count} of {len(claim)} frames were lost and have no pose, {times} from frame {start} to {end}"
         level: Level = "failed" if len(claim) - count < MIN_TRACKED * len(claim) else "degraded"
         found.append(Finding("lost", level, text, start, end))
     return found
@@ -82,7 +83,11 @@ def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding
         return []
     first, last = max(stretches, key=lambda ends: ends[1] - ends[0])
     start, end = int(claim.frames[first]), int(claim.frames[last])
-    text = f"frames {start} to {end} show the picture before them again, while the camera moved; film them again"
+    seconds = f"{claim.times[first]:.1f} to {claim.times[last]:.1f} s"
+    text = (
+        f"frames {start} to {end} ({seconds}) repeat the picture before them, while the camera moved: their poses are "
+        "guesses. Film this part again, or do not use it"
+    )
     return [Finding("frozen", "degraded", text, start, end)]
 
 
@@ -95,7 +100,10 @@ def _same(before: FrameEvidence, after: FrameEvidence) -> bool:
 
 def _never_started(claim: Claim) -> str:
     if not claim.began_in_known_map:
-        return "the map was never started: not enough parallax or texture; the poses are meaningless"
+        return (
+            "the poses are meaningless: the map was never started, for lack of sideways motion or of texture; begin "
+            "with sideways motion, or skip frames with `--start`"
+        )
     found, count = np.count_nonzero(claim.tracked), len(claim)
     return (
         f"{found} of {count} frames were found in the known map: they show another place, or the same one from "
