@@ -42,7 +42,7 @@ def check_record(claim: Claim) -> list[Finding]:
     found += _lost(claim)
     if claim.submaps > 1:
         text = (
-            f"the map is in {claim.submaps} submaps whose relative position and scale are unknown, because tracking was "
+            f"the map is in {claim.submaps} submaps whose relative position and scale are unknown: tracking was "
             "lost between them; trajectory.txt and map.ply hold the one with most frames, trajectory-2.txt the next. "
             "Film again with overlap, or use each submap by itself"
         )
