@@ -196,6 +196,8 @@ def frame_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
 def keyframe_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
     """Return camera -> world of the keyframes of a submap, by default the largest one."""
     own = [slam.keyframes[number] for number in submaps_by_size(slam)[submap]] if slam.keyframes else []
+    # Keyframes of frames that were placed at the end have the last numbers.
+    own.sort(key=lambda keyframe: keyframe.timestamp)
     poses = rigid.invert(np.array([keyframe.pose for keyframe in own]).reshape(-1, 4, 4))
     return Trajectory(np.array([keyframe.timestamp for keyframe in own]), poses)
 

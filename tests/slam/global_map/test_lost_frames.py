@@ -16,7 +16,7 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.lost_frames import place_lost
 from vggtgeo.slam.pending_window import merge_pending_window
-from vggtgeo.slam.run import frame_trajectory, run_frames
+from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory, run_frames
 from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
@@ -71,6 +71,14 @@ def test_lost_frames_are_placed_by_keyframes_made_of_them(
     assert not found.tracker.unplaced
     error = evaluate_trajectory(frame_trajectory(found), walk[2]).se3.statistics.rmse
     assert error < 0.03, f"{100 * error:.1f} cm"
+
+
+def test_keyframes_are_listed_by_time(lost: Slam) -> None:
+    """A keyframe that was made at the end of a frame in between is listed where it was seen. Oracle: the times."""
+    first, second, *others = lost.keyframes
+    swapped = (replace(first, timestamp=second.timestamp), replace(second, timestamp=first.timestamp), *others)
+    listed = keyframe_trajectory(replace(lost, map=replace(lost.map, keyframes=swapped)))
+    assert listed.timestamps.tolist() == sorted(keyframe.timestamp for keyframe in swapped)
 
 
 def test_frames_of_another_place_stay_lost(lost: Slam) -> None:
