@@ -28,8 +28,8 @@ def test_depth_on_the_side_that_leaves_does_not_hide_what_both_see() -> None:
     leaving = np.setdiff1d(np.arange(len(first.points.pixels)), matches.index_i)
     inverse = np.full(len(first.points.pixels), np.nan)
     inverse[leaving] = 1.0 / DEPTH
-    deviation = np.where(np.isfinite(inverse), 1e-4, np.nan)
-    first = replace(first, points=replace(first.points, inverse_depth=inverse, deviation=deviation))
+    estimate_sigma = np.where(np.isfinite(inverse), 1e-4, np.nan)
+    first = replace(first, points=replace(first.points, inverse_depth=inverse, estimate_sigma=estimate_sigma))
     pair = match_keyframes(first, second, _roles(matches), INTRINSICS)
     assert pair is not None
     assert len(pair.points) == len(matches)
