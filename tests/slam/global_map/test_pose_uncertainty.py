@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import equinox as eqx
 import numpy as np
 import pytest
 from degenerate_scenes import packed, without_matches_of
+from recorded_run import recorded_run
+from reported import pattern
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
@@ -18,7 +21,7 @@ import vggtgeo as vg
 from vggtgeo.cli.progress import print_result
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.loop import simulate_loop
-from vggtgeo.slam.global_map import pose_uncertainty
+from vggtgeo.slam.global_map import global_adjustment, pose_uncertainty
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma, sparse_worst
 from vggtgeo.slam.tracking.evidence import tangent
 
@@ -152,3 +155,18 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     print_result(Console(file=page), result, summary, tmp_path / "run")
     assert f"{100 * np.median(stated.translation):.1f} cm" in page.getvalue()
     assert f"{np.rad2deg(np.median(stated.rotation)):.2f} deg" in page.getvalue()
+
+
+def test_keyframes_without_an_uncertainty_are_named() -> None:
+    """The last adjustment notes how many keyframes are unknown and their frames, all of them if there is no uncertainty
+    at all, and nothing if it is whole. Oracle: rows made NaN by hand.
+    """
+    slam = recorded_run().slam
+    slam = replace(slam, map=replace(slam.map, keyframes=tuple(replace(slam.keyframes[0], frame=n) for n in range(8))))
+    sigma = np.full((8, 2), 0.01)
+    noted = lambda values: global_adjustment._uncertainty_notes(replace(slam, map=replace(slam.map, pose_sigma=values)))
+    assert noted(sigma) == []
+    assert len(noted(None)) == 1
+    sigma[[2, 3, 4, 6]] = np.nan
+    (note,) = noted(sigma)
+    assert all(re.search(pattern(part), note) for part in (4, 8, "2 to 4", "6 to 6"))

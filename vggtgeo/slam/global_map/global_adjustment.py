@@ -31,6 +31,8 @@ from vggtgeo.slam.window.sliding_window import solve_jit
 
 REPORTED_CHANGE = 0.01
 """Relative change of the camera above which the user is informed."""
+MAX_NAMED = 4
+"""Stretches of frames that a note names."""
 DISTORTION_SIGMAS, MAX_WARP = 5.0, 3.0
 """Standard deviations, and pixels in the corners of the image, above which a distortion is reported."""
 
@@ -57,7 +59,26 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             slam, shared = shared.try_camera(slam, adjustment, state, settings)
             solved = adjustment.problem, state
     sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
-    return replace(slam, map=replace(slam.map, pose_sigma=sigma))
+    slam = replace(slam, map=replace(slam.map, pose_sigma=sigma))
+    return replace(slam, notes=(*slam.notes, *_uncertainty_notes(slam)))
+
+
+def _uncertainty_notes(slam: Slam) -> list[str]:
+    """Return a note on keyframes without an uncertainty after the last adjustment."""
+    sigma = slam.map.pose_sigma
+    if sigma is None:
+        return ["the uncertainty of the poses is unknown: the last adjustment did not determine them"]
+    unknown = np.flatnonzero(np.isnan(sigma).any(1))
+    if not len(unknown):
+        return []
+    stretches = np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1)
+    frames = [f"{slam.keyframes[rows[0]].frame} to {slam.keyframes[rows[-1]].frame}" for rows in stretches]
+    more = f" and {len(frames) - MAX_NAMED} more" if len(frames) > MAX_NAMED else ""
+    return [
+        f"the uncertainty of {len(unknown)} of {len(sigma)} keyframes is unknown (frames "
+        f"{', '.join(frames[:MAX_NAMED])}{more}): the images hardly determine where they are in the map; do not rely "
+        "on their positions"
+    ]
 
 
 @dataclass(frozen=True, eq=False)
