@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, LineFeatures, PointMatches, Segments
 
 from vggtgeo.geometry import rigid
@@ -88,4 +89,4 @@ class _TrueMatches:
 
 
 def _roles(matches: PointMatches) -> Roles:
-    return Roles(points=_TrueMatches(matches))
+    return Roles(points=_TrueMatches(matches), depth=NoDepth())

@@ -101,8 +101,10 @@ def match_keyframes(
     The overlap is predicted from the points of the first, or of the second if the first has no depth; without any depth
     it is not checked.
     """
+    # What a depth camera leaves out is glass, mirrors or far away: not at the mean depth of the rest.
+    shown = some_points if roles.metric else points_in_view
     for one, other in ((first, second), (second, first)):
-        seen = points_in_view(one, intrinsics)
+        seen = shown(one, intrinsics)
         if len(seen):
             if overlap(seen, other, intrinsics) < MIN_OVERLAP:
                 return None
