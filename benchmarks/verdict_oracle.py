@@ -28,7 +28,9 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.verdict.adjustment import (
+from vggtgeo.slam.verdict.alternatives import START, explain
+from vggtgeo.slam.verdict.claim import Claim, extent
+from vggtgeo.slam.verdict.corner_adjustment import (
     DRIFT,
     FOCAL,
     KNOTS,
@@ -40,8 +42,6 @@ from vggtgeo.slam.verdict.adjustment import (
     solve,
     start_of,
 )
-from vggtgeo.slam.verdict.alternatives import START, explain
-from vggtgeo.slam.verdict.claim import Claim, extent
 from vggtgeo.slam.verdict.judge import aligned, tracks_of_windows
 from vggtgeo.slam.verdict.noise import scores, with_own_noise
 

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.verdict.adjustment import Tracks
 from vggtgeo.slam.verdict.alternatives import Explanation, explain
 from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.corner_adjustment import Tracks
 from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.windows import tracks_of
 

@@ -128,7 +128,7 @@ def open_run_folder(
                     _check_no_checkpoint(RunFolder(place))
                 yield _prepare(RunFolder(place), reserve, bool(resume))
             finally:
-                _keep_checkpoint_or_remove(place / UNFINISHED)
+                _remove_stage_unless_needed(place / UNFINISHED)
     finally:
         for path in created:
             if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
@@ -156,7 +156,7 @@ def _prepare(run: RunFolder, reserve: int, resume: bool) -> RunFolder:
             with (run.stage / _RESERVED).open("wb") as file:
                 _allocate(file.fileno(), reserve)
     except OSError as error:
-        _keep_checkpoint_or_remove(run.stage)
+        _remove_stage_unless_needed(run.stage)
         raise not_written(run.folder, error, reserve) from None
     return run
 
@@ -179,7 +179,7 @@ def _allocate(file: int, size: int) -> None:
             raise
 
 
-def _keep_checkpoint_or_remove(stage: Path) -> None:
+def _remove_stage_unless_needed(stage: Path) -> None:
     """Remove the stage; if it has a checkpoint or unpublished poses, keep it without the reserved space."""
     if (stage / "trajectory.txt").is_file() or (stage / CHECKPOINT).is_file():
         (stage / _RESERVED).unlink(missing_ok=True)

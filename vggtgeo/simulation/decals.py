@@ -12,7 +12,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from vggtgeo.simulation.noise import blend, fractal, quantise, random_colour, scribble
+from vggtgeo.simulation.texture_fields import blend, fractal, quantise, random_colour, scribble
 
 _LINE = cv2.LINE_AA
 

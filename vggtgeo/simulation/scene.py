@@ -10,8 +10,8 @@ import numpy as np
 
 from vggtgeo.simulation.atlas import Atlas, build_atlas
 from vggtgeo.simulation.lightmap import Lightmap, bake
-from vggtgeo.simulation.noise import fractal
 from vggtgeo.simulation.shapes import SceneBuilder, Surfaces, stack_blockers, stack_surfaces
+from vggtgeo.simulation.texture_fields import fractal
 from vggtgeo.simulation.textures import TILES, paint_texture
 
 _TILE_SIZE = 1024

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.decals import DECALS
-from vggtgeo.simulation.noise import blend, fractal, quantise, random_colour, tile_cells
+from vggtgeo.simulation.texture_fields import blend, fractal, quantise, random_colour, tile_cells
 
 Painter = Callable[[np.random.Generator, int], np.ndarray]
 

@@ -27,7 +27,7 @@ from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.join_at_end import join_at_end
 from vggtgeo.slam.global_map.loops import close_loops
-from vggtgeo.slam.global_map.lost_frames import place_lost
+from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
 from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.made_ahead import made_ahead
@@ -163,7 +163,7 @@ def finish(
     with clock.measure("place frames"):
         slam = replace(slam, tracker=against_nearest(slam.map, slam.tracker, slam.intrinsics, roles))
     with clock.measure("loops"):
-        slam = place_lost(join_at_end(slam, roles), roles, settings)
+        slam = place_lost_without_depth(join_at_end(slam, roles), roles, settings)
         slam = with_recorded_ties(join_at_end(slam, roles), roles)
         slam = close_loops(slam, roles, settings)
     with clock.measure("global adjustment"):

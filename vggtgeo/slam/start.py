@@ -63,7 +63,7 @@ def begin_again_with_depth(
         tracker=replace(slam.tracker, frames=(*before, record), waiting=waiting),
         notes=(*slam.notes, note),
     )
-    slam = _place_waiting(slam, keyframe, roles)
+    slam = _place_in_new_map(slam, keyframe, roles)
     return replace(slam, tracker=replace(slam.tracker, waiting=()))
 
 
@@ -106,7 +106,7 @@ def start_without_depth(slam: Slam, frame: Frame, features: Features, roles: Rol
     anchor = scale_anchor(slam.map, slam.window.members)
     slam = adjust_window(replace(slam, map=replace(slam.map, factors=(*slam.map.factors, anchor))), settings)
     first, second = slam.keyframes[first.number], slam.keyframes[number]
-    slam = _place_waiting(slam, first, roles)
+    slam = _place_in_new_map(slam, first, roles)
     inliers = int(np.count_nonzero(guess.inliers))
     # The frames between were placed in the map of this moment: what becomes of it later is shared out over them.
     arrival = (first.number, second.pose @ rigid.invert(first.pose))
@@ -164,7 +164,7 @@ def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
     )
 
 
-def _place_waiting(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
+def _place_in_new_map(slam: Slam, first: Keyframe, roles: Roles) -> Slam:
     """Track the waiting frames in the new map, and keep the accepted poses."""
     placed = {}
     for waiting in slam.tracker.waiting:

@@ -14,7 +14,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.global_map.lost_frames import place_lost
+from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
 from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory, run_frames
 from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
@@ -65,7 +65,7 @@ def test_lost_frames_are_placed_by_keyframes_made_of_them(
     """The camera leaves what the map shows; frames that see its border become keyframes, which place those beyond.
     Oracle: the renderer's poses.
     """
-    found = place_lost(lost, FREE_ROLES, SETTINGS)
+    found = place_lost_without_depth(lost, FREE_ROLES, SETTINGS)
     assert all(record.tracked for record in found.frames), [r.frame for r in found.frames if not r.tracked]
     assert len(found.keyframes) > len(lost.keyframes)
     assert not found.tracker.unplaced
@@ -88,7 +88,9 @@ def test_frames_of_another_place_stay_lost(lost: Slam) -> None:
         replace(_waiting(frame), frame=KNOWN + row, timestamp=(KNOWN + row) / 10)
         for row, frame in enumerate(other.frames())
     )
-    found = place_lost(replace(lost, tracker=replace(lost.tracker, unplaced=elsewhere)), FREE_ROLES, SETTINGS)
+    found = place_lost_without_depth(
+        replace(lost, tracker=replace(lost.tracker, unplaced=elsewhere)), FREE_ROLES, SETTINGS
+    )
     assert found.map is lost.map
     assert not any(record.tracked for record in found.frames[KNOWN:])
 

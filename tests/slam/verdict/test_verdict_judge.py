@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.results.result import Result
 from vggtgeo.slam.verdict import judge as judge_module
-from vggtgeo.slam.verdict.adjustment import Noise, solve, start_of
+from vggtgeo.slam.verdict.corner_adjustment import Noise, solve, start_of
 from vggtgeo.slam.verdict.corner_findings import findings
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude

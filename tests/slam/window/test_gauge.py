@@ -24,7 +24,7 @@ from vggtgeo.simulation.small_window import SimulatedWindow, simulate_window
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
-from vggtgeo.slam.window.sliding_window import make_room
+from vggtgeo.slam.window.sliding_window import marginalise_oldest
 from vggtgeo.slam.window.window import Window, WindowPrior
 
 KEYFRAMES, POINTS = 7, 12
@@ -192,7 +192,7 @@ def test_the_keyframe_that_the_next_is_tied_to_stays() -> None:
     """
     settings = SlamSettings(window=WindowSettings(size=4, point_slots=16, line_slots=12))
     window = Window(members=(3, 4, 5, 6))
-    assert make_room(window, settings).members == (4, 5, 6)
-    assert make_room(window, settings, needed=3).members == (3, 5, 6)
-    assert make_room(window, settings, needed=5).members == (4, 5, 6)
-    assert make_room(Window(members=(4, 5, 6)), settings, needed=4).members == (4, 5, 6)
+    assert marginalise_oldest(window, settings).members == (4, 5, 6)
+    assert marginalise_oldest(window, settings, needed=3).members == (3, 5, 6)
+    assert marginalise_oldest(window, settings, needed=5).members == (4, 5, 6)
+    assert marginalise_oldest(Window(members=(4, 5, 6)), settings, needed=4).members == (4, 5, 6)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, PoseGraph, distance, solve_pose_graph
+from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, PoseGraph, solve_pose_graph, squared_distance
 from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
 from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
@@ -57,7 +57,7 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     motions, closing = odometry(slam)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     drifted = [loop for loop in loops if not loop.agrees(slam)]
-    torn = [tie for tie in closing if distance(tie, poses) > LOOP_GATE and _pixels(tie, slam) > MAX_LOOP_ERROR]
+    torn = [tie for tie in closing if squared_distance(tie, poses) > LOOP_GATE and _pixels(tie, slam) > MAX_LOOP_ERROR]
     if not drifted and not torn:
         return slam, list(loops)
     measured = (*closing, *(loop.motion for loop in loops))
@@ -103,7 +103,7 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
         if number in tree:
             tie = tree[number]
             # Adjusted poses are more accurate than the tracked motion, unless an adjustment went wrong.
-            agrees = distance(tie, poses) < LOOP_GATE
+            agrees = squared_distance(tie, poses) < LOOP_GATE
             motions.append(replace(tie, pose=between(tie.first, tie.second)) if agrees else tie)
         elif (number - 1, number) in matched:
             motions.append(MeasuredRelativePose(number - 1, number, between(number - 1, number), loose))

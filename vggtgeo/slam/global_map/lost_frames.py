@@ -25,7 +25,7 @@ from vggtgeo.slam.window.window import Window
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 
-def place_lost(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
+def place_lost_without_depth(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     """Place the frames that tracking has lost, as far as all keyframes allow."""
     if slam.metric or not slam.keyframes:
         return slam

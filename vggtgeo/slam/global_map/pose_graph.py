@@ -108,10 +108,10 @@ def solve_pose_graph(graph: PoseGraph) -> SolvedPoseGraph:
     poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64)[:count])
     if not np.isfinite(poses).all():
         return SolvedPoseGraph(graph.poses, np.zeros(len(graph.loops), bool))
-    return SolvedPoseGraph(poses, np.array([distance(loop, poses) < LOOP_GATE for loop in graph.loops], bool))
+    return SolvedPoseGraph(poses, np.array([squared_distance(loop, poses) < LOOP_GATE for loop in graph.loops], bool))
 
 
-def distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float:
+def squared_distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float:
     """Return the squared Mahalanobis distance of the poses from a measured relative pose, 6 degrees of freedom."""
     found = poses[measured.second] @ rigid.invert(poses[measured.first])
     off = tangent(found @ rigid.invert(measured.pose))

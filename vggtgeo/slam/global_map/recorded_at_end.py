@@ -11,7 +11,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.drift_correction import at_poses
-from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, distance
+from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, squared_distance
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
@@ -84,7 +84,7 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
         for row, (tie, (first, second)) in enumerate(zip(ties, pairwise(numbers), strict=True)):
             before, after = (slam.keyframes[number].pose for number in (first, second))
             poses[second] = longer(after @ rigid.invert(before), 1.0 / local[row]) @ poses[first]
-            if tie is not None and distance(tie, poses) > LOOP_GATE:
+            if tie is not None and squared_distance(tie, poses) > LOOP_GATE:
                 recorded_motion = tie.pose if tie.second == second else rigid.invert(tie.pose)
                 poses[second] = recorded_motion @ poses[first]
     factors = tuple(factor for factor in slam.map.factors if not isinstance(factor, MeasuredBaseline))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from vggtgeo.slam.verdict.adjustment import (
+from vggtgeo.slam.verdict.corner_adjustment import (
     CENTRE,
     DRIFT,
     FOCAL,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.verdict.adjustment import Fit, solve, start_of
+from vggtgeo.slam.verdict.corner_adjustment import Fit, solve, start_of
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from vggtgeo.datasets.check import PLAUSIBLE
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.verdict.adjustment import Tracks
 from vggtgeo.slam.verdict.alternatives import explain
 from vggtgeo.slam.verdict.claim import Claim, extent
+from vggtgeo.slam.verdict.corner_adjustment import Tracks
 from vggtgeo.slam.verdict.corner_findings import findings
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks, FrameEvidence
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude

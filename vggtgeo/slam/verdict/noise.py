@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.slam.verdict.adjustment import SIZE, Fit, Noise, reduce, solve
+from vggtgeo.slam.verdict.corner_adjustment import SIZE, Fit, Noise, reduce, solve
 from vggtgeo.slam.verdict.thresholds import MIN_PIXEL_NOISE, MIN_RELATIVE_DEPTH_NOISE
 
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from vggtgeo.slam.verdict.adjustment import Tracks
 from vggtgeo.slam.verdict.claim import Claim
+from vggtgeo.slam.verdict.corner_adjustment import Tracks
 from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.thresholds import MIN_COMMON, MIN_FRAMES, MIN_VIEWS
 

@@ -121,7 +121,7 @@ class AdjustedWindow:
     notes: tuple[str, ...]
 
 
-def make_room(window: Window, settings: SlamSettings, needed: int | None = None) -> Window:
+def marginalise_oldest(window: Window, settings: SlamSettings, needed: int | None = None) -> Window:
     """Marginalise the oldest keyframe of a full window, in the last problem that contained it.
 
     needed: a keyframe that must stay, because the next one was tracked against it.
@@ -155,7 +155,7 @@ def enter(
     length_known: whether the distance to `tied_to` is measured (`match_keyframes`). The images of those outside the
     window are compressed.
     """
-    window = make_room(window, settings, tied_to)
+    window = marginalise_oldest(window, settings, tied_to)
     match = lambda number: match_keyframes(
         known.keyframes[number], keyframe, roles, intrinsics, length_known=length_known
     )
