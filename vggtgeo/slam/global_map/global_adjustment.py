@@ -68,11 +68,14 @@ def _uncertainty_notes(slam: Slam) -> list[str]:
     sigma = slam.map.pose_sigma
     if sigma is None:
         return ["the uncertainty of the poses is unknown: the last adjustment did not determine them"]
-    unknown = np.flatnonzero(np.isnan(sigma).any(1))
+    # By time: keyframes of frames that were placed at the end have the last numbers.
+    numbers = np.array([keyframe.frame for keyframe in slam.keyframes])
+    order = np.argsort(numbers)
+    unknown = np.flatnonzero(np.isnan(sigma[order]).any(1))
     if not len(unknown):
         return []
-    stretches = np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1)
-    frames = [f"{slam.keyframes[rows[0]].frame} to {slam.keyframes[rows[-1]].frame}" for rows in stretches]
+    stretches = np.split(numbers[order][unknown], np.flatnonzero(np.diff(unknown) > 1) + 1)
+    frames = [f"{own[0]} to {own[-1]}" for own in stretches]
     more = f" and {len(frames) - MAX_NAMED} more" if len(frames) > MAX_NAMED else ""
     return [
         f"the uncertainty of {len(unknown)} of {len(sigma)} keyframes is unknown (frames "

@@ -56,27 +56,19 @@ class Directed:
     line_confidence: np.ndarray
 
 
-def some_points(keyframe: Keyframe, intrinsics: np.ndarray, most: int = 64) -> np.ndarray:
-    """Return world points of a few slots of known depth, spread over the image, float64 `[m, 3]`."""
-    inverse = keyframe.points.inverse_depth
-    known = np.nonzero(np.isfinite(inverse))[0]
-    some = known[:: max(len(known) // most, 1)]
-    return rigid.unproject(keyframe.points.pixels[some], inverse[some], keyframe.pose, intrinsics)
+def some_points(keyframe: Keyframe, intrinsics: np.ndarray, *, fill: bool = False, most: int = 64) -> np.ndarray:
+    """Return world points of a few slots of known depth, spread over the image, float64 `[m, 3]`.
 
-
-def points_in_view(keyframe: Keyframe, intrinsics: np.ndarray, most: int = 64) -> np.ndarray:
-    """Return world points of a few slots, spread over the image, float64 `[m, 3]`; none where no depth is known.
-
-    Slots of unknown depth are at the mean inverse depth of the others: in a turn without metric depth only the side of
-    the image that is leaving has depth.
+    fill: also slots of unknown depth, at the mean inverse depth of the others. In a turn without metric depth only the
+    side of the image that is leaving has depth.
     """
     inverse = keyframe.points.inverse_depth
     known = np.isfinite(inverse)
-    if not known.any():
-        return np.zeros((0, 3))
-    some = np.arange(len(inverse))[:: max(len(inverse) // most, 1)]
-    filled = np.where(known, inverse, np.mean(inverse[known]))
-    return rigid.unproject(keyframe.points.pixels[some], filled[some], keyframe.pose, intrinsics)
+    if fill and known.any():
+        inverse = np.where(known, inverse, np.mean(inverse[known]))
+    rows = np.nonzero(np.isfinite(inverse))[0]
+    some = rows[:: max(len(rows) // most, 1)]
+    return rigid.unproject(keyframe.points.pixels[some], inverse[some], keyframe.pose, intrinsics)
 
 
 def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> float:
@@ -102,9 +94,8 @@ def match_keyframes(
     it is not checked.
     """
     # What a depth camera leaves out is glass, mirrors or far away: not at the mean depth of the rest.
-    shown = some_points if roles.metric else points_in_view
     for one, other in ((first, second), (second, first)):
-        seen = shown(one, intrinsics)
+        seen = some_points(one, intrinsics, fill=not roles.metric)
         if len(seen):
             if overlap(seen, other, intrinsics) < MIN_OVERLAP:
                 return None
