@@ -170,3 +170,9 @@ def test_keyframes_without_an_uncertainty_are_named() -> None:
     sigma[[2, 3, 4, 6]] = np.nan
     (note,) = noted(sigma)
     assert all(re.search(pattern(part), note) for part in (4, 8, "2 to 4", "6 to 6"))
+    # A keyframe placed at the end has the last number, and an earlier frame.
+    frames = (0, 1, 2, 4, 5, 6, 7, 3)
+    keyframes = tuple(replace(slam.keyframes[0], frame=frame) for frame in frames)
+    slam = replace(slam, map=replace(slam.map, keyframes=keyframes))
+    (note,) = noted(np.where(np.isin(frames, [2, 3, 4])[:, None], np.nan, 0.01))
+    assert re.search(pattern("2 to 4"), note)
