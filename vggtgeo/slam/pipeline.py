@@ -54,6 +54,7 @@ from vggtgeo.slam.tracking.track import (
     track,
     track_by_map,
     track_by_rays,
+    unless_contradicted,
 )
 from vggtgeo.slam.tracking.tracker import FramePose
 from vggtgeo.slam.tracking.two_view_motion import usual_step
@@ -169,12 +170,16 @@ def _track(
         with clock.measure("relocalise"):
             found = relocalise(TrackingInput(data, slam.intrinsics, roles), slam.keyframes, slam.tracker) or found
     grows = bool(slam.window.members) and not settings.keyframes.localise_only
-    if grows and not slam.metric and found is not None and not found.accepted:
+    if grows and not slam.metric and found is not None:
         with clock.measure("track"):
             newest = slam.keyframes[slam.window.members[-1]]
             given = TrackingInput(data, slam.intrinsics, roles, _prior(slam, frame, recorded))
             length = None if recorded is None else recorded.length(newest, frame.timestamp)
-            found = track_by_rays(given, newest, length or usual_step(slam.keyframes, frame.index)) or found
+            length = length or usual_step(slam.keyframes, frame.index)
+            if found.accepted:
+                found = unless_contradicted(found, given, newest, length)
+            else:
+                found = track_by_rays(given, newest, length) or found
     return slam, data, found
 
 
@@ -224,7 +229,7 @@ def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Ro
     if not best.accepted:
         source = view_of(best.keyframe, slam.tracker, slam.intrinsics, roles)
         joint = track_by_map(given, submap, best.keyframe, source)
-        return joint if joint.accepted else best
+        return replace(joint, matches=best.matches) if joint.accepted else best
     return refined_by_map(best, given, submap)
 
 

@@ -11,13 +11,17 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from vggtgeo.models.classical import PnpGeometry
-from vggtgeo.models.roles import Features, LineFeatures, PointMatches, Segments
+from vggtgeo.models.roles import Features, GeometryResult, LineFeatures, PointMatches, Segments
 
+from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.slam.perception.description import Description
+from vggtgeo.slam.run import default_roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
-from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.evidence import Evidence, tangent
+from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput, unless_contradicted
 from vggtgeo.slam.tracking.two_view_motion import two_view_motion, usual_step
 
 INTRINSICS = np.array([400.0, 400.0, 239.5, 134.5])
@@ -79,6 +83,33 @@ def test_the_information_says_that_the_length_is_a_guess() -> None:
     assert deviation / length == pytest.approx(0.7, rel=0.01)
     off = tangent(found.motion @ rigid.invert(TRUE))
     assert off @ found.information @ off < 6 * 4**2
+
+
+def test_a_motion_by_wrong_depths_is_replaced() -> None:
+    """A track that moves the opposite way, and turns by what makes up for it, gives way to the motion of the epipolar
+    lines, within 0.3 degrees. The right motion stays, though noise leaves outliers. Oracle: the motion that was drawn.
+    """
+    keyframe, matches = _views()
+    opposite = exponential(np.array([-0.30, -0.05, -0.10, 0.02, 0.62, -0.03]))
+    found = unless_contradicted(_tracked(keyframe, matches, opposite), _given(keyframe), keyframe, 0.3)
+    assert np.degrees(rigid.angle_between(found.relative, TRUE)) < 0.3
+    assert found.evidence.by_rays
+
+    noisy = replace(
+        matches, pixels_j=matches.pixels_j + np.random.default_rng(4).normal(0, 1.2, matches.pixels_j.shape)
+    )
+    right = _tracked(keyframe, noisy, TRUE)
+    assert unless_contradicted(right, _given(keyframe), keyframe, 0.3) is right
+
+
+def _tracked(keyframe: Keyframe, matches: PointMatches, motion: np.ndarray) -> Track:
+    information = 1e6 * np.eye(6)
+    return Track(keyframe, motion, information, Evidence(), GeometryResult.SUCCESS, matches=matches)
+
+
+def _given(keyframe: Keyframe) -> TrackingInput:
+    frame = Frame(1, 0.1, keyframe.image, None, "1")
+    return TrackingInput(FrameData(frame, Description.of(keyframe.features), None), INTRINSICS, default_roles(False))
 
 
 def test_the_usual_step_goes_on_at_the_speed_between_the_newest_keyframes() -> None:

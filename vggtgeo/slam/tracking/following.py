@@ -41,7 +41,8 @@ class Located:
     """A pose from key points, the number of matches, and their world points, float64 [m, 3].
 
     sigma: standard deviation of a match, pixels. slots: int [m], slots of these matches in the keyframe, and pixels:
-    float64 [m, 2], in the frame; None for matches with several keyframes.
+    float64 [m, 2], in the frame; None for matches with several keyframes. with_unknown_depth: the matches with those of
+    unknown depth; None by flow, or with several keyframes.
     """
 
     guess: PoseGuess
@@ -50,6 +51,7 @@ class Located:
     sigma: float
     slots: np.ndarray | None = None
     pixels: np.ndarray | None = None
+    with_unknown_depth: PointMatches | None = None
 
     @property
     def seen(self) -> SeenPoints | None:

@@ -16,6 +16,7 @@ from vggtgeo.models.roles import (
     GeometryResult,
     LineFeatures,
     PointMatcher,
+    PointMatches,
     PoseGuess,
     PoseQuery,
 )
@@ -38,7 +39,7 @@ from vggtgeo.slam.tracking.fusion import (
 )
 from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
 from vggtgeo.slam.tracking.tracker import SeenPoints
-from vggtgeo.slam.tracking.two_view_motion import two_view_motion
+from vggtgeo.slam.tracking.two_view_motion import explains_more, may_explain_more, two_view_motion
 
 PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, the rest from the keyframe's depth at that one pixel.
@@ -118,6 +119,8 @@ class Track:
     pose: float64 [4, 4], world -> camera. measured: float64 [6, 6], information of the motion keyframe -> frame over
     its left tangent, translation first, without systematic errors. result: the reason if there is no pose. alone: the
     track before other keyframes refined it. seen: its matches with the keyframe, if the pose is from points alone.
+    matches: all matches with the keyframe, of known depth or not; None if the pose is not by descriptors of one
+    keyframe.
     """
 
     keyframe: Keyframe
@@ -127,6 +130,7 @@ class Track:
     result: GeometryResult
     alone: Track | None = None
     seen: SeenPoints | None = None
+    matches: PointMatches | None = None
 
     @property
     def accepted(self) -> bool:
@@ -183,6 +187,28 @@ def track_by_rays(given: TrackingInput, keyframe: Keyframe, length: float) -> Tr
     length: of the motion between both, from the motion so far.
     """
     matches = given.roles.points.match(keyframe.features, given.data.features)
+    return _placed_by_rays(given, keyframe, length, matches)
+
+
+def unless_contradicted(found: Track, given: TrackingInput, keyframe: Keyframe, length: float) -> Track:
+    """Return the track, or that by rays if its motion explains more matches beyond chance.
+
+    keyframe, length: as for `track_by_rays`. A track by another keyframe is returned as it is: the poses of both
+    keyframes may differ by drift.
+    """
+    matches = found.matches
+    if found.keyframe.number != keyframe.number or matches is None or found.evidence.by_rays:
+        return found
+    if not may_explain_more(found.relative, matches, given.intrinsics):
+        return found
+    other = _placed_by_rays(given, keyframe, length, matches)
+    if other is None or not other.accepted:
+        return found
+    better = explains_more(other.relative, found.relative, matches, given.intrinsics)
+    return other if better else found
+
+
+def _placed_by_rays(given: TrackingInput, keyframe: Keyframe, length: float, matches: PointMatches) -> Track | None:
     found = two_view_motion(matches, length, given.intrinsics, given.roles.geometry, PIXEL_SIGMA)
     if found is None:
         return None
@@ -225,6 +251,7 @@ def _placed(
         return Track(keyframe, guess.pose, np.zeros((6, 6)), evidence, guess.result)
     pose = rigid.orthonormal(found.motion @ keyframe.pose)
     track = _judged(pose, found.information, evidence, keyframe, given.prior)
+    track = replace(track, matches=located.with_unknown_depth)
     return replace(track, seen=located.seen) if known and dense is None else track
 
 
@@ -249,7 +276,7 @@ def refined_by_map(found: Track, given: TrackingInput, keyframes: Iterable[Keyfr
     measured = found.measured + refined.information
     evidence = replace(found.evidence, map_points=refined.points)
     better = _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, given.prior)
-    return replace(better, alone=found, seen=found.seen)
+    return replace(better, alone=found, seen=found.seen, matches=found.matches)
 
 
 def moved_with(found: Track, keyframe: Keyframe) -> Track:
@@ -285,10 +312,10 @@ def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
 
 def _by_descriptors(given: TrackingInput, keyframe: Keyframe, matcher: PointMatcher) -> Located:
     """Return the pose from key points of known depth, matched by descriptors."""
-    matches = matcher.match(keyframe.features, given.data.features)
-    inverse_depth = keyframe.points.inverse_depth[matches.index_i]
+    every = matcher.match(keyframe.features, given.data.features)
+    inverse_depth = keyframe.points.inverse_depth[every.index_i]
     known = np.isfinite(inverse_depth)
-    matches = matches.select(known)
+    matches = every.select(known)
     points = rigid.unproject(matches.pixels_i, inverse_depth[known], keyframe.pose, given.intrinsics)
     query = PoseQuery(
         given.data.frame.image,
@@ -302,7 +329,7 @@ def _by_descriptors(given: TrackingInput, keyframe: Keyframe, matcher: PointMatc
         window_depths=tuple(member.depth for member in given.window) if given.roles.metric else (),
     )
     guess = given.roles.geometry.locate(query)
-    return Located(guess, len(matches), points, PIXEL_SIGMA, matches.index_i, matches.pixels_j)
+    return Located(guess, len(matches), points, PIXEL_SIGMA, matches.index_i, matches.pixels_j, every)
 
 
 def _judged(

@@ -8,6 +8,10 @@ The information of the motion is that of the matches with depths eliminated: wit
 left tangent and its column `c` over the inverse depth of the point, `sum J^T (I - c c^T / c^T c) J / sigma^2`. It has
 no information about the length, so that of the prior is added. If all points are far away the translation is weakly
 constrained and follows the motion prior (`fusion.fused_with_prior`).
+
+Depths may also be known and wrong: after a fast turn with little parallax, points with wrong depths agree on a wrong
+motion, in the worst case the opposite one. The epipolar lines of all matches, with known depth or without, then
+contradict it (`explains_more`).
 """
 
 from __future__ import annotations
@@ -15,11 +19,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import STEP_GROWTH
+
+EXPLAINED_GATE = 2.0
+"""Largest distance of a match from its epipolar line, pixels: four standard deviations of a key point."""
+DECISIVE = float(chi2.isf(1e-6, 1))
+"""Statistic above which one of two motions explains more matches than the other beyond chance. Tried on each frame of
+a run, so that a level of 1e-6 is one false decision in a million frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +67,26 @@ def two_view_motion(
     # |t|`.
     information += np.outer(along, along) / (STEP_GROWTH * length * length) ** 2
     return TwoViewMotion(motion, information, guess.inliers, points)
+
+
+def explains_more(motion: np.ndarray, other: np.ndarray, matches: PointMatches, intrinsics: np.ndarray) -> bool:
+    """Return whether a motion explains more matches than another does, beyond chance (McNemar, 1947).
+
+    Only matches that one of both explains tell them apart; if they are equally good, each of these has the same chance
+    to be explained by either.
+    """
+    ours, theirs = (_explained(one, matches, intrinsics) for one in (motion, other))
+    gained, lost = np.count_nonzero(ours & ~theirs), np.count_nonzero(theirs & ~ours)
+    return bool(gained > lost and (gained - lost) ** 2 > DECISIVE * (gained + lost))
+
+
+def may_explain_more(motion: np.ndarray, matches: PointMatches, intrinsics: np.ndarray) -> bool:
+    """Return whether so many matches contradict a motion that another one could explain more beyond chance."""
+    return bool(np.count_nonzero(~_explained(motion, matches, intrinsics)) > DECISIVE)
+
+
+def _explained(motion: np.ndarray, matches: PointMatches, intrinsics: np.ndarray) -> np.ndarray:
+    return pinhole.epipolar_distance(matches.pixels_i, matches.pixels_j, motion, intrinsics) < EXPLAINED_GATE
 
 
 def usual_step(keyframes: tuple[Keyframe, ...], frame: int) -> float:
