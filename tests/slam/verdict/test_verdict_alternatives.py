@@ -190,6 +190,22 @@ def test_halves_confirm_a_displacement_and_not_mistracked_corners(seed: int) -> 
     assert one.consequence.places == pytest.approx(np.sqrt(0.15**2 * 6 / COUNT * (1 - 6 / COUNT)), rel=0.3)
 
 
+@pytest.mark.parametrize(("count", "told"), [(8, False), (79, True)])
+def test_few_corners_that_jump_together_are_no_reason(count: int, told: bool) -> None:
+    """In one frame all corners but a few are lost, and these jump by 60 pixels: the free pose follows them, and both
+    halves of them agree. That is no reason for 8 corners, and one for all 79. Oracle: what was planted.
+    """
+    tracks = walk(COUNT).tracks()
+    there = np.flatnonzero(tracks.frame == 10)
+    kept = np.ones(len(tracks.frame), bool)
+    kept[there[count:]] = False
+    jump = np.zeros(tracks.pixels.shape)
+    jump[there[:count]] = [60.0, 0.0]
+    few = {name: getattr(tracks, name)[kept] for name in ("frame", "track", "depth", "readout")}
+    found = contradiction(explain(replace(tracks, **few, pixels=(tracks.pixels + jump)[kept])), True)
+    assert (found is not None and found.size >= 1) is told
+
+
 def test_what_the_run_states_as_its_error_contradicts_nothing() -> None:
     """Without depth, places that are off by 8 % of their extent are reported where the run states to know them to 1 %,
     and not where it states 10 %. Oracle: what was planted, beyond the limit of 6 %.

@@ -124,7 +124,7 @@ class Unknowns:
 @dataclass(frozen=True, eq=False)
 class Linear:
     """Residuals, whitened, [m, 3], robust weights [m, 3], derivatives by pose [m, 3, 6], point [m, 3, 3] and
-    calibration [m, 3, SIZE]; energy: minus twice the robust log likelihood.
+    calibration [m, 3, SIZE]; loss: minus twice the robust log likelihood of each corner with its depth, [m].
     """
 
     residual: np.ndarray
@@ -132,7 +132,12 @@ class Linear:
     by_pose: np.ndarray
     by_point: np.ndarray
     by_theta: np.ndarray
-    energy: float
+    loss: np.ndarray
+
+    @property
+    def energy(self) -> float:
+        """Sum of the loss."""
+        return float(self.loss.sum())
 
 
 def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
@@ -186,8 +191,8 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
     square = np.column_stack([np.sum(residual[:, :2] ** 2, 1), residual[:, 2] ** 2]) / KERNEL**2
     square[behind, 0] = (HUGE / KERNEL) ** 2
     weight = (1.0 / (1.0 + square))[:, [0, 0, 1]]
-    energy = KERNEL**2 * float(np.log1p(square).sum())
-    return Linear(residual, weight, whiten * by_pose, whiten * by_point, whiten * by_theta, energy)
+    loss = KERNEL**2 * np.log1p(square).sum(1)
+    return Linear(residual, weight, whiten * by_pose, whiten * by_point, whiten * by_theta, loss)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,9 +2,9 @@
 
 An explanation of a window (`alternatives.py`) is reported where
 
-- it is significant: two halves of the tracks, fitted apart, confirm its consequence by more than `SIGMAS` standard
-  deviations, those that the run itself states for its places included; an alternative beside free poses is added only
-  at the level of `SIGNIFICANCE`; and
+- it is significant: the tracks prefer it at the level of `SIGNIFICANCE`, and so they do an alternative beside free
+  poses; and two halves of the tracks, fitted apart, confirm its consequence by more than `SIGMAS` standard deviations,
+  those that the run itself states for its places included; and
 - it has a consequence: places differ from those of the run by more than `MAX_PLACE_ERROR` (without depth
   `MAX_PLACE_ERROR_SHARE` of the path's extent), or turns from frame to frame by more than `MAX_TURN_ERROR`.
 
@@ -23,6 +23,7 @@ from vggtgeo.slam.verdict.alternatives import Added, Explanation
 from vggtgeo.slam.verdict.claim import Claim, extent
 from vggtgeo.slam.verdict.consequence import Consequence, confirmed, difference
 from vggtgeo.slam.verdict.finding import Finding
+from vggtgeo.slam.verdict.noise import preferred
 from vggtgeo.slam.verdict.thresholds import (
     MAX_DEPTH_NOISE,
     MAX_PLACE_ERROR,
@@ -94,6 +95,7 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
         values = np.array([found.places, found.turn])
         sigmas = np.array([np.hypot(found.places_sigma, stated * around), found.turn_sigma])
         size = float(np.max(values / limits, where=values > SIGMAS * sigmas, initial=0.0))
+        size *= preferred(one.best)
     if cause is None and size < 1.0 and not one.added:
         return None
     named = one.added.alternative.name if one.added else "poses"

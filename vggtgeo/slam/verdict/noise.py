@@ -10,6 +10,9 @@
       V = H^-1 (sum_track G G' + sum_frame G G' - sum_o g_o g_o') H^-1,   G the sum of the scores of a cluster.
 
   `V H` is the number of observations that count as one.
+
+- A track that follows the wrong corner is wrong in all its frames, and free poses fit some of these. So likelihoods are
+  compared track by track (Vuong 1989): the sum of the gains must exceed what their scatter makes by chance.
 """
 
 from __future__ import annotations
@@ -17,9 +20,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
 
-from vggtgeo.slam.verdict.corner_adjustment import SIZE, Fit, Noise, reduce, solve
-from vggtgeo.slam.verdict.thresholds import MIN_PIXEL_NOISE, MIN_RELATIVE_DEPTH_NOISE
+from vggtgeo.slam.verdict.corner_adjustment import SIZE, Fit, Noise, reduce, solve, start_of
+from vggtgeo.slam.verdict.thresholds import MIN_PIXEL_NOISE, MIN_RELATIVE_DEPTH_NOISE, SIGNIFICANCE
 
 
 def with_own_noise(fit: Fit) -> Fit:
@@ -37,6 +41,15 @@ def estimated(fit: Fit) -> Noise:
     shared = residual[known, 2] * np.sqrt(tracks.depths[known])  # the error of a depth is common to its track
     depth = noise.depth * _deviation(shared) if known.any() else noise.depth
     return Noise(max(float(pixel), MIN_PIXEL_NOISE), max(depth, MIN_RELATIVE_DEPTH_NOISE))
+
+
+def preferred(fit: Fit) -> bool:
+    """Return whether the tracks prefer a fit with free poses to the claim, beyond chance, its unknowns paid for."""
+    tracks = fit.tracks
+    claim = solve(tracks, start_of(tracks), fit.noise, poses_free=False)
+    gain = tracks.sums(claim.linear.loss - fit.linear.loss)
+    unknowns = 6 * (len(tracks.rows) - 1) + fit.columns.shape[1]
+    return bool(gain.sum() - unknowns > norm.isf(SIGNIFICANCE) * np.sqrt(len(gain)) * gain.std())
 
 
 def _deviation(values: np.ndarray) -> float:
