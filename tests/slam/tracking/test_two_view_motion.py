@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import NamedTuple
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from vggtgeo.slam.run import default_roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 from vggtgeo.slam.tracking.evidence import Evidence, tangent
-from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput, unless_contradicted
+from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput, track, unless_contradicted
 from vggtgeo.slam.tracking.two_view_motion import two_view_motion, usual_step
 
 INTRINSICS = np.array([400.0, 400.0, 239.5, 134.5])
@@ -100,6 +101,16 @@ def test_a_motion_by_wrong_depths_is_replaced() -> None:
     )
     right = _tracked(keyframe, noisy, TRUE)
     assert unless_contradicted(right, _given(keyframe), keyframe, 0.3) is right
+
+
+def test_matches_are_kept_where_no_depth_is_known() -> None:
+    """A track that has no pose, for lack of depths, keeps the matches that contradict a pose by other keyframes."""
+    keyframe, matches = _views()
+    given = _given(keyframe)
+    roles = replace(given.roles, points=Mock(match=lambda features, other: matches))
+    found = track(replace(given, roles=roles), keyframe, None)
+    assert not found.accepted
+    assert found.matches is matches
 
 
 def _tracked(keyframe: Keyframe, matches: PointMatches, motion: np.ndarray) -> Track:

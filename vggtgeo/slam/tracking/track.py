@@ -248,7 +248,8 @@ def _placed(
     if needed and given.data.lines is not None:
         found, evidence = with_lines(found, prior, evidence, keyframe, given.data.lines, given.intrinsics, lines)
     if found is None:
-        return Track(keyframe, guess.pose, np.zeros((6, 6)), evidence, guess.result)
+        nothing = np.zeros((6, 6))
+        return Track(keyframe, guess.pose, nothing, evidence, guess.result, matches=located.with_unknown_depth)
     pose = rigid.orthonormal(found.motion @ keyframe.pose)
     track = _judged(pose, found.information, evidence, keyframe, given.prior)
     track = replace(track, matches=located.with_unknown_depth)
