@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bad_rows_maps import state
 from reported import raises
+from tiny_state import state
 from vggtgeo.models.onnx.bounds import Refusals
 
 from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, RunSoFar, load_checkpoint
