@@ -158,28 +158,6 @@ def test_a_held_pose_in_another_frame_is_named() -> None:
     assert float(_diagnosed(PROBLEM.with_term(relative), truth).saved[-1]) == 0  # feels no common motion
 
 
-def test_positions_beyond_the_digits_are_refused() -> None:
-    # Proves that positions coarser than the matches are refused by `pack`, and those coarser than a fix fail the solve;
-    # and that double precision and far scenes are taken. Oracle: a step of eps times the distance, in pixels.
-    seen, guess = WINDOW.observations, (WINDOW.intrinsics, WINDOW.observations.depth_mean)
-    poses = np.asarray(WINDOW.start.wxyz_xyz if hasattr(WINDOW.start, "wxyz_xyz") else WINDOW.start, float)
-    far = poses.copy()
-    far[:, 4:] += np.array([692_345.0, 5_336_012.0, 519.0])
-    with pytest.raises(vg.InputError, match="`poses`"):
-        vg.pack(seen, far, *guess, dtype=jnp.float32)
-    vg.pack(seen, far, *guess, dtype=jnp.float64)
-    vg.pack(seen, far, guess[0], guess[1] * 1e-5, dtype=jnp.float32)
-    near = poses.copy()
-    near[:, 4:] += np.array([3000.0, 0.0, 0.0])
-    problem, start, _ = vg.pack(seen, near, *guess, dtype=jnp.float32, fixed_intrinsics=True)
-    position = jnp.asarray(start.poses.inverse().translation())
-    for sigma, share in ((1e-2, 0.0), (1e-5, 1.0)):
-        fix = Fix(keyframe=[0, 1, 2], position=position, weight=jnp.full(3, sigma**-2, jnp.float32))
-        found = _diagnosed(problem.with_term(fix), start)
-        assert float(found.unresolved[-1]) == share
-        assert float(found.unresolved[0]) == 0
-
-
 def test_a_solve_without_diagnosis_is_the_same_solve() -> None:
     """The state is equal to the last digit, and the message is that of the termination; oracle: the solve with it."""
     problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()

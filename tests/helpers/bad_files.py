@@ -93,18 +93,6 @@ def video(path: Path, count: int = 12, walk: bool = False) -> Path:
     return path
 
 
-def holed_video(folder: Path) -> Path:
-    """A video whose data are zeros from four tenths to half, as a download in pieces leaves them."""
-    whole = bytearray(video(folder / "clip.mp4", 40, walk=True).read_bytes())
-    start = whole.index(b"mdat") + 4
-    length = int.from_bytes(whole[start - 8 : start - 4], "big") - 8
-    hole = slice(start + length * 4 // 10, start + length * 5 // 10)
-    whole[hole] = bytes(hole.stop - hole.start)
-    (folder / "clip.mp4").write_bytes(whole)
-    (folder / "calibration.txt").write_text("55 55 31.5 23.5")
-    return folder / "clip.mp4"
-
-
 def problem(**changes: Any) -> Callable[[Path], Path]:
     """A problem file of the flat layout with other arrays; None leaves one out; functions get what was there."""
 

@@ -8,12 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reported import raises
 
 import vggtgeo as vg
-from vggtgeo.datasets import Frame, without_depth
+from vggtgeo.datasets import Frame
 from vggtgeo.geometry import rigid
-from vggtgeo.io.errors import InputError
 from vggtgeo.learning import (
     Batch,
     ConfidenceNetwork,
@@ -107,15 +105,6 @@ def test_windows_of_a_recording_are_right_where_the_truth_is_exact() -> None:
     error, _ = error_and_gradient(chosen, jnp.where(chosen.right, 1.0, MIN_CONFIDENCE))
     start = np.linalg.norm(window.start[1:, 4:] - window.poses[1:, 4:], axis=1)
     assert float(error) < 0.5 * start.max(), (float(error), start)
-
-
-def test_recordings_without_depth_or_truth_are_refused() -> None:
-    """What lacks is named; oracle: the sentences."""
-    sequence = vg.simulate("room", 30, 101, (160, 120))
-    with pytest.raises(InputError, match="has no depth"):
-        next(recorded_windows(without_depth(sequence), 1))
-    with raises(30, 37):
-        next(recorded_windows(sequence, 1, spacing=12))
 
 
 @pytest.mark.long

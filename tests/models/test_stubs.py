@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from reported import raises
 from synthetic_room import room
 from vggtgeo.models.roles import DenseConfidence, LineDetector, MetricDepth, PointMatcher, WindowGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
@@ -53,20 +52,6 @@ def test_answers_depend_on_seed_and_frames_not_on_the_order_of_calls(oracle: Sim
     late, early = moge.estimate(images[9]).depth, moge.estimate(images[2]).depth
     assert np.array_equal(SimulatedMoge(oracle, seed=1).estimate(images[2]).depth, early)
     assert np.array_equal(SimulatedMoge(oracle, seed=1).estimate(images[9]).depth, late)
-
-
-def test_an_unknown_image_is_refused(oracle: SimulatedOracle) -> None:
-    # An image that the oracle has not given raises an error that says so.
-    with raises("image", error=ValueError):
-        SimulatedMoge(oracle).estimate(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
-
-
-def test_wrong_settings_are_named(oracle: SimulatedOracle) -> None:
-    # A negative deviation is refused by name.
-    with raises("noise", error=ValueError):
-        SimulatedMast3r(oracle, noise=-1.0)
-    with raises("error", error=ValueError):
-        SimulatedMoge(oracle, error=float("nan"))
 
 
 def test_smooth_fields_have_unit_variance_and_memory() -> None:

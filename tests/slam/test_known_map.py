@@ -29,7 +29,6 @@ from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.known_map import as_map, entered, save_map
 from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.state_file import save_state
 from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.judge import judge
@@ -173,30 +172,6 @@ def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
     assert len(slam.tracker.waiting) == 6
     assert judge(slam).reasons[0].startswith("0 of 6 ")
     assert not Claim.of(first_half()).began_in_known_map
-
-
-def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
-    """Another camera, other images, no map, a state in place of a map: one sentence; oracle: the sentence."""
-    camera = sequence().camera
-    longer = replace(camera, intrinsics=(300.0, 300.0, 159.5, 119.5))
-    for other, named in (
-        (replace(camera, width=640), ("320 x 240", "640 x 240")),
-        (longer, ("266.2, 266.2, 159.5, 119.5", "300.0")),
-    ):
-        with raises("known_map", *named):
-            next(vg.run(sequence().frames(), ROLES, SETTINGS, camera=other, known_map=known))
-    with pytest.raises(vg.InputError, match=r"localise_only` .*`known_map`"):
-        vg.reconstruct(sequence(), ROLES, FIXED)
-    save_state(tmp_path / "state", first_half())
-    with raises(tmp_path / "state", "'map'"):
-        vg.load_map(tmp_path / "state")
-    slam = first_half()
-    with pytest.raises(vg.InputError, match="there is no keyframe to save"):
-        save_map(tmp_path / "map", replace(slam, map=replace(slam.map, keyframes=())))
-    read = object.__new__(Result)
-    object.__setattr__(read, "record", None)
-    with raises("save_map"):
-        read.save_map(tmp_path / "map")
 
 
 @pytest.mark.long

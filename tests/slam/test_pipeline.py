@@ -20,7 +20,6 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
 from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.summary import list_submaps
 from vggtgeo.simulation import simulate
@@ -436,11 +435,3 @@ def test_back_from_a_jump_the_window_is_of_one_submap(room) -> None:
     assert len(set(submap_of(slam.map)[list(slam.window.members)])) == 1
     jumped = {keyframe.number for keyframe in slam.keyframes if 8 <= keyframe.frame < 22}
     assert not [pair.key for pair in slam.map.pairs if len(jumped & set(pair.key)) == 1]
-
-
-def test_a_frame_of_another_size_is_named(room) -> None:
-    """An image whose size differs raises an error that names it, found and expected."""
-    frames, camera, _ = room
-    odd = replace(frames[1], image=frames[1].image[:-10], depth=None, name="odd.png")
-    with pytest.raises(InputError, match=r"`odd.png` is 320 x 230 pixels.*320 x 240"):
-        _run([frames[0], odd], camera)

@@ -142,14 +142,6 @@ def test_a_wrong_assignment_ends_the_program_before_it_runs(tmp_path: Path, assi
     assert not out.exists()
 
 
-def test_a_table_of_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
-    """A table with a name that is no group's ends the program; oracle: the list of groups."""
-    (tmp_path / "s.toml").write_text("frames = 3\n[track]\nmin_inliers = 3\n")
-    done = CliRunner().invoke(make_app(), ["demo", "--settings", str(tmp_path / "s.toml"), "-o", str(tmp_path / "out")])
-    assert done.exit_code == 2
-    assert f"`track` is no group of settings; it must be one of {', '.join(GROUPS)}" in done.stderr
-
-
 @pytest.mark.parametrize(
     ("table", "given", "assignments", "expected"),
     [
