@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import jax
@@ -12,14 +11,10 @@ import numpy as np
 
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.padding import PaddedSize
-from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.terms.term import check_width
 from vggtgeo.geometry.camera_models import AbstractCamera
-from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.given import check_real, check_whole, real_numbers
-
-MAX_PADDED = 10_000_000
-"""Largest number of rows of a padded array."""
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_real, real_numbers
 
 UNIT = 1e-3
 """Tolerance of unit length for quaternions and line normals: rounding of single precision and text files."""
@@ -261,25 +256,6 @@ def check_positive(name: str, values: np.ndarray, count: int) -> None:
     if np.any(bad):
         first = int(np.nonzero(bad)[0][0])
         raise InputError(f"`{name}[{first}]` must be positive and finite, got {values[first]}")
-
-
-def warn_if_far(inverse_depth: np.ndarray) -> None:
-    """Warn if most initial inverse depths are below the solver's bound, where the solve would end at once."""
-    far = int(np.sum(inverse_depth <= MIN_INVERSE_DEPTH))
-    if far > 0.5 * len(inverse_depth):
-        warnings.warn(
-            f"{far} of {len(inverse_depth)} landmarks start farther away than 1,000 km, the bound of inverse depths: "
-            "use a larger unit of length, such as metres",
-            InputWarning,
-            stacklevel=3,
-        )
-
-
-def check_whole_size(size: PaddedSize) -> None:
-    """Check that a padded size has whole numbers."""
-    for name in ("keyframes", "points", "lines", "degree", "edges", "samples", "rows"):
-        if getattr(size, name) is not None or name not in ("edges", "samples", "rows"):
-            check_whole(f"size.{name}", getattr(size, name), 0, MAX_PADDED)
 
 
 def check_size(size: PaddedSize, needed: PaddedSize) -> None:

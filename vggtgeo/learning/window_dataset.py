@@ -168,13 +168,6 @@ class WindowDataset:
             raise InputError(f"`{place}` is no complete folder of windows; write one first") from None
         if type(version) is not int or version != VERSION:
             raise InputError(f"`{place / _INDEX}` is of version {version!r:.20}; this program reads {VERSION}")
-        if type(count) is not int or count < 0:
-            raise InputError(f"`{place / _INDEX}` counts {count!r:.20} windows; expected a number: write it again")
-        for row in {0, count - 1} - {-1}:
-            if not (place / _name(row)).is_file():
-                raise InputError(f"`{place / _name(row)}` is not there, and `{_INDEX}` counts {count} windows")
-        if is_there(place / _name(count)):
-            raise InputError(f"`{place / _name(count)}` is there, and `{_INDEX}` counts {count} windows")
         return cls(place, count, tuple(terms))
 
     def __len__(self) -> int:
@@ -256,8 +249,6 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
 
     """
     check_kind("windows", windows, Sequence, "a list of windows, as `WindowDataset` gives them")
-    if not windows:
-        raise InputError("`windows` is empty; give at least one")
     for row, window in enumerate(windows):
         check_kind(f"windows[{row}]", window, LabelledWindow, "a window, as `WindowDataset` gives it")
         if _shapes(window) != _shapes(windows[0]):

@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
-from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
@@ -160,7 +159,6 @@ def covariances(
     """
     check_pair(problem, state)
     check_finite(state)
-    check_weights(problem)
     expected = "a result of `vggtgeo.choose_reduced_solver`"
     check_kind("reduced_solver", reduced_solver, AbstractReducedSolver | None, expected)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver

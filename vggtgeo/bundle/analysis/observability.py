@@ -37,7 +37,6 @@ from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
 from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import term_residuals, used_slots
@@ -91,7 +90,6 @@ def observability(problem: Problem, state: State) -> Observability:
     """
     check_pair(problem, state)
     check_finite(state)
-    check_weights(problem)
     if problem.num_keyframes <= DENSE_KEYFRAMES:
         known = _observability_jit(problem, state)
         check_linearisation(problem, state, jnp.all(jnp.isfinite(known.landmark_information)))

@@ -57,24 +57,6 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     return times, found
 
 
-def off_landmarks(slam: Slam, poses: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the reprojection errors of the final map in frames tracked by points alone, pixels [m], by row of the
-    frames.
-
-    Infinite for a landmark behind the camera. Frames with few matches are left out; empty before the last adjustment.
-    poses: of `frame_poses`.
-    """
-    if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
-        return {}
-    found, motions = {}, _motions(slam)
-    for row in _placed_by_points(slam):
-        points, pixels = _sight(slam, row, poses[row], motions)
-        if len(points) >= MIN_POINTS:
-            off = np.linalg.norm(rigid.project(points, poses[row], slam.intrinsics) - pixels, axis=1)
-            found[row] = np.where(points @ poses[row][2, :3] + poses[row][2, 3] > MIN_DEPTH, off, np.inf)
-    return found
-
-
 def _placed_by_points(slam: Slam) -> list[int]:
     return [row for row, record in enumerate(slam.frames) if record.seen is not None and record.tracked]
 

@@ -133,11 +133,6 @@ class Evidence:
         return self.dense_fair and (self.correlation >= STRONG_CORRELATION or surfaces)
 
     @property
-    def placed_by_surface(self) -> bool:
-        """Whether image and surface alone constrain the pose in all directions."""
-        return self.dense_strong and self.sigma_translation < BARE_SIGMA
-
-    @property
     def bare_surface(self) -> bool:
         """Whether surfaces alone constrain the pose in an image without texture."""
         seen = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP
