@@ -40,7 +40,7 @@ def test_the_paper_is_what_it_was() -> None:
     assert len(jobs) == 103
     full = next(job for job in jobs if (job.sequence, job.setting) == ("corridor", "full"))
     assert full.spec["set"]["keyframes"]["keyframe_distance"] == 0.5
-    assert full.spec["set"]["weights"] == {"confidence_gain": 4.0, "confidence_floor": 0.5}
+    assert full.spec["set"]["weights"] == {"confidence": "paper"}
     assert full.spec["set"]["refinement"] == {"global_adjustment": False}
     assert full.spec["key_points"] == 600
 
@@ -60,14 +60,14 @@ def test_suites_hold_what_the_paper_was_measured_on() -> None:
 def test_runs_are_settings_upon_the_sequence_upon_the_suite() -> None:
     # Proves the order in which settings of the pipeline are laid over each other, and seeds. Oracle: by hand.
     text = tiny.TEXT.replace("seeds = 3", "seeds = 3\nfirst_seed = 7")
-    text = text.replace("\n[[seq", "\n[set.window]\nsize = 6\nwindow_iterations = 5\n\n[[seq", 1)
+    text = text.replace("\n[[seq", "\n[set.window]\nsize = 6\npoint_slots = 50\n\n[[seq", 1)
     text = text.replace("frames = 4 }\n\n[[seq", "frames = 4 }\n[sequence.set.window]\nsize = 7\n\n[[seq", 1)
-    text += "[setting.set.window]\nwindow_iterations = 4\n"
+    text += "[setting.set.window]\npoint_slots = 40\n"
     jobs = tiny.jobs(text)
     assert [job.name for job in jobs[:4]] == ["walk.full.7", "walk.bare.7", "walk.full.8", "walk.bare.8"]
     walk, bare = jobs[0].spec["set"], jobs[1].spec["set"]
-    assert walk == {"window": {"size": 7, "window_iterations": 5}}
-    assert bare == {"line": {"use_lines": False}, "window": {"size": 7, "window_iterations": 4}}
+    assert walk == {"window": {"size": 7, "point_slots": 50}}
+    assert bare == {"line": {"use_lines": False}, "window": {"size": 7, "point_slots": 40}}
 
 
 def test_a_fingerprint_changes_with_what_a_result_depends_on(tmp_path: Path) -> None:

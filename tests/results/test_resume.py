@@ -116,9 +116,9 @@ def test_only_the_same_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     oracle: the sentence."""
     before = killed(monkeypatch, tmp_path / "kept", 2)
     content = before.path.read_bytes()
-    window = replace(SETTINGS, window=replace(SETTINGS.window, window_iterations=9))
+    window = replace(SETTINGS, window=replace(SETTINGS.window, point_slots=97))
     for options, sentence in (
-        ({"settings": window}, "`window.window_iterations` is 9.* 8"),
+        ({"settings": window}, "`window.point_slots` is 97.* 96"),
         ({"roles": replace(ROLES, flow=None)}, "`flow` .*PatchFlow"),
         ({"seed": 1}, "`seed` is 1.* 0"),
         ({"end": 4}, r"`start, end, stride` is \(0, 4, 1\).*\(0, None, 1\)"),

@@ -43,7 +43,7 @@ from vggtgeo.slam.window_steps import adjust_window, camera_prior
 SIZE = (320, 240)
 # One small window shape for all tests of this file, so that the solver is compiled once.
 SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    window=WindowSettings(size=4, point_slots=96, line_slots=48),
     refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
@@ -158,7 +158,7 @@ def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: floa
     settings = updated(
         SETTINGS,
         {
-            "refinement": {"global_adjustment": True, "global_iterations": 20},
+            "refinement": {"global_adjustment": True},
             "depth_terms": {"surface_points": surfaces},
         },
     )
@@ -173,9 +173,7 @@ def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
     """Compiled for a map of so many keyframes, the solver of the last adjustment is not compiled again; oracle: how
     many programs of it were prepared.
     """
-    settings = updated(
-        SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 2, "global_rounds": 1}}
-    )
+    settings = updated(SETTINGS, {"refinement": {"global_adjustment": True, "global_rounds": 1}})
     kept = lambda: solve_jit.prepared
     before = kept()
     compile_global(shape_for(len(tracked.keyframes), 0, settings), settings)
@@ -205,7 +203,7 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
     """
     middle, settings = (
         len(tracked.keyframes) // 2,
-        updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth_terms": {"surface_points": 0.0}}),
+        updated(SETTINGS, {"depth_terms": {"surface_points": 0.0}}),
     )
     apart = _shaken(tracked, 0.05, 2.0, from_keyframe=middle, together=True)
     within = [pair for pair in apart.map.pairs if (pair.first < middle) == (pair.second < middle)]
@@ -241,7 +239,7 @@ def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
     """A second visit 3 m and 40 degrees away, where no keyframe should see what the first visit saw: what it looks like
     finds it, and a pose graph brings it back before the adjustment. Oracle: the keyframes of the first visit.
     """
-    settings = updated(SETTINGS, {"refinement": {"global_iterations": 20}, "depth_terms": {"surface_points": 0.0}})
+    settings = updated(SETTINGS, {"depth_terms": {"surface_points": 0.0}})
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_rotvec(np.deg2rad(40.0) * np.array([0.2, 0.97, 0.1])).as_matrix()
     motion[:3, 3] = 2.0, 0.5, -2.0

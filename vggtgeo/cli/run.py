@@ -111,7 +111,7 @@ def tables_of_switches(switches: SwitchOptions, options: RunOptions) -> dict[str
     depth_weight = DepthSettings.depth_weight if switches.depth_prior else 0.0
     tables: dict[str, Tables] = {
         "no_lines": {"line": {"use_lines": not switches.no_lines}},
-        "no_confidence": {"weights": {"use_confidence": not switches.no_confidence}},
+        "no_confidence": {"weights": {"confidence": "none" if switches.no_confidence else "measured"}},
         "depth_prior": {"depth_terms": {"depth_weight": depth_weight}},
         "global_adjustment": {"refinement": {"global_adjustment": switches.global_adjustment}},
         "refine_intrinsics": {"camera": {"refine_intrinsics": REFINE[switches.refine_intrinsics]}},

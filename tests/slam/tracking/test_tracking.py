@@ -41,7 +41,7 @@ from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingI
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
 SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    window=WindowSettings(size=4, point_slots=96, line_slots=48),
     refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
@@ -423,7 +423,7 @@ def test_submaps_join_where_they_meet(room: Room) -> None:
     assert any("a new submap" in note for note in slam.notes), slam.notes
     assert any("is joined to the one before" in note for note in slam.notes), slam.notes
     assert len(slam.map.roots) == 1
-    slam = finish(slam, ROLES, updated(SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 10}}))
+    slam = finish(slam, ROLES, updated(SETTINGS, {"refinement": {"global_adjustment": True}}))
     times = np.arange(len(numbers)) / 10
     assert _error(slam, Trajectory(times, truth.poses[numbers])) < 0.04
 
