@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -10,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import tiny_suites as tiny
-from conftest import ROOT
 
 from vggtgeo.benchmark.processes import Limits, run_limited, shares
 from vggtgeo.benchmark.provenance import provenance
@@ -120,34 +118,6 @@ def test_changed_settings_and_code_are_run_again(tmp_path: Path) -> None:
     (store.place(jobs[0]) / "row.json").write_text("{}")
     with pytest.raises(InputError, match="delete it"):
         store.load(jobs[0])
-
-
-@pytest.mark.long
-def test_a_driver_that_dies_goes_on_where_it_was(tmp_path: Path) -> None:
-    # Proves that after SIGKILL of the driver a second call does the rest only, and that no run is lost or done twice
-    # but the one that was going on. Oracle: the list of starts.
-    code = (
-        f"import sys; sys.path[:0] = [{str(ROOT / 'tests' / 'helpers')!r}, {str(ROOT)!r}]\n"
-        "import tiny_suites as tiny\nfrom pathlib import Path\n"
-        "from vggtgeo.benchmark.processes import Limits\nfrom vggtgeo.benchmark.runner import all_rows\n"
-        "from vggtgeo.benchmark.store import Store\n"
-        f"store = Store(Path({str(tmp_path)!r}), 'tiny', 's')\n"
-        "all_rows(tiny.jobs(), store, Limits(20, 2), command=tiny.worker('time.sleep(0.2)'))\n"
-    )
-    driver = subprocess.Popen([sys.executable, "-c", code])
-    while len(list(tmp_path.glob("runs/*/row.json"))) < 4:
-        assert driver.poll() is None
-        time.sleep(0.02)
-    driver.kill()
-    driver.wait()
-    time.sleep(0.4)  # the run that was going on is a stand-in, which does not watch its parent
-    finished = {path.parent.name for path in tmp_path.glob("runs/*/row.json")}
-    rows = all_rows(tiny.jobs(), Store(tmp_path, "tiny", "s"), LIMITS, command=tiny.worker())
-    assert [row["status"] for row in rows] == ["ok"] * 12
-    starts = Counter((tmp_path / "starts.txt").read_text().split())
-    assert set(starts) == {job.name for job in tiny.jobs()}
-    assert all(starts[name] == 1 for name in finished)
-    assert sum(starts.values()) <= 13
 
 
 def test_a_walk_is_rendered_by_one_run_and_goes_with_the_last(tmp_path: Path) -> None:

@@ -78,10 +78,6 @@ def test_a_derivative_that_is_not_finite_is_found() -> None:
             function(bad, START)
     inside = jax.jit(vg.covariances)(bad, START)
     assert np.isnan(inside.poses).all()
-    window = bad.with_term(vg.empty_prior(3))
-    with pytest.raises(vg.InputError, match="`range`"):
-        vg.marginalise(window, START, jnp.asarray(0))
-    assert np.isnan(jax.jit(vg.marginalise)(window, START, jnp.asarray(0)).root).all()
 
 
 def test_a_solve_says_what_is_not_finite() -> None:

@@ -219,33 +219,6 @@ def test_colours_are_shown_as_those_of_the_pictures(
     np.testing.assert_array_equal(shown(tmp_path / "out"), own(run))
 
 
-@pytest.mark.long
-def test_every_frame_with_its_picture(tmp_path: Path) -> None:
-    # Proves that frames which are no keyframes are in the exports, with their poses, pictures and depth, once the run
-    # kept them. Oracle: the run's trajectory and frames; pycolmap, whose reprojection error stays the stated one.
-    run, frames = recorded_run(), recorded_run().sequence
-    result = vg.Result.of(run.slam)
-    folder = tmp_path / "room"
-    result.save(folder, depth="every", frames=frames)
-    scene = Scene.load(folder)
-    assert scene.frames.tolist() == [record.frame for record in run.slam.frames]
-    np.testing.assert_allclose(np.linalg.inv(scene.poses), result.trajectory.poses, atol=1e-9)
-    export(folder, "nerfstudio", tmp_path / "n")
-    written = json.loads((tmp_path / "n/transforms.json").read_text())["frames"]
-    assert len(written) == len(scene.frames) > len(run.slam.keyframes)
-    assert all((tmp_path / "n" / frame["depth_file_path"]).is_file() for frame in written)
-    true = np.array([frame.image for frame in frames.frames()], int)
-    for row, read in enumerate(open_sequence(tmp_path / "n").frames()):
-        assert np.abs(true - read.image).mean(axis=(1, 2, 3)).argmin() == row
-    stated = export(folder, "colmap", tmp_path / "c")
-    pycolmap = pytest.importorskip("pycolmap")
-    model = pycolmap.Reconstruction(str(tmp_path / "c/sparse/0"))
-    assert model.num_images() == len(scene.frames)
-    model.update_point_3d_errors()
-    error = stated["mean_reprojection_error_over_points_px"]
-    assert model.compute_mean_reprojection_error() == pytest.approx(error, abs=1e-3)
-
-
 def test_borders_that_no_pixel_fills_are_masked(tmp_path: Path) -> None:
     # Proves that both formats say which pixels an undistorted picture made up, and neither does where there are none.
     result = vg.Result.of(recorded_run().slam)

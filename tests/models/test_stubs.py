@@ -39,21 +39,6 @@ def test_stubs_fulfil_their_roles_and_say_that_they_are_simulated(oracle: Simula
     assert all(stub.simulated for stub in (matcher, lines, depth, confidence, window))
 
 
-@pytest.mark.long
-def test_answers_depend_on_seed_and_frames_not_on_the_order_of_calls(oracle: SimulatedOracle, images: list) -> None:
-    # A second, fresh stub asked in another order gives the same bytes; another seed gives others.
-    one, two, other = (SimulatedMast3r(oracle, seed=seed, count=200) for seed in (1, 1, 2))
-    first = one.match(one.describe(images[3]), one.describe(images[5]))
-    two.match(two.describe(images[7]), two.describe(images[8]))
-    again, different = (s.match(s.describe(images[3]), s.describe(images[5])) for s in (two, other))
-    assert np.array_equal(first.pixels_j, again.pixels_j)
-    assert not np.array_equal(first.pixels_j[:10], different.pixels_j[:10])
-    moge = SimulatedMoge(oracle, seed=1)
-    late, early = moge.estimate(images[9]).depth, moge.estimate(images[2]).depth
-    assert np.array_equal(SimulatedMoge(oracle, seed=1).estimate(images[2]).depth, early)
-    assert np.array_equal(SimulatedMoge(oracle, seed=1).estimate(images[9]).depth, late)
-
-
 def test_smooth_fields_have_unit_variance_and_memory() -> None:
     # Over many seeds: mean 0, variance 1, and correlation exp(-(t / memory)^2 / 2) after t, to 4 standard errors.
     count, memory = 500, 1.5
@@ -82,16 +67,6 @@ def test_simulated_depth_has_the_stated_errors(oracle: SimulatedOracle, images: 
     assert np.quantile(steps, 0.5) < 0.003, f"{np.quantile(steps, 0.5)=}"
     exact = SimulatedMoge(oracle, error=0.0, wobble=0.0).estimate(images[0])
     assert np.abs(exact.depth - oracle.depth(0)).max() < 1e-5
-
-
-@pytest.mark.long
-def test_simulated_depth_wobbles_in_scale_from_frame_to_frame(oracle: SimulatedOracle, images: list) -> None:
-    # With the smooth error off, each frame is off by one factor, whose logarithm has the stated deviation.
-    moge = SimulatedMoge(oracle, error=0.0, wobble=0.05)
-    scales = np.array([np.log(moge.estimate(image).depth / oracle.depth(EVERY * k)) for k, image in enumerate(images)])
-    assert scales.std(axis=(1, 2)).max() < 1e-5
-    deviation = scales[:, 0, 0].std()
-    assert abs(deviation / 0.05 - 1) < 4 / np.sqrt(2 * len(images)), f"{deviation=}"
 
 
 def test_simulated_matches_have_the_stated_noise_gaps_and_outliers(oracle: SimulatedOracle, images: list) -> None:

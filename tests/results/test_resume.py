@@ -75,7 +75,7 @@ def undisturbed() -> Run:
         return run(monkeypatch)
 
 
-@pytest.mark.parametrize("frame", [5, *(pytest.param(k, marks=pytest.mark.long) for k in (1, FRAMES - 1))])
+@pytest.mark.parametrize("frame", [5, pytest.param(FRAMES - 1, marks=pytest.mark.long)])
 def test_a_resumed_run_ends_as_an_undisturbed_one(
     frame: int, undisturbed: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -89,26 +89,6 @@ def test_a_resumed_run_ends_as_an_undisturbed_one(
     assert plain(again) == plain(undisturbed)
     assert len(again.evidence) == FRAMES
     assert len(again.result.record.windows) == len(undisturbed.result.record.windows) > 1
-
-
-@pytest.mark.long
-def test_a_run_is_killed_again_and_again(undisturbed: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A resumed run keeps its state, too, and is resumed after its last frame; oracle: the undisturbed run, and the
-    seconds, which add up.
-    """
-    before = killed(monkeypatch, tmp_path / "kept", 3)
-    with pytest.raises(Killed):
-        run(monkeypatch, before, callbacks=[KilledAfter(6)])
-    monkeypatch.setattr(reconstruction, "finish", lambda *_: (_ for _ in ()).throw(Killed))
-    with pytest.raises(Killed):
-        run(monkeypatch, before)
-    monkeypatch.undo()
-    assert frames_kept(before.path) == f"{FRAMES} frames"
-    kept, _ = CHECKPOINT.read(before.path)
-    again = run(monkeypatch, before)
-    assert list(differences(undisturbed.result.record, again.result.record)) == []
-    assert again.result.summary["seconds_by_stage"]["all"] > kept.whole > kept.tracking > 0
-    assert again.result.summary["seconds_by_stage"]["track"] == pytest.approx(kept.seconds["track"], abs=1e-3)
 
 
 def test_only_the_same_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,16 +75,15 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("preset", ["paper", "light"])
 def test_a_run_asks_every_network_and_from_a_cache_none(
-    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int], preset: str
+    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
 ) -> None:
     # Proves that a whole run goes through every network of the preset and no other, that its result is finite, and
     # that a second run with the same cache asks none and gives the same. Oracle: a count, and the first trajectory.
     settings = SlamSettings(refinement=GlobalMapSettings(global_adjustment=False))
     poses = []
-    for expected in (set(NEEDED[preset]), set()):
-        found = perception(preset, Roles(), files, tmp_path / "cache")
+    for expected in (set(NEEDED["paper"]), set()):
+        found = perception("paper", Roles(), files, tmp_path / "cache")
         counted.clear()
         *_, slam = run(walk, found.roles, settings)
         assert set(counted) == expected
