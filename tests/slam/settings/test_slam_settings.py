@@ -128,7 +128,7 @@ def test_no_group_has_the_name_of_a_flag() -> None:
         ("min_inliers=20", "`min_inliers` is no setting; the nearest is `keyframes.min_inliers`"),
         ("window.window=4", "`window.window` is no setting; the nearest is `window.size`"),
         ("window.size", "`window.size` sets nothing; write `group.field=value`"),
-        ("window.size=four", "`window.size` is 'four'; it must be a whole number from 3 to 1000"),
+        ("window.size=four", "`window.size` is 'four'; it must be a whole number from 3 to 1000000"),
         ("line.use_lines=1", "`line.use_lines` is 1; it must be true or false"),
         ("window.kernel=tukey 3", "`window.kernel` is 'tukey 3'; it must be one of barron, cauchy"),
     ],

@@ -16,6 +16,7 @@ from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.evidence import tangent
@@ -28,8 +29,8 @@ WIDTH, MAX_WIDTH = 1.0, 8.0
 """Width of the Geman-McClure kernel, pixels: final and initial, halved in each step. A redescending kernel, because
 matches may be off by as much as the gate of tracking, some pixels (`benchmarks/between_keyframes.py`)."""
 STEPS, CONVERGED = 15, 1e-5
-MIN_DEPTH, MAX_DEPTH = 0.1, 1e6
-"""Range of the depths that are used, in map units."""
+MAX_DEPTH = 1e6
+"""Largest depth that is used, in map units; the smallest is that of depth sensors."""
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:

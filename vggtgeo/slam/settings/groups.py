@@ -164,8 +164,7 @@ class WindowSettings(CheckedSettings):
     """The keyframes that are adjusted together while the run goes on.
 
     Fields:
-        size: Number of keyframes adjusted together. Memory grows with its square: each may see the points of each,
-            30 GB at the most.
+        size: Number of keyframes adjusted together. Memory grows with its square: each may see the points of each.
         point_slots: Points of a keyframe, at most.
         line_slots: Line samples of a keyframe, at most.
         kernel: Robust kernel of points and lines, in the last adjustment too; widths in pixels.
@@ -178,9 +177,9 @@ class WindowSettings(CheckedSettings):
     """
 
     group: ClassVar[str] = "window"
-    size: int = whole(10, at_least=3, at_most=1000)
-    point_slots: int = whole(320, at_least=1, at_most=100_000)
-    line_slots: int = whole(192, at_least=1, at_most=100_000)
+    size: int = whole(10, at_least=3)
+    point_slots: int = whole(320, at_least=1)
+    line_slots: int = whole(192, at_least=1)
     kernel: AbstractKernel = field(
         default_factory=lambda: Cauchy(jnp.asarray(2.0)), metadata={"expected": Expected(_KERNEL, is_kernel)}
     )
