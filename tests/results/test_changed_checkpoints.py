@@ -39,14 +39,6 @@ def test_an_unchanged_one_is_read(tmp_path: Path) -> None:
     assert len(found.slam.frames) == 1
 
 
-def test_a_state_that_does_not_fit(tmp_path: Path) -> None:
-    """What is wrong with the state ends with what to do, too."""
-    slam = run().slam
-    kept = run(slam=replace(slam, tracker=replace(slam.tracker, velocity=np.full((4, 4), np.nan))))
-    with raises("`velocity`", 16):
-        asked(tmp_path, kept, FACTS)
-
-
 def test_a_setting_that_differs_is_named(tmp_path: Path) -> None:
     """The shortest of those that differ is named, with both values."""
     CHECKPOINT.write(tmp_path / "kept.npz", run(), {**FACTS, "identity": {"points": "Matcher(seed=0)", "seed": "0"}})

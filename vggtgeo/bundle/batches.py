@@ -127,14 +127,6 @@ def solve_batch(
 
     """
     check_kinds(problems, initials, "initials")
-    count = len(initials.intrinsics)
-    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((problems, initials))}
-    if lengths != {(count,)}:
-        found = ", ".join(str(length[0]) if length else "none" for length in sorted(lengths))
-        raise InputError(
-            f"`problems` and `initials` must have one number of windows in all arrays, got {found}: pass both as "
-            "returned by `vggtgeo.batches.pack_batch`"
-        )
     if at_once is not None:
         check_whole("at_once", at_once, 1)
     platform = devices[0].platform if devices else jax.default_backend()

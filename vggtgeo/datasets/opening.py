@@ -1,6 +1,7 @@
 """Choice of the reader of a path."""
 
 import os
+import warnings
 from pathlib import Path
 from typing import Protocol
 
@@ -25,7 +26,7 @@ from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.views import with_rate
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import path_of
 
 
@@ -149,6 +150,8 @@ def _open_folder(place: Path, kind: str | None) -> Sequence:
         raise InputError(f"`{place}` holds the result of a run; give the recording that it was made of")
     for reader in FOLDER_KINDS.values():
         if reader.matches(place):
+            if dead:
+                warnings.warn(f"`{place}`: {dead}", InputWarning, stacklevel=4)
             return reader.open(place)
     names = sorted(path.name for path in place.iterdir())
     other = next((name for name in names if Path(name).suffix.lower() in OTHER_PICTURES | ARCHIVES), None)

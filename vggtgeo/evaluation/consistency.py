@@ -63,6 +63,10 @@ def consistency(
         raise InputError(
             f"`errors` has shape {errors.shape}, `covariances` {covariances.shape}; expected [n, k] and [n, k, k]"
         )
+    if not 0 < level < 1:
+        raise InputError(f"`level` must be between 0 and 1, got {level}")
+    if not (np.isfinite(errors).all() and np.isfinite(covariances).all()):
+        raise InputError("`errors` and `covariances` must be finite; leave rows with NaN or infinity out")
     try:
         factors = np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:
@@ -91,6 +95,11 @@ def pose_consistency(
     place_sigma = real_array("place_sigma", place_sigma, (None,))
     rotation_sigma = real_array("rotation_sigma", rotation_sigma, (None,))
     check_positive("scale", scale, "factor")
+    if not len(estimate) == len(place_sigma) == len(rotation_sigma):
+        raise InputError(
+            f"`place_sigma` and `rotation_sigma` must have {len(estimate)} entries, one per pose of `estimate`, got "
+            f"{len(place_sigma)} and {len(rotation_sigma)}"
+        )
     rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)
     found, true = (
         rigid.invert(poses[:1]) @ poses if len(poses) else poses

@@ -137,11 +137,6 @@ def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
     if bad.any():
         raise InputError(f"pose {int(np.argmax(bad))} of {count} must have a rotation in its upper left 3 x 3 block")
     bad = np.abs(poses[:, 3] - np.eye(4)[3]).max(axis=1, initial=0.0) > _ROTATION_TOLERANCE
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(
-            f"pose {row} of {count} has the last row {poses[row, 3].tolist()}; expected 0, 0, 0, 1: is it transposed?"
-        )
 
 
 def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:

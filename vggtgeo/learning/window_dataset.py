@@ -208,8 +208,6 @@ class WindowDataset:
             if value is not None:
                 check_whole(name, value)
         check_kind("share", share, tuple, "(k, n) with 0 <= k < n")
-        if len(share) != 2:
-            raise InputError(f"`share` is {share!r:.60}; it must be (k, n) with 0 <= k < n")
         part, parts = share
         for value in share:
             check_whole("share", value)
@@ -251,8 +249,6 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
     check_kind("windows", windows, Sequence, "a list of windows, as `WindowDataset` gives them")
     for row, window in enumerate(windows):
         check_kind(f"windows[{row}]", window, LabelledWindow, "a window, as `WindowDataset` gives it")
-        if _shapes(window) != _shapes(windows[0]):
-            raise InputError(f"`windows[{row}]` has another padded shape, other terms or other labels than the first")
     stack: LabelledWindow = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
     return stack
 

@@ -200,11 +200,6 @@ def _check_large(problem: Problem, state: State) -> None:
             f"{asked} cannot run inside `jit` or `vmap`, since its sparse solver is scipy's: call it outside, or "
             f"{limit}"
         )
-    if state.inverse_depth.dtype != jnp.float64:
-        raise ValueError(
-            f"{asked} needs a `state` in float64, got {state.inverse_depth.dtype}, whose rounding errors hide weak "
-            "directions of a map of this size: set `jax_enable_x64` and pack again"
-        )
 
 
 class _Coordinates(NamedTuple):
