@@ -44,7 +44,8 @@ from vggtgeo.datasets import Sequence, open_sequence, without_depth
 from vggtgeo.evaluation.consistency import pose_consistency
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, with_depths
-from vggtgeo.slam.global_map.pose_uncertainty import CALIBRATION, CENTRE, DEPTH_SCALE, MOMENT
+from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
+from vggtgeo.slam.global_map.pose_uncertainty import CENTRE, DEPTH_SCALE, MOMENT
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import tangent
 
@@ -177,7 +178,7 @@ def _with_unseen_errors(recording: Recording, seed: int) -> Recording:
     that is not where it is said to be), and a moment for each image, drawn as they are stated.
     """
     rng = np.random.default_rng(seed)
-    longer, wider = np.exp(rng.normal(0.0, (DEPTH_SCALE, CALIBRATION)))
+    longer, wider = np.exp(rng.normal(0.0, (DEPTH_SCALE, FOCAL_SIGMA)))
     fx, fy, cx, cy = recording.camera.intrinsics
     camera = replace(recording.camera, intrinsics=(wider * fx, wider * fy, cx, cy))
     times = recording.truth.timestamps

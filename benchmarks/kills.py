@@ -25,7 +25,7 @@ from vggtgeo.simulation import simulate
 from vggtgeo.simulation.sequence import write_tum_folder
 
 PROGRAM = "from vggtgeo.cli import main; main()"
-SMALL = ("window.size=4", "window.point_slots=96", "window.line_slots=48", "window.window_iterations=8")
+SMALL = ("window.size=4", "window.point_slots=96", "window.line_slots=48")
 DIFFERS = ("seconds_by_stage", "frames_per_second", "frames_per_second_whole_run", "peak_memory_gb")
 """Of the summary: times and memory."""
 

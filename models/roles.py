@@ -328,11 +328,6 @@ class PoseQuery:
                 f"`window_images` has {len(self.window_images)} entries and `window_poses` "
                 f"{len(self.window_poses)}; give one pose for each image"
             )
-        if self.window_depths and len(self.window_depths) != len(self.window_images):
-            raise ValueError(
-                f"`window_depths` has {len(self.window_depths)} entries and `window_images` "
-                f"{len(self.window_images)}; give one depth for each image, or none"
-            )
 
 
 @dataclass(frozen=True)

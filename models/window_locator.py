@@ -43,10 +43,6 @@ class WindowLocator:
     least: int = 60
     parallax: float = float(np.deg2rad(1.0))
 
-    def __post_init__(self) -> None:
-        if self.views is not None and self.views < 2:
-            raise ValueError(f"`views` must be at least 2 (a keyframe and the frame), got {self.views}")
-
     def locate(self, query: PoseQuery) -> PoseGuess:
         """Return the pose of the query's frame; see `InitialGeometry.locate`."""
         predicted = self._predict(query)

@@ -36,7 +36,7 @@ SLAM_STAIR = (
     ("camera", "tracking", "window"),
     ("state",),
     ("callback", "keyframe_decision", "pending_window", "recorded_prior", "submaps", "window_steps"),
-    ("state_checks", "window_recorder"),
+    ("window_recorder",),
     ("global_map",),
     ("manhattan", "start"),
     ("pipeline",),

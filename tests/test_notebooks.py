@@ -18,8 +18,7 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 LONGEST_CELL = 25
 WINDOW = "size=6, point_slots=160, line_slots=64)"
 SMALL_WINDOW = (
-    "size=4, point_slots=96, line_slots=48, window_iterations=8), "
-    "refinement=vg.settings.GlobalMapSettings(global_adjustment=False)"
+    "size=4, point_slots=96, line_slots=48), refinement=vg.settings.GlobalMapSettings(global_adjustment=False)"
 )
 QUICK = ("solve",)
 # What the shorter run replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.

@@ -1,4 +1,4 @@
-"""The package imports from anywhere, as a wheel and editable, and collides with nobody's folders."""
+"""The package imports from anywhere as a wheel, and collides with nobody's folders."""
 
 import re
 import shutil
@@ -106,16 +106,11 @@ def wheel(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(folder.glob("*.whl"))
 
 
-@pytest.fixture(scope="module", params=["wheel", "editable"])
-def installation(
-    request: pytest.FixtureRequest, source: Path, wheel: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Installation:
-    folder = tmp_path_factory.mktemp(request.param)
-    if request.param == "wheel":
-        _pip_install("--target", folder, wheel)
-        return Installation(folder, f"sys.path.append({str(folder)!r})")
-    _pip_install("--target", folder, "--no-build-isolation", "--editable", source)
-    return Installation(source, f"site.addsitedir({str(folder)!r})")
+@pytest.fixture(scope="module")
+def installation(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    folder = tmp_path_factory.mktemp("installed")
+    _pip_install("--target", folder, wheel)
+    return Installation(folder, f"sys.path.append({str(folder)!r})")
 
 
 @pytest.fixture

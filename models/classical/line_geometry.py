@@ -34,8 +34,6 @@ def sample_segments(endpoints: np.ndarray, spacing: float = 10.0) -> tuple[np.nd
     float64 [s] in [0, 1], the position from end 0 to end 1. A segment of length l has floor(l / spacing) + 1.
     """
     check_array("endpoints", endpoints, (None, 2, 2))
-    if not spacing > 0:
-        raise ValueError(f"`spacing` is {spacing}, expected a positive number of pixels")
     along = (endpoints[:, 1] - endpoints[:, 0]).astype(np.float64)
     length = np.linalg.norm(along, axis=1)
     counts = np.floor(length / spacing + 1e-9).astype(np.int64) + 1

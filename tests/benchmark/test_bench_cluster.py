@@ -8,8 +8,6 @@ import threading
 import time
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import tiny_suites as tiny
@@ -20,7 +18,6 @@ from vggtgeo.benchmark.cluster import Cluster, run_remotely
 from vggtgeo.benchmark.processes import Limits, claim_cores
 from vggtgeo.benchmark.runner import all_rows
 from vggtgeo.benchmark.store import Store
-from vggtgeo.benchmark.worker import NO_SPACE
 
 LIMITS = Limits(60.0, 2.0)
 SCRIPT = """
@@ -33,13 +30,6 @@ row |= {"status": "ok", "ate_se3_m": 0.01 * job["seed"], "frames": 4, "tracked":
 row |= {"protocol": job["spec"]["protocol"]}
 (folder / "row.json").write_text(json.dumps(row))
 """
-
-
-class Reference:
-    """What a stand-in for Ray gives for a task: its result."""
-
-    def __init__(self, found: Any) -> None:
-        self.found = found
 
 
 def command(folder: Path, scratch: Path) -> list[str]:
@@ -70,32 +60,6 @@ def test_runs_of_a_node_have_processors_of_their_own(tmp_path: Path) -> None:
             assert too_many == ()
     with claim_cores(len(there)) as again:
         assert again == tuple(there)
-
-
-def test_a_node_without_space_ends_the_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that a run whose node had no space left ends the batch as on one machine, and is run again by the next
-    # call: no row `crash`. Ray is played by a stand-in that calls at once. Oracle: the error, and the row after it.
-    full = f"import sys; sys.exit(print(\"No space left on device: 'map.ply'\") or {NO_SPACE})"
-    store = Store(tmp_path, "t", "s")
-    at_once = SimpleNamespace(remote=lambda *given: Reference(run_remotely(*given)))
-    ray = SimpleNamespace(
-        remote=lambda **_: lambda _: at_once,
-        wait=lambda waiting, num_returns: (waiting[:num_returns], waiting[num_returns:]),
-        get=lambda reference: reference.found,
-        shutdown=lambda: None,
-        exceptions=SimpleNamespace(RayError=ConnectionError),
-    )
-    monkeypatch.setattr("vggtgeo.benchmark.cluster._connect", lambda _: ray)
-    with raises("No space left on device"):
-        all_rows(
-            tiny.jobs()[:1],
-            store,
-            LIMITS,
-            cluster=Cluster("local"),
-            command=lambda *_: [sys.executable, "-S", "-c", full],
-        )
-    (row,) = all_rows(tiny.jobs()[:1], store, LIMITS, cluster=Cluster("local"), command=command)
-    assert row["status"] == "ok"
 
 
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")

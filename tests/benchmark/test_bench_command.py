@@ -75,13 +75,6 @@ def test_two_batches_keep_off_each_other(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / ".bench.lock").exists()
 
 
-def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
-    # Proves that nothing is run whose result could not be written.
-    (tmp_path / "file").write_text("")
-    with raises("output"):
-        runner.bench("quick", tmp_path / "file")
-
-
 @pytest.mark.slow  # compiles; notebooks/evaluate.ipynb runs the same path
 def test_two_real_runs_from_start_to_tables(tmp_path: Path) -> None:
     # Proves that worker, stubs, pipeline and metrics fit together. Oracle: a run without lines gives other numbers; a

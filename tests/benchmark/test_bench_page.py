@@ -7,34 +7,9 @@ import numpy as np
 import tiny_suites as tiny
 from bench_rows import EXTERNAL, ROWS, row
 
-from vggtgeo.benchmark import markdown
-from vggtgeo.benchmark.figures import ablation_figure, cost_figure, paths
+from vggtgeo.benchmark.figures import paths
 from vggtgeo.benchmark.page import write_page
 from vggtgeo.geometry.trajectory import Trajectory
-
-
-def test_labels_of_any_length_leave_room_for_the_drawing() -> None:
-    # Proves that long titles break, and short ones do not: axes that collapse are a warning of Matplotlib, which is an
-    # error here. Oracle: the lines of the labels.
-    text = tiny.TEXT.replace("full system", "the whole of the system with everything that it has, and " * 4)
-    rows = [{**one, "seconds_tracking": 2.0, "peak_memory_gb": 0.5} for one in ROWS]
-    figure = ablation_figure(tiny.suite(text), rows)
-    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert labels[0].count("\n") == 2
-    assert labels[0].endswith(" ...")
-    assert labels[1] == "without | lines"
-    for drawn in (figure, cost_figure(tiny.suite(text), rows)):
-        drawn.canvas.draw()
-
-
-def test_errors_that_hardly_differ_are_drawn_beside_each_other() -> None:
-    # Proves that two errors a thousandth apart, which would fill the axis, do not, and that it has a number. Oracle:
-    # the axis.
-    rows = [{**one, "ate_se3_m": 0.00873 * (1 + 0.001 * number)} for number, one in enumerate(ROWS)]
-    axes = ablation_figure(tiny.suite(), rows).axes[0]
-    low, high = axes.get_xlim()
-    assert high / low >= 2.4
-    assert any(low <= tick <= high for tick in axes.get_xticks())
 
 
 def test_the_path_that_is_drawn_is_one_that_can_be(tmp_path: Path) -> None:
@@ -110,12 +85,3 @@ def test_the_page_holds_everything_and_loads_nothing(tmp_path: Path) -> None:
         "crash",
     ):
         assert wanted in page.text, wanted
-
-
-def test_a_suite_without_any_result_has_a_page(tmp_path: Path) -> None:
-    # Proves that a batch in which everything failed can be looked at, and drawn.
-    rows = [row("walk", "full", 0, None, status="crash", message="x")]
-    write_page(tmp_path / "report.html", tiny.suite(), rows, tmp_path)
-    assert "crash" in (tmp_path / "report.html").read_text()
-    assert markdown.page(tiny.suite(), rows)
-    assert ablation_figure(tiny.suite(), rows) is not None

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 import tiny_suites as tiny
 from bench_rows import EXTERNAL, ROWS, row
-from reported import raises, warns
+from reported import raises
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.benchmark import markdown
-from vggtgeo.benchmark.external import external_rows, warn_of_missing
+from vggtgeo.benchmark.external import external_rows
 from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.published import published
 from vggtgeo.benchmark.runner import subtract_baseline
 from vggtgeo.benchmark.suite import Suite
 from vggtgeo.benchmark.table import Row, paired
-from vggtgeo.evaluation import comparability
 from vggtgeo.geometry.trajectory import Trajectory
 
 
@@ -68,16 +67,6 @@ def _systems(tmp_path: Path, ours: np.ndarray, theirs: Trajectory) -> tuple[Suit
     return suite, subtract_baseline(suite, rows, place.parent)
 
 
-def test_another_sequence_has_the_status_that_evaluate_gives(tmp_path: Path) -> None:
-    # Proves that a batch does not rank what `vggtgeo evaluate` calls not comparable. Oracle: `comparability`.
-    times = np.arange(100) / 10
-    for poses in (_walk(1), np.linalg.inv(_walk(0))):
-        _, (_, found) = _systems(tmp_path, _walk(0), Trajectory(times, poses))
-        reasons = comparability(Trajectory(times, poses), Trajectory(times, _walk(0)), metric=True).reasons
-        assert found["status"] == "not comparable"
-        assert all(one in found["message"] for one in reasons)
-
-
 def test_differences_are_over_the_time_that_both_cover(tmp_path: Path) -> None:
     # Proves that a system which was lost after a third is compared with ours over that third. Oracle: ours is exact
     # there and wrong by a decimetre after, theirs wrong by 3 cm; over all, ours would be worse.
@@ -90,17 +79,6 @@ def test_differences_are_over_the_time_that_both_cover(tmp_path: Path) -> None:
     assert rows[1]["ate_se3_m"] < rows[0]["ate_se3_m"]
     (found,) = paired(rows, "other", suite.base, "ate_se3_m", "walk")
     assert found == pytest.approx(rows[1]["ate_se3_m"], abs=1e-6)
-
-
-def test_a_system_without_any_file_is_told_before_the_runs(tmp_path: Path) -> None:
-    # Proves that a misspelt place of other systems' trajectories is a warning, and one file is enough for none. Oracle:
-    # that nothing is said where it is there (warnings are errors here).
-    suite = tiny.suite(tiny.TEXT + EXTERNAL)
-    with warns("`other`", "other/walk.txt", 2):
-        warn_of_missing(suite, tiny.jobs(), tmp_path)
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other/hall.txt").touch()
-    warn_of_missing(suite, tiny.jobs(), tmp_path)
 
 
 def test_published_figures_have_source_and_protocol_and_stand_apart() -> None:

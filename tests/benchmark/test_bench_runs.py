@@ -1,29 +1,19 @@
 """Runs in processes of their own: limits, crashes, killed workers, a killed driver, resuming."""
 
-import errno
 import json
 import os
-import random
-import signal
-import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from pathlib import Path
 
 import pytest
 import tiny_suites as tiny
-from conftest import ROOT
-from reported import raises
 
-from vggtgeo.benchmark import worker
 from vggtgeo.benchmark.processes import Limits, run_limited, shares
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.runner import all_rows
-from vggtgeo.benchmark.scheduling import worker_command
 from vggtgeo.benchmark.store import Store
-from vggtgeo.benchmark.worker import NO_SPACE
 from vggtgeo.io.errors import InputError
 
 LIMITS = Limits(seconds=20.0, memory_gb=2.0)
@@ -128,168 +118,6 @@ def test_changed_settings_and_code_are_run_again(tmp_path: Path) -> None:
     (store.place(jobs[0]) / "row.json").write_text("{}")
     with pytest.raises(InputError, match="delete it"):
         store.load(jobs[0])
-
-
-@pytest.mark.long
-def test_two_hundred_runs_with_ten_kills_end_as_undisturbed(tmp_path: Path) -> None:
-    # Proves that workers that are killed at random cost nothing but time: each run is there once, and every number is
-    # that of a batch that nobody disturbed. Oracle: that batch.
-    text = tiny.TEXT.replace("seeds = 3", "seeds = 50")
-    jobs = tiny.jobs(text)
-    assert len(jobs) == 200
-    calm = all_rows(jobs, Store(tmp_path / "calm", "tiny", "s"), LIMITS, workers=4, command=tiny.worker())
-    killed: Counter[str] = Counter()
-    ended = threading.Event()
-
-    def kill() -> None:
-        rng = random.Random(0)
-        while killed.total() < 10 and not ended.is_set():
-            time.sleep(rng.uniform(0.01, 0.15))
-            for folder in Path("/proc").iterdir():
-                try:
-                    line = (folder / "cmdline").read_bytes().decode()
-                    # A run is tried again twice: one that is killed more often is a row that says so.
-                    if str(tmp_path / "wild") in line and killed[line] < LIMITS.retries:
-                        os.kill(int(folder.name), signal.SIGKILL)
-                        killed[line] += 1
-                        break
-                except (OSError, ValueError):
-                    continue
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    slow = tiny.worker("time.sleep(0.02)")
-    wild = all_rows(jobs, Store(tmp_path / "wild", "tiny", "s"), LIMITS, workers=4, command=slow)
-    ended.set()
-    killer.join()
-    assert killed.total() == 10
-    assert _without_time(wild) == _without_time(calm)
-    assert {row["status"] for row in wild} == {"ok"}
-    assert len(list((tmp_path / "wild" / "runs").iterdir())) == 200
-
-
-@pytest.mark.long
-def test_a_driver_that_dies_goes_on_where_it_was(tmp_path: Path) -> None:
-    # Proves that after SIGKILL of the driver a second call does the rest only, and that no run is lost or done twice
-    # but the one that was going on. Oracle: the list of starts.
-    code = (
-        f"import sys; sys.path[:0] = [{str(ROOT / 'tests' / 'helpers')!r}, {str(ROOT)!r}]\n"
-        "import tiny_suites as tiny\nfrom pathlib import Path\n"
-        "from vggtgeo.benchmark.processes import Limits\nfrom vggtgeo.benchmark.runner import all_rows\n"
-        "from vggtgeo.benchmark.store import Store\n"
-        f"store = Store(Path({str(tmp_path)!r}), 'tiny', 's')\n"
-        "all_rows(tiny.jobs(), store, Limits(20, 2), command=tiny.worker('time.sleep(0.2)'))\n"
-    )
-    driver = subprocess.Popen([sys.executable, "-c", code])
-    while len(list(tmp_path.glob("runs/*/row.json"))) < 4:
-        assert driver.poll() is None
-        time.sleep(0.02)
-    driver.kill()
-    driver.wait()
-    time.sleep(0.4)  # the run that was going on is a stand-in, which does not watch its parent
-    finished = {path.parent.name for path in tmp_path.glob("runs/*/row.json")}
-    rows = all_rows(tiny.jobs(), Store(tmp_path, "tiny", "s"), LIMITS, command=tiny.worker())
-    assert [row["status"] for row in rows] == ["ok"] * 12
-    starts = Counter((tmp_path / "starts.txt").read_text().split())
-    assert set(starts) == {job.name for job in tiny.jobs()}
-    assert all(starts[name] == 1 for name in finished)
-    assert sum(starts.values()) <= 13
-
-
-def test_a_fault_of_the_caller_leaves_no_process(tmp_path: Path) -> None:
-    # Proves that an exception of `progress` ends the batch at once with that exception. Oracle: the time it takes.
-    def progress(done: int, total: int, row: object) -> None:
-        raise RuntimeError("enough")
-
-    began = time.monotonic()
-    with pytest.raises(RuntimeError, match="enough"):
-        all_rows(
-            tiny.jobs(),
-            Store(tmp_path, "tiny", "s"),
-            LIMITS,
-            workers=2,
-            progress=progress,
-            command=tiny.worker("time.sleep(0 if job['seed'] == 0 and job['setting'] == 'full' else 15)"),
-        )
-    assert time.monotonic() - began < 8
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_full_disk_ends_the_batch_and_costs_no_run(tmp_path: Path, workers: int) -> None:
-    # Proves that a run that a full disk ended is no row but the end of the batch, with its reason (also where other
-    # runs are stopped for it), that what is finished stays, and that a second call does the rest. Oracle: a worker made
-    # to end so, and the list of starts.
-    jobs = [job for job in tiny.jobs() if job.sequence == "walk" and job.setting == "full"]
-    store = Store(tmp_path, "tiny", "s")
-    full = tiny.worker(f"""
-if job["seed"] == 2: sys.exit(print("No space left on device: 'map.ply'") or {NO_SPACE})
-if job["seed"] == 0: time.sleep({15 if workers == 2 else 0})
-""")
-    with raises("walk.full.2", "No space left on device"):
-        all_rows(jobs, store, LIMITS, workers=workers, command=full)
-    finished = {path.parent.name for path in tmp_path.glob("runs/*/row.json")}
-    assert finished == ({"walk.full.0", "walk.full.1"} if workers == 1 else {"walk.full.1"})
-    rows = all_rows(jobs, store, LIMITS, command=tiny.worker())
-    assert {row["status"] for row in rows} == {"ok"}
-    starts = Counter((tmp_path / "starts.txt").read_text().split())
-    assert all(starts[name] == 1 for name in finished)
-
-
-@pytest.mark.parametrize("told", [False, True])
-def test_a_worker_tells_a_full_disk_from_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: bool) -> None:
-    # Proves the exit code of a run whose disk is full, also where an error of the input says so, and that it leaves no
-    # row; any other error of the system is a fault of the program. Oracle: errors by their numbers.
-    (job,) = tiny.jobs()[:1]
-    place = Store(tmp_path, "tiny", "s").begin(job)
-
-    def run(number: int) -> None:
-        def fails(*_: object) -> None:
-            try:
-                raise OSError(number, os.strerror(number), "map.ply")
-            except OSError as error:
-                if told:
-                    raise InputError("`out` cannot be written") from None
-                raise error
-
-        monkeypatch.setattr(worker, "_run", fails)
-        monkeypatch.setattr(worker, "end_with_parent", lambda parent: None)
-        worker.main([str(place), str(tmp_path), "1"])
-
-    with pytest.raises(SystemExit) as ended:
-        run(errno.ENOSPC)
-    assert ended.value.code == NO_SPACE
-    assert not (place / worker.ROW).exists()
-    if told:
-        run(errno.EACCES)
-        assert json.loads((place / worker.ROW).read_text())["status"] == "error"
-    else:
-        with pytest.raises(PermissionError):
-            run(errno.EACCES)
-
-
-def test_a_worker_ends_whose_driver_is_gone_already(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that a run ends whose driver was killed while it was importing, which takes seconds: it knows the driver's
-    # number from its command line. Oracle: this process's number, and parents that are told to the worker.
-    command = worker_command(Path("run"), Path("scratch"))
-    assert command[-1] == str(os.getpid())
-    for parents in ([1], [7, 7, 1]):
-        ended, asked = threading.Event(), iter(parents)
-        monkeypatch.setattr(os, "_exit", lambda code, ended=ended: ended.set())
-        monkeypatch.setattr(os, "getppid", lambda asked=asked: next(asked))
-        worker.end_with_parent(7, 0.01)
-        assert ended.wait(10)
-        assert next(asked, None) is None
-
-
-def test_what_a_killed_batch_left_is_taken_away(tmp_path: Path) -> None:
-    # Proves that rendered walks, of a hundred megabytes each, do not pile up where batches are killed. Oracle: a folder
-    # as a killed batch leaves it.
-    (tmp_path / ".scratch").mkdir()
-    (tmp_path / ".scratch/old.walk").write_text("a walk")
-    seen = tiny.worker("assert not (folder.parent.parent / '.scratch/old.walk').exists()")
-    rows = all_rows(tiny.jobs()[:1], Store(tmp_path, "tiny", "s"), LIMITS, command=seen)
-    assert [row["status"] for row in rows] == ["ok"]
-    assert not (tmp_path / ".scratch").exists()
 
 
 def test_a_walk_is_rendered_by_one_run_and_goes_with_the_last(tmp_path: Path) -> None:

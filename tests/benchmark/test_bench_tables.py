@@ -4,7 +4,6 @@ import csv
 import io
 import runpy
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -73,32 +72,6 @@ def test_the_tables_of_the_documents_can_be_written(tmp_path: Path, monkeypatch:
     assert text.endswith("<!-- tables: end -->\nafter\n")
     assert "| icl-office | RGB-D | 1 | 9/10 | 97.5 | 2.00 |" in text
     assert "old" not in text
-
-
-def test_the_page_of_the_paper_takes_the_accuracy_alone() -> None:
-    # Proves that of a batch's tables `docs/write_tables.py` takes the ATE after SE(3), and nothing else. Oracle: text.
-    accuracy = runpy.run_path(str(ROOT / "docs" / "write_tables.py"))["accuracy"]
-    text = markdown.page(tiny.suite(), ROWS)
-    found = accuracy(text)
-    assert found in text
-    assert found.startswith("ATE RMSE after SE(3) alignment, cm")
-    assert "| full system |" in found
-    assert "Sim(3)" not in found
-    assert "#" not in found
-
-
-def test_what_has_no_result_is_told() -> None:
-    # Proves that crashes and recordings that are not there are in the page, and in no mean.
-    rows = [*ROWS[:2], row("walk", "full", 2, None, status="crash", message="ended by SIGSEGV")]
-    rows.append(row("hall", "full", 0, None, status="absent"))
-    text = markdown.page(tiny.suite(), rows)
-    assert "| walk | full | 2 | crash | ended by SIGSEGV |" in text
-    assert "Missing recordings: hall" in text
-    assert "## Provenance" not in text, "an empty table"
-    assert "## Provenance" in markdown.page(tiny.suite(), [row("walk", "full", 0, 2.0, version="0.1.0")])
-    assert "| full system | 3.00 ± 1.41 (2 of 3) |" in text
-    assert "| walk | full system | 2 of 3 | 27/30 |" in text
-    assert "# a b\n" in markdown.page(replace(tiny.suite(), title="a\nb"), rows)
 
 
 def test_the_table_comes_back_from_csv_and_parquet(tmp_path: Path) -> None:

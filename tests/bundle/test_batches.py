@@ -9,15 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reported import raises
 from scenes import Scene, make_scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-from vggtgeo.bundle.analysis.covariances import Covariances
 from vggtgeo.bundle.batches import Window, pack_batch, solve_batch
-from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.solution import solution_like, solve
+from vggtgeo.bundle.solution import solve
 
 SOLVER = SchurLevenbergMarquardt(max_iterations=40, rtol=1e-12)
 SCENES = [  # two shapes, to compile no more than those
@@ -54,17 +51,6 @@ def test_a_ragged_batch_gives_what_each_window_gives(at_once: int) -> None:
 @eqx.filter_jit
 def solve_alone(problem: Problem, state: State):
     return solve(problem, state, solver=SOLVER)
-
-
-def test_a_batch_can_be_printed() -> None:
-    # Proves that results of a batch are readable where there is no one number to show. Oracle: the shapes in the text.
-    one = solution_like(*SCENES[1].pack()[:2], SOLVER)
-    solutions = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one)
-    assert "energy=f64[2]" in str(solutions)
-    assert repr(solutions) == str(solutions)
-    zeros = lambda *shape: jnp.zeros(shape)
-    known = Covariances(zeros(4, 6, 6), zeros(4, 4), zeros(4, 9), zeros(4, 3, 6, 6), zeros())
-    assert "poses=f64[2,4,6,6]" in str(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), known))
 
 
 @pytest.mark.long
@@ -115,20 +101,3 @@ def test_a_batch_is_shared_out_over_devices() -> None:
     command = [sys.executable, "-c", SHARED]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-
-
-def test_a_batch_that_cannot_be_shared_out_is_refused() -> None:
-    # Proves the message. Oracle: its text.
-    problems, states, _ = batch()
-    with raises("`problems`", 3, "`devices`", 2):
-        solve_batch(problems, states, devices=jax.devices() * 2)
-
-
-def test_what_is_wrong_with_a_window_names_it() -> None:
-    # Proves the messages of `pack_batch`. Oracle: their texts.
-    good = window(SCENES[0])
-    bad = Observations(**{**vars(good[0]), "pixel": good[0].pixel[:-1]})
-    with raises("`windows[1]`", "`pixel`", "shape"):
-        pack_batch([good, (bad, *good[1:])])
-    with raises("`windows`"):
-        pack_batch([])

@@ -16,7 +16,6 @@ from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.term import local_model
-from vggtgeo.io.errors import InputError
 
 POINTS, LINES, KEYFRAMES = 6, 2, 3
 
@@ -220,19 +219,3 @@ def test_marginalisation_takes_the_pixels_along():
     )
     found = np.asarray(prior.root.T @ prior.root)[np.ix_(kept, kept)]
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("sigma", [-1.0, 0.0, np.nan])
-def test_pixel_sigma_must_be_positive(sigma):
-    """The error names the argument."""
-    made = vg.simulate_window(KEYFRAMES, POINTS, 0)
-    wrong = replace(made, observations=replace(made.observations, pixel_sigma=sigma))
-    with pytest.raises(InputError, match="pixel_sigma"):
-        wrong.pack()
-
-
-def test_a_state_without_offsets_is_refused(window):
-    """A problem with a term on the host's pixels needs a state that has them."""
-    problem, state = window
-    with pytest.raises(InputError, match="pixel_offset"):
-        vg.solve(problem, replace(state, pixel_offset=None))

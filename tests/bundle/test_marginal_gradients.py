@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reported import raises
 from scenes import make_scene
 from vggtgeo.solvers.symmetric_eigen import symmetric_eigen
 
@@ -194,10 +193,3 @@ def test_reorder_and_gather_work_under_jit() -> None:
     np.testing.assert_array_equal(gathered, scene.observations.point_weight)
     slopes = jax.grad(lambda depth: jnp.sum(index.gather(depth) ** 2))(initial.inverse_depth)
     np.testing.assert_allclose(index.gather(slopes), 2 * index.gather(initial.inverse_depth))
-
-
-@pytest.mark.parametrize("order", [jnp.asarray([0.0, 1.0]), jnp.asarray([[0], [1]])])
-def test_an_order_of_another_kind_is_refused_when_traced(order: jax.Array) -> None:
-    # Proves that type and shape of a traced order are checked.
-    with raises("`order`", order.dtype):
-        jax.jit(vg.permute_prior)(vg.empty_prior(2), order)

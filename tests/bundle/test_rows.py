@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from scenes import make_scene
 from vggtgeo.solvers.band_cholesky import BandCholesky
-from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 import vggtgeo as vg
-from vggtgeo.bundle.linearise import linearise
-from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.padding import PaddedSize, Slots, row_lengths
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_problem, save_problem
@@ -117,18 +114,6 @@ def test_every_linear_solver_takes_rows(solver: Any, solutions: tuple[vg.Solutio
     dense = vg.covariances(ROWS[0], solutions[1].state)
     np.testing.assert_allclose(known.poses, dense.poses, rtol=1e-4, atol=1e-10)
     np.testing.assert_allclose(known.inverse_depth, dense.inverse_depth, rtol=1e-4)
-
-
-def test_sparse_blocks_take_rows() -> None:
-    # Proves the blocks of the Schur complement that large maps use. Oracle: those of one row a host.
-    found = []
-    for problem, state, _ in (WHOLE, ROWS):
-        system = linearise(prepared(problem), state)
-        layout = sparse_layout(system)
-        found.append((np.asarray(layout.place), reduced_blocks(system, layout)))
-    np.testing.assert_array_equal(found[0][0], found[1][0])
-    for one, other in zip(jax.tree.leaves(found[0][1]), jax.tree.leaves(found[1][1]), strict=True):
-        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-6)
 
 
 @pytest.mark.long

@@ -96,18 +96,6 @@ def test_constant_velocity_goes_on() -> None:
     np.testing.assert_allclose(initial.poses.wxyz_xyz, every[1:], atol=1e-12)
 
 
-def test_windows_of_other_shapes_are_refused() -> None:
-    # Proves that shapes, cameras and a missing keyframe are checked before anything is compiled.
-    problem, initial, _ = vg.simulate_window(3, points=4, lines=0).pack(terms=[vg.empty_prior(3)])
-    smaller, start, _ = vg.simulate_window(2, points=4, lines=0).pack(terms=[vg.empty_prior(2)])
-    with raises("`next_problem`", 2):
-        vg.slide(problem, initial, smaller, start)
-    with pytest.raises(vg.InputError, match=r"`next_initial\.inverse_depth`"):
-        vg.slide(problem, initial, problem, start)
-    with pytest.raises(vg.InputError, match="`leaving` is 3"):
-        vg.slide(problem, initial, problem, initial, leaving=3)
-
-
 def slid(first: Problem, start: State, following: Windows, solver: SchurLevenbergMarquardt) -> State:
     """The states of all windows, each solved under the prior of those before."""
 

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reported import raises
 from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_schur_complement
 from vggtgeo.solvers.band_cholesky import BandCholesky
@@ -21,8 +20,6 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.minres import minres
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
-from vggtgeo.bundle.analysis.covariances import covariances
-from vggtgeo.bundle.analysis.observability import observability
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.node_order import longest, narrow_order
 from vggtgeo.bundle.problem import Problem, State
@@ -267,15 +264,3 @@ def test_minimum_residuals_at_a_saddle() -> None:
     found = jax.jit(lambda b: minres(lambda x: jnp.asarray(matrix) @ x, lambda r: r / diagonal, b, 1e-13, 50))(rhs)
     assert bool(found.converged)
     np.testing.assert_allclose(found.solution, np.linalg.solve(matrix, rhs), atol=1e-11)
-
-
-def test_what_is_too_large_is_refused() -> None:
-    # Proves the sentences for a map whose dense matrix nobody wants. Oracle: their text.
-    window, _ = simulate_loop(610, points=1, reach=1)
-    problem, initial, _ = window.pack()
-    with raises("reduced_solver=choose_reduced_solver", error=ValueError):
-        covariances(problem, initial)
-    with raises("`keyframes`", 32, error=ValueError):
-        covariances(problem, initial, reduced_solver=ITERATIVE)
-    with raises(610, "`jit`", error=ValueError):
-        jax.eval_shape(observability, problem, initial)

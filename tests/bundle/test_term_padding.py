@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from changed_file import with_arrays, with_header
 from jax.flatten_util import ravel_pytree
 from own_terms import SCENE, LogCosh, PointToPlane, PositionFix, StepOfWheels, own_terms
 from reported import raises
@@ -127,32 +126,6 @@ def test_a_file_gives_back_every_leaf(tmp_path: Path, packed) -> None:
     assert {leaf.dtype for leaf in jax.tree.leaves(half[1])} == {np.dtype(np.float32)}
 
 
-def test_a_file_executes_nothing_and_names_what_is_missing(tmp_path: Path, packed) -> None:
-    # Proves that a class which is not given is refused with what to do, that a file cannot name any class it likes,
-    # and that an inconsistent file is refused. Oracle: what the errors name.
-    path, other = tmp_path / "own.npz", tmp_path / "other.npz"
-    vg.save_problem(path, *packed)
-    with raises(path, "LogCosh", "terms"):
-        vg.load_problem(path, terms=OWN[:3])
-    with raises("terms", "PositionFix"):
-        vg.load_problem(path, terms=[*OWN, type("PositionFix", (), {})])
-    for change, named in (
-        (lambda header: header["classes"][0].__setitem__(0, "os:system"), "os:system"),
-        (lambda header: header["classes"][0].__setitem__(1, ["held"]), "held"),
-        (lambda header: header.update(version=99), "99"),
-        (lambda header: header.pop("tree"), "tree"),
-    ):
-        other.write_bytes(path.read_bytes())
-        with raises(other, named):
-            vg.load_problem(with_header(other, change), terms=OWN)
-    for change, named in (
-        (lambda arrays: arrays.pop("problem.terms[0].target"), "problem.terms[0].target"),
-        (lambda arrays: arrays.update({"problem.fixed_pose": np.zeros(7, bool)}), "problem.fixed_pose"),
-    ):
-        with raises(other, named):
-            vg.load_problem(with_arrays(path, change, other), terms=OWN)
-
-
 @pytest.mark.long
 def test_a_batch_of_windows_with_different_terms(packed) -> None:
     # Proves that windows may differ in which own terms they have and how many observations of each. Oracle: the energy
@@ -173,33 +146,3 @@ def test_a_batch_of_windows_with_different_terms(packed) -> None:
         assert float(found[number]) == pytest.approx(float(energy), rel=1e-12)
         for batched, alone in zip(gradients, gradient, strict=True):
             np.testing.assert_allclose(batched[number], alone, rtol=1e-9, atol=1e-9 * float(jnp.abs(alone).max()))
-
-
-def test_wrong_terms_are_refused_by_name() -> None:
-    # Proves that each mistake in a term is one sentence that names it. Oracle: the messages.
-    fix, wheels, planes = own_terms()
-    seen = SCENE.observations
-    flat = lambda **changes: replace(planes, **changes)
-    fields = lambda **changes: replace(planes, fields={**planes.fields, **changes})
-    cases = [
-        ([fix, fix], ("`terms`", "`position_fix`")),
-        ([eqx.tree_at(lambda t: t.weight, fix, -fix.weight)], ("`position_fix.weight[0]`", "got -")),
-        ([eqx.tree_at(lambda t: t.weight, wheels, jnp.ones(2))], ("`step_of_wheels.weight`", "(2,)")),
-        ([eqx.tree_at(lambda t: t.keyframe, fix, fix.keyframe + 1)], ("`position_fix.keyframe`", 2, 3)),
-        ([flat(edge=None)], ("`FlatTerm`", "`edge`")),
-        ([flat(landmark=planes.landmark + 100)], ("`point_to_plane.landmark`", 100)),
-        ([flat(landmark=planes.landmark[::-1])], ("`point_to_plane.edge[0]`", "host")),
-        ([fields(normal=planes.fields["normal"][1:])], ("`point_to_plane.normal`", "shape")),
-        ([fields(weight=planes.fields["weight"] * np.nan)], ("`point_to_plane.weight[0]`", "nan")),
-        ([replace(planes, kind=PositionFix)], ("`FlatTerm`", "`PositionFix`")),
-        (
-            [eqx.tree_at(lambda t: t.weight, SCENE.pack(terms=[planes])[0].point_to_plane, jnp.ones((2, 2)))],
-            ("FlatTerm",),
-        ),
-    ]
-    assert len(seen.host)
-    for terms, named in cases:
-        with raises(*named):
-            SCENE.pack(terms=terms)
-    with raises("position_fix", 2, "size.terms", 1):
-        SCENE.pack(terms=[fix], size=replace(LARGER, terms=(("position_fix", 1),)))

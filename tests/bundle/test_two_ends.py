@@ -22,7 +22,6 @@ from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.geometry.line_segments import fractions, segment_slots, straightened
-from vggtgeo.io.errors import InputError
 
 POINTS, SEGMENTS, SAMPLES = 6, 2, 4
 SOLVER = SchurLevenbergMarquardt(rtol=1e-12, max_iterations=100)
@@ -202,13 +201,3 @@ def test_segments_of_unequal_length_are_packed() -> None:
     problem, state, _ = scene().pack()
     padded, wide, _ = scene().pack(size=PaddedSize(3, 8, 15, 3, samples=5))
     assert float(run(padded, wide).energy) == pytest.approx(float(run(problem, state).energy), rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("host", "segment", "message"),
-    [([0, 0], [0, -1], "`segment` is -1 for a line sample"), ([0, 1], [4, 4], "`segment` 4 has samples hosted in two")],
-)
-def test_wrong_segments_are_refused(host: list[int], segment: list[int], message: str) -> None:
-    # Proves the messages. Oracle: their texts.
-    with pytest.raises(InputError, match=message):
-        segment_slots(np.array(host), np.array(segment))

@@ -120,19 +120,6 @@ def test_a_landmark_that_only_an_undetermined_keyframe_sees(estimated: Estimate)
     np.testing.assert_array_equal(lost, [[1, 0]])
 
 
-@pytest.mark.parametrize("scene", ["zero", "rotation"])
-def test_never_nan(estimated: Estimate, scene: str) -> None:
-    # Proves that a problem that says nothing, or nothing about depth, has infinite variances and no NaN.
-    lost = {"zero": lacking.without(WELL, "point", "line", "depth"), "rotation": lacking.pure_rotation()}[scene]
-    problem, truth = packed(lost, at_truth=True, intrinsics_sigma=None)
-    found = estimated(problem, truth)
-    assert not any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves(found))
-    assert np.all(np.asarray(found.inverse_depth)[:, lacking.POINTS :] == np.inf)
-    if scene == "zero":
-        assert np.all(np.isinf(np.diagonal(found.poses[1:], axis1=1, axis2=2)))
-        assert np.all(np.isinf(np.diagonal(found.intrinsics)))
-
-
 def test_scaled_by_the_variance_factor(estimated: Estimate) -> None:
     # Proves that only ratios of weights matter after scaling. Oracle: invariance under all weights times 4.
     problem, truth = packed(WELL, at_truth=True, kernel=Huber(jnp.asarray(1e6, float)), **OPTIONS)

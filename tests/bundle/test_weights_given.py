@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from own_terms import SCENE, PointToPlane, PositionFix, StepOfWheels
-from reported import raises
 
 import vggtgeo as vg
 
@@ -54,24 +53,3 @@ def test_one_number_is_the_weight_of_each_row_of_a_flat_term() -> None:
     )
     assert float(one.sum()) == 6.0
     np.testing.assert_array_equal(one, listed)
-
-
-@pytest.mark.parametrize("weight", [{}, {"weight": jnp.ones(5)}], ids=["default", "listed"])
-def test_a_flat_term_on_edges_is_refused_by_name(weight: dict[str, jax.Array]) -> None:
-    """A term on edges with one row an observation, or one weight for all of its padding, is an error that names
-    `FlatTerm`, where JAX would speak of an axis. Oracle: the exception.
-    """
-    problem, _, _ = SCENE.pack()
-    flat = PointToPlane(normal=jnp.ones((5, 3)), distance=jnp.ones(5), **weight)
-    with raises("`point_to_plane.weight`", np.shape(flat.weight), "FlatTerm"):
-        problem.with_term(flat)
-    with raises("`point_to_plane.weight`", np.shape(flat.weight), "FlatTerm"):
-        SCENE.pack(terms=[flat])
-
-
-def test_flat_data_beside_padded_weights_are_refused_by_name() -> None:
-    """The field that is flat is the one that is named. Oracle: the exception."""
-    problem, _, _ = SCENE.pack()
-    half = PointToPlane(normal=jnp.ones((5, 3)), distance=jnp.ones(5), weight=problem.points.weight)
-    with raises("`point_to_plane.normal`", "(5, 3)", "FlatTerm"):
-        problem.with_term(half)

@@ -16,14 +16,12 @@ import typer
 from conftest import ROOT
 from invoked import invoke
 from problem_files import SCENE, arrays_of, write
-from typer.testing import CliRunner
 
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_problem
-from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command, make_app
+from vggtgeo.cli.main import COMMANDS, CommandEntry, load_command
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.jax_environment import cache_folder
 
 HEAVY = {"jax", "cv2", "matplotlib", "scipy", "onnxruntime", "rerun", "equinox", "numpy"}
 PROBE = """
@@ -126,33 +124,6 @@ def test_debug_shows_the_traceback(failing) -> None:
     assert isinstance(result.exception, InputError)
 
 
-def test_a_command_that_is_not_there() -> None:
-    # Proves that a typing error is answered with the command that was meant.
-    result = invoke("solv")
-    assert result.exit_code == 2
-    assert "solve" in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("solv",), "No such command 'solv'. Did you mean 'solve'? (see `vggtgeo --help`)"),
-        (("--bad",), "No such option: --bad (see `vggtgeo --help`)"),
-        (("solve", "--bad"), "No such option: --bad (see `vggtgeo solve --help`)"),
-        (("run",), "Missing argument 'path' (see `vggtgeo run --help`)"),
-        (("demo", "--frames", "many"), "Invalid value for '--frames': "),
-        (("models", "verify"), "Missing argument 'file' (see `vggtgeo models verify --help`)"),
-    ],
-)
-def test_a_wrong_command_line_is_one_line(arguments: tuple[str, ...], message: str) -> None:
-    # Proves that what typer finds wrong is said as briefly as everything else, with where to read on.
-    result = CliRunner().invoke(make_app(), list(arguments), prog_name="vggtgeo")
-    assert result.exit_code == 2
-    assert result.stderr.startswith(f"error: {message}")
-    assert len(result.stderr.splitlines()) == 1
-    assert result.stdout == ""
-
-
 def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
     # Proves that the program computes in 64 bits, keeps compiled code in the user's cache folder, adjusts on the
     # processor, and, where it is told to use a GPU, leaves its memory to others.
@@ -169,13 +140,6 @@ def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
     command = [sys.executable, "-c", script]
     result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
     assert result.stdout.split() == ["float64", str(tmp_path / "vggtgeo" / "jax"), "0.0", "false", "cpu"]
-
-
-def test_no_cache_where_none_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that a cache folder that cannot be made is done without.
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert cache_folder() is None
 
 
 def test_solve_from_file_to_file(tmp_path: Path) -> None:
@@ -217,25 +181,6 @@ def test_float32_reaches_the_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert report["energy_final"] != report["energy_initial"]
     with np.load(solution) as arrays:
         assert all(arrays[name].dtype == np.float64 for name in arrays.files)
-
-
-def test_solve_says_what_is_wrong(tmp_path: Path) -> None:
-    # Proves that a bad file or option ends with a message that names it, and writes nothing.
-    solution = tmp_path / "solution.npz"
-    spoilt = arrays_of_start()["T"]
-    spoilt[1, 4] = np.nan
-    problem = write(tmp_path, T_init=spoilt)
-    cases = [
-        ((str(tmp_path / "no.npz"),), "no.npz` does not exist"),
-        ((str(problem), "--max-steps", "0"), "--max-steps"),
-        ((str(problem), "--dtype", "float16"), "--dtype"),
-        ((str(problem), "--max-steps", "3"), "problem.npz`: `poses[1]` must be finite"),
-    ]
-    for arguments, message in cases:
-        result = invoke("solve", *arguments, "-o", str(solution))
-        assert result.exit_code == 2, result.output
-        assert message in result.stderr
-    assert not solution.exists()
 
 
 def arrays_of_start() -> dict[str, np.ndarray]:

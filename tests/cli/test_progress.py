@@ -66,37 +66,6 @@ def test_a_pipe_gets_whole_lines_at_once(terminal: bool, monkeypatch: pytest.Mon
     assert file.getvalue().splitlines() == lines
 
 
-def test_bars_and_clocks_stay_in_80_columns() -> None:
-    """Names longer than the line, a count of a stage and the state of tracking leave each row its count and its clock.
-    Oracle: the rendered lines, by hand.
-    """
-    run, file = recorded_run(), io.StringIO()
-    bar = ProgressBar(Console(file=file, force_terminal=True, color_system=None, width=80))
-    with bar:
-        bar.on_stage("calibration " * 10)
-        bar.on_stage_frame(37, 150)
-        bar.on_begin("clip" * 30, 12345)
-        bar.on_frame(run.states[0], run.frames[0])
-        page = Console(width=80, color_system=None, record=True, file=io.StringIO())
-        page.print(*bar._progress.get_renderables(), sep="\n")
-        lines = page.export_text().rstrip().splitlines()
-    assert len(lines) == 3
-    assert all(len(line) <= 80 for line in lines)
-    for line, count in zip(lines, ("37/150", "1/12345"), strict=False):
-        assert re.search(rf" {count} +\d:\d\d:\d\d$", line.rstrip()), lines
-
-
-def test_a_stage_that_counts_no_frames_has_no_count() -> None:
-    """A clock alone, while it goes on and when it is over; oracle: no stroke of a count in its row."""
-    bar = ProgressBar(Console(file=io.StringIO(), force_terminal=True, width=80))
-    with bar:
-        for name in ("compiling", "writing"):
-            bar.on_stage(name)
-        page = Console(width=80, color_system=None, record=True, file=io.StringIO())
-        page.print(*bar._progress.get_renderables())
-        assert "/" not in page.export_text()
-
-
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.4, "0 s"), (59.6, "1 min 0 s"), (378.2, "6 min 18 s"), (3900, "1 h 5 min")]
 )

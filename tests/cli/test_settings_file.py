@@ -6,17 +6,14 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import bad_files as bad
 import pytest
 import typer
 from conftest import ROOT
-from reported import raises
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import COMMANDS, EXIT_INPUT, EXIT_INTERNAL, CommandEntry, load_command, make_app
-from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption, RerunOption
+from vggtgeo.cli.options import EXIT_INTERRUPTED, JsonOption
 from vggtgeo.cli.settings_file import SettingsOption
-from vggtgeo.io.errors import InputError
 from vggtgeo.results.files import write_settings
 
 DEFAULTS = {"path": "clip", "count": 3, "scale": None, "rgb-only": False, "lines": True, "mode": "fast", "json": False}
@@ -67,17 +64,6 @@ def test_a_file_says_what_flags_say(tmp_path: Path) -> None:
     assert seen_by_the_command("--settings", path) == by_flags
 
 
-def test_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves `~` in files and where a shell leaves it: in quotes, behind `=`. Oracle: the home folder.
-    monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / "frames").mkdir()
-    found = seen_by_the_command("--settings", file_with(tmp_path, 'path = "~/clip"\n'))
-    assert found["path"] == str(tmp_path / "clip")
-    for words, named in ((["~/frames"], "frames"), (["clip", "--settings=~/no.toml"], "no.toml")):
-        done = CliRunner().invoke(make_app(), ["run", *words], prog_name="vggtgeo")
-        assert f"`{tmp_path / named}`" in done.stderr, done.stderr
-
-
 def test_a_flag_takes_back_what_the_file_says(tmp_path: Path) -> None:
     # Proves that each switch of a file can be turned over by a flag, either way. Oracle: the defaults.
     path = file_with(tmp_path, "rgb-only = true\nlines = false\njson = true\n")
@@ -111,73 +97,6 @@ def test_what_is_written_gives_the_same_again(tmp_path: Path) -> None:
     assert "scale" not in tomllib.loads((tmp_path / "out.toml").read_text())
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("rgb_only = true", "`rgb_only` is not a setting of this command; the nearest is `rgb-only`"),
-        ("cuont = 4", "`cuont` is not a setting of this command; the nearest is `count`"),
-        ("zzz = 4", "`zzz` is not a setting of this command; the nearest is"),
-        ('settings = "x"', "`settings` is not a setting"),
-        ('count = "4"', "`count` is '4'; it must be a whole number"),
-        ("count = true", "`count` is True; it must be a whole number"),
-        ("count = 1.5", "`count` is 1.5; it must be a whole number"),
-        ("scale = true", "`scale` is True; it must be a number"),
-        ("rgb-only = 1", "`rgb-only` is 1; it must be true or false"),
-        ("lines = true\nno-lines = true", "`lines` and `no-lines` are the same setting; give one of them"),
-        ("mode = 3", "`mode` is 3; it must be text in quotes"),
-        ("count = ", "is not valid TOML"),
-    ],
-)
-def test_what_is_wrong_is_said(tmp_path: Path, text: str, message: str) -> None:
-    # Proves that an unknown key or a wrong type is refused with what was meant.
-    with pytest.raises(InputError) as raised:
-        seen_by_the_command("clip", "--settings", file_with(tmp_path, text))
-    assert message in str(raised.value)
-
-
-def test_a_value_that_is_no_choice_is_refused(tmp_path: Path) -> None:
-    # Proves that a value from a file is checked as that of a flag is.
-    with pytest.raises(AssertionError, match="medium"):
-        seen_by_the_command("clip", "--settings", file_with(tmp_path, 'mode = "medium"'))
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    # Proves that the message names the flag and the file.
-    with raises("--settings", "none.toml"):
-        seen_by_the_command("clip", "--settings", str(tmp_path / "none.toml"))
-
-
-@pytest.mark.parametrize(
-    ("text", "flags", "expected"),
-    [
-        ('output = "runs/a"\nrerun = "runs/a/deep/run.rrd"\n', ("-o", "runs/b"), "runs/b/deep/run.rrd"),
-        ('output = "runs/a"\nrerun = "runs/a/run.rrd"\n', (), "runs/a/run.rrd"),
-        ('output = "runs/a"\nrerun = "elsewhere/run.rrd"\n', ("-o", "runs/b"), "elsewhere/run.rrd"),
-        ('output = "runs/a"\nrerun = "serve"\n', ("-o", "runs/b"), "serve"),
-        ('output = "runs/a"\n', ("--rerun", "runs/a/run.rrd", "-o", "runs/b"), "runs/a/run.rrd"),
-        ('rerun = "run/run.rrd"\n', ("-o", "runs/b"), "run/run.rrd"),
-    ],
-)
-def test_a_run_again_leaves_the_old_recording(tmp_path: Path, text: str, flags: tuple[str, ...], expected: str) -> None:
-    # Proves that a recording inside the file's output folder goes to the new output, and any other stays where it is.
-    found: list[str | None] = []
-
-    def command(
-        output: Annotated[Path, typer.Option("-o", "--output")] = Path("run"),
-        settings: SettingsOption = None,
-        rerun: RerunOption = None,
-    ) -> None:
-        found.append(rerun)
-        assert settings is not None
-        assert settings.values()["rerun"] == rerun
-
-    app = typer.Typer(add_completion=False)
-    app.command()(command)
-    result = CliRunner().invoke(app, ["--settings", file_with(tmp_path, text), *flags], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert found == [expected]
-
-
 def test_help_of_every_command_is_quick_and_shows_examples() -> None:
     # Proves that no command's help loads a numerical package, and that each ends with its examples.
     # Oracle: `sys.modules` of a new process.
@@ -191,34 +110,6 @@ def test_help_of_every_command_is_quick_and_shows_examples() -> None:
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"
-
-
-def test_a_name_that_is_wrong_is_told_before_jax_is_loaded(tmp_path: Path) -> None:
-    # Proves that the commonest mistakes cost no seconds: loading JAX takes two. Oracle: what the process has loaded.
-    (tmp_path / "file").write_text("")
-    (tmp_path / "frames").mkdir()
-    (tmp_path / "run.toml").write_text("stride = 'two'")
-    bad.frames(tmp_path / "good")
-    calls = (
-        ["run", "nothere"],
-        ["run", "frames", "-o", "file"],
-        ["run", "good", "-o", "/proc/new", "--intrinsics", "1,1,1,1"],
-        ["run", "good", "--intrinsics", "55,55,nan,24"],
-        ["run", "good", "--settings", "run.toml"],
-        ["export", "nothere", "--to", "ply"],
-        ["view", "nothere"],
-    )
-    text = f"""
-import sys
-from vggtgeo.cli.main import make_app
-for call in {calls!r}:
-    try:
-        make_app()(call)
-    except SystemExit as end:
-        print(end.code, "jax" in sys.modules)
-"""
-    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert done.stdout.splitlines() == ["2 False"] * len(calls), (done.stdout, done.stderr)
 
 
 def test_the_help_tells_the_exit_codes() -> None:

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny_bags as bags
-from reported import raises, warns
+from reported import warns
 from scipy.spatial.transform import Rotation
 from tiny_bags import Topic, image, info, of_frame, transforms
 
 from vggtgeo.datasets import open_sequence, with_intrinsics, without_depth
-from vggtgeo.datasets.check import inspect
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import NoteWarning
@@ -103,43 +102,6 @@ def test_two_cameras_in_one_frame_need_no_transform(tmp_path: Path) -> None:
     with warns("a.bag", "0", warning=NoteWarning):
         frame = next(open_sequence(path).frames())
     assert np.nanmax(np.abs(frame.depth - depth_of_wall(COLOUR, np.eye(4)))) < 0.02
-
-
-@pytest.mark.filterwarnings("ignore::vggtgeo.io.errors.GuessedCameraWarning")
-@pytest.mark.parametrize(
-    ("more", "gone", "missing"),
-    [
-        ({}, "", "tf_static"),
-        ({"tf": steps(moving=True)}, "", "tf_static"),
-        ({"tf__static": steps()}, "c_depth_info", "`CameraInfo` of `/c/depth/image`"),
-        ({"tf__static": steps()}, "c_color_info", "`CameraInfo` of `/c/color/image`"),
-        (
-            {"tf__static": steps(), "c_info": of_frame(info((64, 48), matrix(DEPTH)), FRAMES[1])},
-            "c_depth_info",
-            "`CameraInfo` of `/c/depth/image`",
-        ),
-    ],
-    ids=["no transform", "one that changes", "no camera of the depth", "no camera of the images", "one of both topics"],
-)
-def test_depth_that_cannot_be_registered_is_refused(
-    tmp_path: Path, more: dict[str, Topic], gone: str, missing: str
-) -> None:
-    # Proves that depth of another camera is refused before a run, with both topics, both cameras, what is missing and a
-    # way out; and that the images alone can be read. Oracle: what was written.
-    topics = of_two_cameras(**more)
-    topics.pop(gone, None)
-    path = bags.write(tmp_path / "a.bag", **topics)
-    (problem,) = [text for text in inspect(path).problems if "--rgb-only" in text]
-    for part in ("`/c/depth/image`", "`/c/color/image`", *FRAMES, missing):
-        assert part in problem
-    if not gone:
-        assert "f = 44.0, 43.0" in problem
-        assert "f = 50.0, 50.0" in problem
-        sequence = open_sequence(path, depth=False)
-        assert not sequence.has_depth
-        assert next(sequence.frames()).depth is None
-    with raises("a.bag"):
-        open_sequence(path)
 
 
 def test_depth_that_is_registered_stays_as_it_is(tmp_path: Path) -> None:

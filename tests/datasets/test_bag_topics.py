@@ -7,14 +7,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import tiny_layouts as tiny
 import tiny_sequences
 from reported import raises
 
 from vggtgeo.datasets.bag_cameras import camera_of
 from vggtgeo.datasets.bag_images import image_of, metres_of
-from vggtgeo.datasets.bag_topics import Chosen, chosen_topics, described_choice
-from vggtgeo.datasets.check import inspect
+from vggtgeo.datasets.bag_topics import Chosen, chosen_topics
 
 PLACE = Path("a.bag, /c, 0")
 
@@ -76,24 +74,6 @@ def test_compressed_topics() -> None:
         assert chosen_topics(PLACE, {name: packed(kind), "/c/compressed": colour}) == Chosen("/c/compressed", name, ())
 
 
-def test_what_cannot_be_read_is_named() -> None:
-    # Proves that the sentence has the topics with what they hold, since one encoding is all that is wrong.
-    with raises("/a", "/d"):
-        chosen_topics(PLACE, {"/a": raw("64FC1"), "/d": raw("16UC1")})
-    with raises("a.bag"):
-        chosen_topics(PLACE, {})
-
-
-def test_what_was_chosen_is_told() -> None:
-    # Proves a sentence where there was a choice, and none where there was none.
-    chosen = Chosen("/rgb", "/depth_registered", ("/depth", "/ir"))
-    assert described_choice(chosen, "/gt") == (
-        "images of `/rgb`, depth of `/depth_registered`, truth of `/gt`; not read: `/depth`, `/ir`"
-    )
-    assert described_choice(Chosen("/rgb", "", ("/ir",)), "") == "images of `/rgb`, no depth; not read: `/ir`"
-    assert not described_choice(Chosen("/rgb", "/depth", ()), "")
-
-
 @pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
 def test_images_behind_a_mosaic(encoding: str) -> None:
     # Proves which pixel has which colour. Oracle: a wall of one colour, seen through the filter that the name says.
@@ -109,14 +89,6 @@ def test_images_in_brightness_and_colour(encoding: str, places: str) -> None:
     values = {"y": 126, "u": 128, "v": 128}
     pixels = np.tile(np.array([values[letter] for letter in places], np.uint8).reshape(2, 2), (4, 3, 1))
     np.testing.assert_allclose(image_of(raw(encoding, pixels), PLACE).image, 128, atol=1)
-
-
-def test_a_mosaic_that_was_compressed() -> None:
-    # Proves that drivers which compress the mosaic itself are read as its name says. Oracle: a wall of one colour.
-    pattern = np.tile(np.array([[200, 120], [120, 40]], np.uint8), (8, 10))
-    content = cv2.imencode(".png", pattern)[1].tobytes()
-    image = image_of(packed("bayer_rggb8; png compressed ", content), PLACE).image
-    np.testing.assert_array_equal(image[4:-4, 4:-4].reshape(-1, 3), np.tile([200, 120, 40], (96, 1)))
 
 
 def test_compressed_depth() -> None:
@@ -137,18 +109,6 @@ def test_compressed_depth() -> None:
             metres_of(packed("16UC1; compressedDepth rvl", rest), PLACE)
     with raises("a.bag, /c, 0"):
         image_of(packed("bgr8; jpeg compressed bgr8"), PLACE)
-
-
-def test_a_choice_is_a_note_and_no_problem(tmp_path: Path) -> None:
-    # Proves that `data check` tells what was taken of two depths, and ends well.
-    pytest.importorskip("rosbags", reason="rosbags is not installed")
-    found = inspect(tiny.bag(tmp_path / "a.bag", ros2=False, more=("/camera/depth/image_raw",)))
-    assert not any("not read" in problem for problem in found.problems)
-    (note,) = (fact for fact in found.facts if "not read" in fact)
-    assert (
-        "depth of `/camera/aligned_depth/image_raw`, truth of `/mocap/pose`; not read: `/camera/depth/image_raw`"
-        in note
-    )
 
 
 @pytest.mark.parametrize(

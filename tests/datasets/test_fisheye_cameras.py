@@ -100,14 +100,6 @@ def test_a_bag_of_a_fisheye(tmp_path: Path) -> None:
         open_sequence(tiny.bag(tmp_path / "b.bag", ros2=False, lens="ftheta"))
 
 
-def test_a_lens_of_three_numbers_is_told_with_its_file(tmp_path: Path) -> None:
-    # Proves that the sentence names the file; what else may be wrong in it are rows of bad_inputs.csv.
-    sensor = of_euroc(tmp_path / "scene") / "mav0/cam0/sensor.yaml"
-    sensor.write_text(sensor.read_text().replace(", -0.0007", ""))
-    with raises("sensor.yaml", ": ", "3"):
-        tiny.quietly_opened(tmp_path / "scene")
-
-
 @pytest.mark.slow  # a minute: a run, its last adjustment
 def test_a_video_of_a_calibrated_fisheye() -> None:
     # Proves that a fisheye's images give the path when its calibration is given, and nothing is told against it.

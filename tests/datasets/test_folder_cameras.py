@@ -1,7 +1,6 @@
 """The camera of a folder: in a file of any name, in what a renamed folder says of itself, in `transforms.json`."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -42,34 +41,6 @@ def test_the_camera_of_an_export_of_record3d(tmp_path: Path) -> None:
         open_sequence(folder)
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"frames": []}, ("frames",)),
-        ({"fl_x": "wide"}, ("transforms.json", "wide")),
-        ({"fl_x": -5.0}, ("-5",)),
-        ({"camera_model": "EQUIRECTANGULAR"}, ("camera_model", "EQUIRECTANGULAR")),
-        ({"w": 10, "h": 1000}, ("10", "1000")),
-        ({"frames": [{"file_path": "../../secret.png"}]}, ("../../secret.png",)),
-    ],
-)
-def test_a_wrong_transforms_file_is_told(tmp_path: Path, change: dict[str, object], named: tuple[str, ...]) -> None:
-    # Proves that the sentence names the file, what was found and what was expected.
-    folder = tiny.nerfstudio(tmp_path / "scene")
-    content = json.loads((folder / "transforms.json").read_text())
-    (folder / "transforms.json").write_text(json.dumps({**content, **change}))
-    with raises("transforms.json", *named):
-        open_sequence(folder)
-
-
-def test_depth_that_is_listed_and_not_there_is_told(tmp_path: Path) -> None:
-    # Proves that a folder whose depth was not copied is no folder without depth.
-    folder = tiny.nerfstudio(tmp_path / "scene")
-    shutil.rmtree(folder / "depth")
-    with warns(folder / "depth", 3):
-        assert not open_sequence(folder).has_depth
-
-
 @pytest.mark.parametrize("ending", ["", ".JPEG", None])
 def test_images_that_were_listed_elsewhere_are_found_by_their_names(tmp_path: Path, ending: str | None) -> None:
     # Proves that a list made on another computer, outside its folder, reads the images that lie here, and if they were
@@ -98,13 +69,3 @@ def test_transforms_with_a_field_of_view_or_without_a_camera(tmp_path: Path) -> 
     (folder / "transforms.json").write_text(json.dumps(bare))
     with warns("scene"):
         assert not open_sequence(folder).camera.known
-
-
-def test_frames_of_several_lenses_are_told(tmp_path: Path) -> None:
-    # Proves that the middle of focal lengths that differ is taken with a word. Oracle: what was written.
-    folder = tiny.nerfstudio(tmp_path / "scene", per_frame=True)
-    content = json.loads((folder / "transforms.json").read_text())
-    content["frames"][0]["fl_x"] *= 1.5
-    (folder / "transforms.json").write_text(json.dumps(content))
-    with warns("transforms.json"):
-        assert open_sequence(folder).camera.intrinsics[0] == pytest.approx(tiny_sequences.INTRINSICS[0])

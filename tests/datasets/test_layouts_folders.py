@@ -1,7 +1,5 @@
 """Folders of images and depth, as people and programs write them: pairs, units, and what is no recording."""
 
-import shutil
-import warnings
 from pathlib import Path
 
 import cv2
@@ -13,7 +11,7 @@ from layout_checks import checked
 from reported import raises, warns
 
 from vggtgeo.datasets import open_sequence, with_depth_scale, with_rate
-from vggtgeo.io.errors import InputWarning, UnusableDepthWarning
+from vggtgeo.io.errors import UnusableDepthWarning
 
 
 @pytest.mark.parametrize(
@@ -88,57 +86,6 @@ def test_depth_of_a_phone_is_enlarged_to_the_images(tmp_path: Path) -> None:
         tiny_sequences.write_image(file, tiny_sequences.depth_codes(int(file.stem), 20, 16))
     with raises("0.png"):
         open_sequence(folder)
-
-
-def test_pictures_of_which_one_is_called_depth_are_pictures(tmp_path: Path) -> None:
-    # Proves that a folder is one of RGB-D only where half of the images have a depth.
-    folder = tiny.rgbd(tmp_path / "own", "{}.png", "other/{}.png")
-    tiny_sequences.write_image(folder / "depth_1.png", tiny_sequences.image(1))
-    assert type(tiny.quietly_opened(folder)).__name__ == "ImageFolder"
-
-
-def test_folders_that_cannot_be_paired_are_named(tmp_path: Path) -> None:
-    # Proves the errors: names without a relation, a camera of another size, a unit of depth for a sequence without.
-    folder = tiny.rgbd(tmp_path / "own", "rgb/{}_left_a1.png", "depth/{}_depth_a1.png")
-    (folder / "depth" / "2_depth_a1.png").unlink()
-    with raises("own", "3", "2"):
-        open_sequence(folder)
-    folder = tiny.rgbd(tmp_path / "resized")
-    camera = folder / "intrinsic.json"
-    camera.write_text(camera.read_text().replace(f'"width": {tiny_sequences.WIDTH}', '"width": 848'))
-    with raises("intrinsic.json", "848", "30"):
-        open_sequence(folder)
-    camera.write_text('{"fx": 50, "fy": 50, "ppx": 20, "ppy": 15}')
-    assert open_sequence(folder).camera.intrinsics == (50, 50, 20, 15)
-    camera.write_text(
-        '{"fx": 50, "fy": 50, "ppx": 20, "ppy": 15, "model": "distortion.brown_conrady", "coeffs": [0.1, -0.2, 0, 0]}'
-    )
-    assert open_sequence(folder).camera.distortion == (0.1, -0.2, 0.0, 0.0)
-    camera.write_text('{"fx": 50}')
-    with raises("intrinsic.json", "intrinsic_matrix"):
-        open_sequence(folder)
-    camera.unlink()
-    shutil.rmtree(folder / "depth")
-    alone = tiny.quietly_opened(folder)
-    assert not alone.has_depth
-    assert len(alone) == tiny.COUNT
-    with raises("resized"):
-        with_depth_scale(alone, 5000.0)
-
-
-@pytest.mark.parametrize(
-    ("kept", "told"), [(range(12), 0), (range(0, 12, 2), 0), (range(0, 12, 3), 0), (range(6), 1), (range(1, 12), 1)]
-)
-def test_images_that_are_missing_are_told(kept: range, told: int, tmp_path: Path) -> None:
-    """Of the last half, or of one; not of a colour camera that is slower than that of depth. Oracle: the numbers."""
-    for number in range(12):
-        tiny_sequences.write_image(tmp_path / f"depth/{number}.png", tiny_sequences.depth_codes(number))
-    for number in kept:
-        tiny_sequences.write_image(tmp_path / f"rgb/{number}.png", tiny_sequences.image(number % 3))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
-        open_sequence(tmp_path)
-    assert sum("depths have no image: are images missing" in str(warning.message) for warning in caught) == told
 
 
 def test_the_result_of_a_run_is_no_recording(tmp_path: Path) -> None:

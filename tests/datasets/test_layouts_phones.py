@@ -1,18 +1,15 @@
 """Readers of what phones' programs write, each on a tiny recording of just that layout."""
 
-import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny_layouts as tiny
 from layout_checks import checked
-from reported import raises, warns
 
 from vggtgeo.datasets import Sequence, open_sequence, with_rate
 from vggtgeo.datasets.check import inspect
-from vggtgeo.io.errors import InputWarning, LeftOutWarning
+from vggtgeo.io.errors import InputWarning
 
 
 def test_arkit_scenes(tmp_path: Path) -> None:
@@ -69,27 +66,6 @@ def test_polycam(tmp_path: Path, corrected: bool, inside: str) -> None:
     truth = sequence.ground_truth()
     np.testing.assert_allclose(truth.positions[:, 0], [number + corrected for number in range(3)], atol=1e-12)
     assert truth.timestamps[0] == pytest.approx(6234.5)
-
-
-def test_phone_exports_that_are_damaged(tmp_path: Path) -> None:
-    # Proves that an image without its camera is left out, that depth whose confidence is missing is used with a
-    # warning, and that cameras of other images are refused. Oracle: the names of the files.
-    folder = tiny.scanner3d(tmp_path / "a")
-    (folder / "frame_00002.json").write_text("{")
-    (folder / "conf_00004.png").write_bytes(b"")
-    with warns("frame_00002.json", "frame_00002.jpg", warning=LeftOutWarning):
-        sequence = open_sequence(folder)
-    assert [file.image.name for file in sequence.files] == ["frame_00000.jpg", "frame_00004.jpg"]
-    with warns("conf_00004.png"):
-        assert [np.isfinite(frame.depth[0, 4]) for frame in sequence.frames()] == [False, True]
-    folder = tiny.polycam(tmp_path / "b")
-    for file in folder.rglob("cameras/*.json"):
-        file.write_text(json.dumps(json.loads(file.read_text()) | {"width": 30, "height": 40}))
-    with raises("b", "30", "40"):
-        open_sequence(folder)
-    shutil.rmtree(folder / "keyframes/cameras")
-    with raises("b"):
-        open_sequence(folder, "polycam")
 
 
 def test_confidence_is_no_image(tmp_path: Path) -> None:

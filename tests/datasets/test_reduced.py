@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from recorded_run import SETTINGS as SHORT_RUN
-from reported import raises
 
 import vggtgeo as vg
-from vggtgeo.datasets.in_memory import frame_stream
 from vggtgeo.datasets.views import ReducedSequence, reduced, reduced_camera
 
 LARGE, MOST = (320, 240), 160 * 120
@@ -82,12 +78,3 @@ def test_a_run_of_large_images_says_so_and_is_right() -> None:
         assert result.intrinsics == pytest.approx(reduced_camera(sequence.camera, MOST).intrinsics, rel=1e-3)
         assert vg.evaluate(result.trajectory, truth).se3.statistics.rmse < 0.03
     assert next(vg.run(sequence, settings=settings)).keyframes[0].size == (120, 160)
-
-
-def test_a_frame_of_another_size_is_refused_with_the_sizes_that_were_read() -> None:
-    """The message speaks of the images as they are, not of the reduced ones."""
-    first, second, _ = room(LARGE).frames()
-    odd = replace(second, image=second.image[:200], depth=None)
-    stream = reduced(frame_stream([replace(first, depth=None), odd], vg.Camera.guess(*LARGE)), MOST)
-    with raises("room-00001", "320", "200"):
-        list(stream.frames())

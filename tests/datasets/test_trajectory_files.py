@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from reported import raises, warns
 from scipy.spatial.transform import Rotation
 
@@ -74,24 +73,6 @@ def test_poses_of_kitti_have_the_times_of_the_truth(tmp_path: Path) -> None:
     assert vg.evaluate(tmp_path / "00.txt", _path()).se3.statistics.maximum < 1e-9
     with raises("00.txt", "12", "9"):
         load_trajectory(tmp_path / "00.txt", _path(9))
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("", ()),
-        ("1 2 3\n", ("1", "3")),
-        ("1 " * 12 + "\n1 2\n", ("2", "'1 2'")),
-        ("0 " * 12, ()),
-        ("nan," * 16 + "nan", ()),
-    ],
-)
-@pytest.mark.filterwarnings("ignore::vggtgeo.io.errors.InputWarning")
-def test_what_is_no_trajectory_is_told(tmp_path: Path, text: str, named: tuple[str, ...]) -> None:
-    # Proves that the file and what is wrong with it are named, whatever its columns.
-    (tmp_path / "a.txt").write_text(text)
-    with raises("a.txt", *named):
-        load_trajectory(tmp_path / "a.txt")
 
 
 def test_poses_of_an_estimate_are_not_left_out_of_the_truth(tmp_path: Path) -> None:

@@ -11,10 +11,9 @@ import av
 import bad_files as bad
 import numpy as np
 import pytest
-from reported import raises, warns
+from reported import warns
 
 from vggtgeo.datasets import open_sequence, with_rate, without_depth
-from vggtgeo.datasets.check import inspect
 from vggtgeo.datasets.video_stream import Track, choose_tracks
 from vggtgeo.io.errors import GuessedCameraWarning, NoteWarning
 
@@ -129,19 +128,6 @@ def test_the_largest_track_is_read(tmp_path: Path) -> None:
     assert {frame.image.shape for frame in frames} == {(48, 64, 3)}
     assert [int(frame.image[9, 9, 0]) for frame in frames] == pytest.approx(list(map(grey, range(COUNT))), abs=4)
     assert len(sequence) == COUNT
-
-
-def test_grey_that_does_not_say_what_it_is_is_named(tmp_path: Path) -> None:
-    # Proves that a track of 16 bits without a title is no depth, and that it is told how to say so; and that depth of
-    # another size than the images is refused, unless it is left alone. Oracle: the words.
-    path = write(tmp_path / "k4a.mkv", DEPTH._replace(title=""), COLOUR)
-    (problem,) = inspect(path).problems
-    assert "-metadata:s:v:0 title=DEPTH" in problem
-    path = write(tmp_path / "other.mkv", COLOUR, DEPTH._replace(size=(80, 72)))
-    with pytest.warns(NoteWarning), raises("80 x 72", "DEPTH", "64 x 48", "--rgb-only"):
-        open_sequence(path)
-    with pytest.warns(NoteWarning):
-        assert not open_sequence(path, depth=False).has_depth
 
 
 def test_tracks_in_colour_go_before_those_in_grey_and_covers() -> None:

@@ -24,7 +24,6 @@ from vggtgeo.evaluation import (
     umeyama,
 )
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
 
 TOLERANCE = 1e-9
 
@@ -220,23 +219,6 @@ def test_a_picture_every_few_seconds_is_followed() -> None:
     assert coverage(slow.select(np.array([*range(11), 20])), slow) == 0.5
 
 
-def test_doubtful_numbers_are_named() -> None:
-    # Proves the warnings of few matches, another clock, a short estimate, an absurd scale and an RPE of no pair, and
-    # none for a good one.
-    truth = _truth()
-    good = Trajectory(truth.timestamps, _estimate(truth).poses)
-    assert evaluate_trajectory(good, truth).warnings == ()
-    assert "only 5 poses match" in evaluate_trajectory(good.select(slice(0, 5)), truth).warnings[0]
-    assert "covers 25 %" in evaluate_trajectory(good.select(slice(0, 31)), truth).warnings[0]
-    scaled = Trajectory(truth.timestamps, _scaled(good.poses, 9.0))
-    assert "the scale is 0.111" in evaluate_trajectory(scaled, truth).warnings[0]
-    assert evaluate_trajectory(good, truth, delta=119).warnings == ()
-    assert "no two poses are 120 poses apart" in evaluate_trajectory(good, truth, delta=120).warnings[0]
-    assert "no two poses are 1e+06 metres" in evaluate_trajectory(good, truth, delta=1e6, unit="metres").warnings[0]
-    shifted = Trajectory(truth.timestamps + np.where(np.arange(120) % 3, 0.012, 0.0), good.poses)
-    assert "only 40 of 120 poses match" in evaluate_trajectory(shifted, truth, max_dt=1e-4).warnings[0]
-
-
 def test_rpe_after_sim3_agrees_with_evo(tmp_path: Path) -> None:
     # Proves that the RPE of an estimate without scale, after its Sim(3) alignment, is evo's, to 1e-9.
     truth = _truth()
@@ -353,17 +335,6 @@ def test_a_still_camera_has_an_ate() -> None:
         assert absolute_error(still, still, kind).statistics.rmse == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("still", ["estimate", "truth"])
-def test_a_scale_that_means_nothing_is_said(still: str) -> None:
-    # Proves that a report warns where one of the two does not move: its scale of 1 is no finding. Oracle: a trajectory
-    # whose poses are all one.
-    moving = _truth()
-    fixed = Trajectory(moving.timestamps, np.repeat(moving.poses[:1], len(moving), axis=0))
-    found = vg.evaluate(fixed, moving) if still == "estimate" else vg.evaluate(moving, fixed)
-    assert found.warnings == (f"all positions of the {still} are equal: the scale is undefined",)
-    assert not vg.evaluate(moving, moving).warnings
-
-
 def test_rotation_angle_is_accurate_at_both_ends() -> None:
     # Proves the angle from 1e-9 rad to pi - 1e-9. Oracle: scipy's rotation vectors.
     angles = np.array([0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-9])
@@ -389,24 +360,6 @@ def _scaled(poses: np.ndarray, scale: float) -> np.ndarray:
     result = poses.copy()
     result[:, :3, 3] *= scale
     return result
-
-
-def test_what_cannot_be_compared_is_said() -> None:
-    # Proves the errors: no common time, too few poses, other lengths, impossible tolerances.
-    truth = _truth(30)
-    later = Trajectory(truth.timestamps + 500.0, truth.poses)
-    with pytest.raises(InputError, match=r"no pose of the two trajectories matches.*same clock"):
-        associate(truth, later)
-    with pytest.raises(InputError, match=r"2 poses match.*at least 3"):
-        evaluate_trajectory(truth.select(slice(0, 2)), truth)
-    with pytest.raises(InputError, match=r"`max_dt` .*nan"):
-        associate(truth, truth, max_dt=np.nan)
-    with pytest.raises(InputError, match=r"`delta` .*0"):
-        relative_error(truth, truth, delta=0)
-    with pytest.raises(InputError, match="match them first"):
-        absolute_error(truth, truth.select(slice(0, 5)))
-    with pytest.raises(InputError, match="NaN"):
-        umeyama(np.full((4, 3), np.nan), np.zeros((4, 3)))
 
 
 def test_a_delta_beyond_the_trajectory_gives_no_pairs() -> None:

@@ -38,12 +38,6 @@ def test_depth_error_of_nothing_is_nan() -> None:
     assert (found.count, found.coverage) == (0, 0.0)
 
 
-def test_depth_of_zero_is_refused() -> None:
-    # Proves that an invalid depth coded as 0 does not enter an error silently.
-    with pytest.raises(InputError, match="`depth`"):
-        depth_error(np.zeros((2, 2)), np.ones((2, 2)))
-
-
 def test_depth_of_a_cloud_is_the_nearest_point_of_each_pixel() -> None:
     # Proves that a depth map turned into world points comes back exactly, with a farther cloud behind it and points
     # behind the camera ignored. Oracle: the depth map.
@@ -59,12 +53,6 @@ def test_depth_of_a_cloud_is_the_nearest_point_of_each_pixel() -> None:
     local = np.concatenate([local, 2.0 * local, -local])
     world = (local - pose[:3, 3]) @ pose[:3, :3]
     np.testing.assert_allclose(depth_of_cloud(world, pose, camera), depth, atol=1e-12)
-
-
-def test_depth_of_a_cloud_refuses_distortion() -> None:
-    # Proves that distortion is not ignored silently.
-    with pytest.raises(InputError, match="`camera`"):
-        depth_of_cloud(np.ones((1, 3)), np.eye(4), Camera((50.0, 50.0, 20.0, 15.0), 40, 30, (0.1, 0.0, 0.0, 0.0)))
 
 
 @pytest.mark.parametrize("threshold", [0.05, 0.3, 10.0])
@@ -86,17 +74,6 @@ def test_cloud_error_equals_brute_force(threshold: float) -> None:
 def test_clouds_apart_have_an_f_score_of_zero() -> None:
     # Proves that no point within the threshold gives 0, not a division by zero.
     assert cloud_error(np.zeros((3, 3)), np.ones((3, 3))).f_score == 0.0
-
-
-def test_impossible_clouds_are_refused() -> None:
-    # Proves the errors of an empty cloud, NaN and an impossible threshold, each naming its argument.
-    points = np.zeros((2, 3))
-    with pytest.raises(InputError, match=r"`truth` .*shape"):
-        cloud_error(points, np.zeros((0, 3)))
-    with pytest.raises(InputError, match=r"`estimate` .*NaN"):
-        cloud_error(np.full((2, 3), np.nan), points)
-    with pytest.raises(InputError, match=r"`threshold` .*0"):
-        cloud_error(points, points, 0.0)
 
 
 def test_cloud_error_has_the_distances_of_open3d() -> None:
@@ -143,17 +120,6 @@ def test_meshes_of_one_surface_agree_however_it_is_cut() -> None:
     assert (found.precision, found.recall) == (1.0, 1.0)
     assert found.mean_distance == pytest.approx(0.03, rel=0.03)
     assert mesh_error((grid, many), two, threshold=0.025).f_score == 0.0
-
-
-def test_impossible_meshes_are_refused() -> None:
-    # Proves the errors of a face without vertex, of no area, and of no spacing.
-    vertices = np.zeros((3, 3))
-    with pytest.raises(InputError, match="to 3"):
-        surface_points((vertices, np.array([[0, 1, 3]])), 0.1)
-    with pytest.raises(InputError, match="no face with an area"):
-        surface_points((vertices, np.array([[0, 1, 2]])), 0.1)
-    with pytest.raises(InputError, match=r"`spacing` .*0"):
-        surface_points((np.eye(3), np.array([[0, 1, 2]])), 0.0)
 
 
 def test_nees_of_right_covariances_keeps_to_its_band() -> None:

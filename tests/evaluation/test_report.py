@@ -10,7 +10,7 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 import pytest
-from recorded_run import FRAMES, SETTINGS, RecordedRun, recorded_run
+from recorded_run import FRAMES, RecordedRun, recorded_run
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
 
@@ -27,6 +27,7 @@ from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
+from vggtgeo.slam.window.sliding_window import MAX_ITERATIONS
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
@@ -100,7 +101,7 @@ def test_every_adjustment_is_recorded_once(run: RecordedRun) -> None:
         assert record.units["points"] == "px"
         assert set(record.rms) == set(record.counts) <= {"points", "lines", "depth", "relative_poses"}
         assert record.energy[1] <= record.energy[0]
-        assert 1 <= record.iterations <= SETTINGS.window.window_iterations
+        assert 1 <= record.iterations <= MAX_ITERATIONS
 
 
 def test_errors_against_a_truth_without_metres_are_no_centimetres(run: RecordedRun, tmp_path: Path) -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import struct
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -17,16 +15,15 @@ import pytest
 from plyfile import PlyData
 from posed_keyframes import keyframe_of, slots_of
 from recorded_run import recorded_run
-from reported import raises, warns
+from reported import warns
 from scipy.spatial.transform import Rotation
-from small_disk import small_disk
 from typer.testing import CliRunner
 from vggtgeo.models.roles import LineMatches, PointMatches
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
 from vggtgeo.datasets import open_sequence
-from vggtgeo.export import FORMATS, export
+from vggtgeo.export import export
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
@@ -222,33 +219,6 @@ def test_colours_are_shown_as_those_of_the_pictures(
     np.testing.assert_array_equal(shown(tmp_path / "out"), own(run))
 
 
-@pytest.mark.long
-def test_every_frame_with_its_picture(tmp_path: Path) -> None:
-    # Proves that frames which are no keyframes are in the exports, with their poses, pictures and depth, once the run
-    # kept them. Oracle: the run's trajectory and frames; pycolmap, whose reprojection error stays the stated one.
-    run, frames = recorded_run(), recorded_run().sequence
-    result = vg.Result.of(run.slam)
-    folder = tmp_path / "room"
-    result.save(folder, depth="every", frames=frames)
-    scene = Scene.load(folder)
-    assert scene.frames.tolist() == [record.frame for record in run.slam.frames]
-    np.testing.assert_allclose(np.linalg.inv(scene.poses), result.trajectory.poses, atol=1e-9)
-    export(folder, "nerfstudio", tmp_path / "n")
-    written = json.loads((tmp_path / "n/transforms.json").read_text())["frames"]
-    assert len(written) == len(scene.frames) > len(run.slam.keyframes)
-    assert all((tmp_path / "n" / frame["depth_file_path"]).is_file() for frame in written)
-    true = np.array([frame.image for frame in frames.frames()], int)
-    for row, read in enumerate(open_sequence(tmp_path / "n").frames()):
-        assert np.abs(true - read.image).mean(axis=(1, 2, 3)).argmin() == row
-    stated = export(folder, "colmap", tmp_path / "c")
-    pycolmap = pytest.importorskip("pycolmap")
-    model = pycolmap.Reconstruction(str(tmp_path / "c/sparse/0"))
-    assert model.num_images() == len(scene.frames)
-    model.update_point_3d_errors()
-    error = stated["mean_reprojection_error_over_points_px"]
-    assert model.compute_mean_reprojection_error() == pytest.approx(error, abs=1e-3)
-
-
 def test_borders_that_no_pixel_fills_are_masked(tmp_path: Path) -> None:
     # Proves that both formats say which pixels an undistorted picture made up, and neither does where there are none.
     result = vg.Result.of(recorded_run().slam)
@@ -321,83 +291,6 @@ def test_an_export_again_replaces_what_an_export_wrote(folder: Path, tmp_path: P
     assert (tmp_path / "out/trajectory.txt").read_text() == "somebody's"
 
 
-def test_no_export_mixes_its_images_with_those_of_a_recording(folder: Path, tmp_path: Path) -> None:
-    # Proves that an export into a recording is refused, whose next run would read both; a second one over the first is
-    # not. Oracle: the files that lie there.
-    recording = tmp_path / "recording"
-    (recording / "images").mkdir(parents=True)
-    shutil.copy(next((folder / "images").iterdir()), recording / "images/mine.jpg")
-    for to in ("nerfstudio", "tum"):
-        with pytest.raises(vg.InputError, match="recording` is a recording; give another folder"):
-            export(folder, to, recording)
-    assert [path.name for path in sorted((recording / "images").iterdir())] == ["mine.jpg"]
-    for to in ("nerfstudio", "colmap", "nerfstudio"):
-        export(folder, to, tmp_path / "new")
-    shutil.copy(recording / "images/mine.jpg", tmp_path / "new/images")
-    with raises("mine.jpg"):
-        export(folder, "nerfstudio", tmp_path / "new")
-
-
-def test_a_full_disk_leaves_the_record_of_what_exports_wrote(folder: Path, tmp_path: Path) -> None:
-    # Proves that an export that cannot note its files any more names the folder, and that the next one still knows the
-    # files of the one before as its own. Oracle: the record's bytes, and that next export.
-    target = tmp_path / "out"
-    export(folder, "tum", target)
-    before = (target / ".vggtgeo-export").read_bytes()
-
-    def other(source: Path, stage: Path) -> dict[str, float]:
-        (stage / f"{'x' * 200}.txt").touch()
-        return {}
-
-    with patch.dict(FORMATS, tum=other), small_disk(100), pytest.raises(OSError, match=r"out/\.vggtgeo-export"):
-        export(folder, "tum", target)
-    assert (target / ".vggtgeo-export").read_bytes() == before
-    with patch.dict(FORMATS, tum=other), small_disk(0), raises(target, error=OSError):
-        export(folder, "tum", target)
-    export(folder, "tum", target)
-
-
-def test_a_damaged_run_leaves_the_export_before(folder: Path, tmp_path: Path) -> None:
-    # Proves that pictures and depth that are none are named, and that what an earlier export wrote stays as it was,
-    # without a trace of the new one. Oracle: the files before.
-    copy, target = _changed(folder, tmp_path), tmp_path / "out"
-    export(copy, "nerfstudio", target)
-    before = {path: path.read_bytes() for path in target.rglob("*") if path.is_file()}
-    depth, picture = next((copy / "depth").glob("*.depth.png")), sorted((copy / "images").iterdir())[-1]
-    whole = depth.read_bytes()
-    cv2.imwrite(str(depth), np.zeros((4, 4, 3), np.uint8))
-    with raises("depth.png", "(4, 4, 3)"):
-        export(copy, "nerfstudio", target)
-    depth.write_bytes(whole)
-    for content, message in ((b"", picture.name), (None, "images/")):
-        picture.unlink() if content is None else picture.write_bytes(content)
-        for name in ("nerfstudio", "colmap"):
-            with pytest.raises(vg.InputError, match=message):
-                export(copy, name, target)
-    assert {path: path.read_bytes() for path in target.rglob("*") if path.is_file()} == before
-    assert {path.name for path in target.iterdir()} == {path.relative_to(target).parts[0] for path in before}
-    with pytest.raises(vg.InputError, match="is the folder of the run itself"):
-        export(copy, "colmap", copy)
-
-
-def test_targets_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None:
-    # Proves that an export does not write among the run's own pictures nor below a file, and leaves no empty folder
-    # where it fails. Oracle: sentences, and the files before.
-    copy = _changed(folder, tmp_path)
-    before = sorted(copy.rglob("*"))
-    with pytest.raises(vg.InputError, match="which is the run's own; give another"):
-        export(copy, "colmap", copy / "images/model")
-    file = tmp_path / "file"
-    file.write_text("somebody's")
-    for target in (file, file / "below"):
-        with pytest.raises(vg.InputError, match=r"/file` is not a folder"):
-            export(copy, "tum", target)
-    (copy / "map.ply").unlink()
-    with raises("map.ply"):
-        export(copy, "las")
-    assert sorted(copy.rglob("*")) == [path for path in before if path.name != "map.ply"]
-
-
 def test_submaps_that_nothing_ties_to_the_map_are_left_out(tmp_path: Path) -> None:
     # Proves that keyframes of another submap, which stand anywhere, are in no COLMAP model, with their
     # pictures and what they saw. Oracle: the run whole, and with its last keyframe cut off.
@@ -419,15 +312,6 @@ def test_submaps_that_nothing_ties_to_the_map_are_left_out(tmp_path: Path) -> No
     assert {path.name for path in (tmp_path / "images").iterdir()} == {
         left.image_name(k) for k in range(len(left.frames))
     }
-
-
-def test_clouds_that_a_format_cannot_hold_are_named(folder: Path, tmp_path: Path) -> None:
-    # Proves the error of a cloud wider than LAS counts millimetres. Oracle: the sentence.
-    pytest.importorskip("laspy")
-    copy = _changed(folder, tmp_path)
-    PointCloud(np.array([[0.0, 0, 0], [3e6, 0, 0]]), np.zeros((2, 3), np.uint8)).save_ply(copy / "map.ply")
-    with pytest.raises(vg.InputError, match=r"map.ply` .*3e\+06 m.*2147484 m"):
-        export(copy, "las", tmp_path / "out")
 
 
 def test_a_run_without_points_or_surfaces_is_refused(folder: Path, tmp_path: Path) -> None:
@@ -455,38 +339,3 @@ def test_a_run_without_points_or_surfaces_is_refused(folder: Path, tmp_path: Pat
     with warns("3 %"):
         export(copy, "tum")
     assert (copy / "export/tum/trajectory.txt").is_file()
-
-
-def test_an_export_says_what_it_lacks_and_what_its_error_is_of(folder: Path, tmp_path: Path) -> None:
-    # Proves the hint of a nerfstudio export without depth images, and the words beside COLMAP's reprojection error.
-    # Oracle: the sentences.
-    copy = _changed(folder, tmp_path)
-    shutil.rmtree(copy / "depth")
-    with warns("--save-depth"):
-        export(copy, "nerfstudio")
-    done = CliRunner().invoke(make_app(), ["export", str(copy), "--to", "colmap"])
-    assert re.search(r", 0\.\d+ px mean reprojection error over points$", done.stdout.strip()), done.stdout
-
-
-def test_what_is_no_run_is_refused(tmp_path: Path, folder: Path) -> None:
-    # Proves the errors of an empty folder, an unknown format, and a scene of another layout, or damaged.
-    with raises("summary.json"):
-        export(tmp_path, "colmap")
-    with raises("to", "colmap", "'obj'"):
-        export(folder, "obj")
-    assert set(FORMATS) == {"colmap", "nerfstudio", "ply", "glb", "las", "tum", "kitti"}
-    replace(SCENE, version=99).write(tmp_path / "scene.npz", 0)
-    with raises("scene.npz", 99):
-        Scene.load(tmp_path)
-    scene = Scene.load(folder)
-    for name, wrong in (
-        ("view", replace(scene, tracks=replace(scene.tracks, view=scene.tracks.view + 1000))),
-        ("poses", replace(scene, poses=np.zeros(3))),
-        ("Tracks", scene.tracks),
-    ):
-        SCENE.write(tmp_path / "scene.npz", wrong)
-        with raises("scene.npz", name):
-            Scene.load(tmp_path)
-    (tmp_path / "scene.npz").write_bytes((folder / "scene.npz").read_bytes()[:100])
-    with raises("scene.npz"):
-        Scene.load(tmp_path)

@@ -1,6 +1,5 @@
 """The picture of a trajectory: what can be proved of it without looking."""
 
-import re
 from pathlib import Path
 
 import cv2
@@ -112,26 +111,6 @@ def test_the_title_tells_the_error() -> None:
     assert plots._title(drawn, "clip", False, metres=True) == "clip:  ATE 0.00 cm after SE(3) (40 poses)"
     drawn = plots._align(walk, _turned(walk, 1), None, with_scale=True)
     assert "after Sim(3)" in plots._title(drawn, "", True, metres=True)
-
-
-def test_a_truth_without_metres_gives_no_centimetres() -> None:
-    # Proves that a truth of COLMAP is aligned with a scale, and errors are called what they are. Oracle: the walk in a
-    # unit of 0.8 m, every second pose 0.01 of them aside.
-    walk = _walk()
-    poses = walk.poses.copy()
-    poses[:, :3, 3] /= 0.8
-    poses[::2, 1, 3] += 0.02
-    figure = plots.trajectory_figure(walk, Trajectory(walk.timestamps, poses), metres=False)
-    assert figure._suptitle is not None
-    assert re.fullmatch(r"ATE 0\.00999\d* after Sim\(3\) \(40 poses\)", figure._suptitle.get_text())
-    assert all("[unit of the truth]" in axes.get_ylabel() for axes in figure.axes)
-
-
-def test_an_empty_trajectory_is_refused(tmp_path: Path) -> None:
-    # Proves that nothing to draw is an error, and leaves no file.
-    with pytest.raises(InputError, match="`estimate` has no pose"):
-        plots.plot_trajectory(tmp_path / "trajectory.png", _walk().select(slice(0, 0)))
-    assert not list(tmp_path.iterdir())
 
 
 def _has(image: np.ndarray, colour: str) -> bool:

@@ -105,16 +105,3 @@ def test_impossible_intrinsics_are_refused(intrinsics: tuple[float, float, float
     # Proves that no camera is made of impossible intrinsics, and that the error names the argument.
     with raises("intrinsics", named):
         Camera(intrinsics, 640, 480)
-
-
-def test_impossible_distortion_and_size_are_refused() -> None:
-    # Proves the same for a wrong number of coefficients, NaN among them, an empty image, and one of another size.
-    with raises("distortion", 3):
-        Camera(INTRINSICS, WIDTH, HEIGHT, (0.1, 0.2, 0.3))
-    with raises("distortion", "nan"):
-        Camera(INTRINSICS, WIDTH, HEIGHT, (0.1, math.nan, 0.0, 0.0))
-    with raises("0 x 120"):
-        Camera(INTRINSICS, 0, HEIGHT)
-    undistorter = Camera(INTRINSICS, WIDTH, HEIGHT, DISTORTIONS["barrel"]).undistorter()
-    with raises("image", "80 x 60", "160 x 120"):
-        undistorter.image(np.zeros((60, 80, 3), np.uint8))

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import os
 import struct
-import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,11 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 import tiny_sequences as tiny
-from changed_file import with_arrays, with_header
 from picture_bytes import TURN
 from problem_files import SCENE, arrays_of
-
-from vggtgeo.bundle.problem_file import save_problem
 
 WIDTH, HEIGHT = 64, 48
 
@@ -51,36 +45,9 @@ def with_image(content: Callable[[], bytes], suffix: str = ".png") -> Callable[[
     return make
 
 
-def beside(change: Callable[[Path], Any]) -> Callable[[Path], Path]:
-    """Good images, and something that `change` does in their folder."""
-
-    def make(folder: Path) -> Path:
-        change(frames(folder / "frames"))
-        return folder / "frames"
-
-    return make
-
-
-def recorded(make: Callable[[Path], Path], change: Callable[[Path], Any]) -> Callable[[Path], Path]:
-    """A recording in the layout of a benchmark or an app, in which `change` has changed something."""
-
-    def both(folder: Path) -> Path:
-        place = make(folder / "scan")
-        change(place)
-        return place
-
-    return both
-
-
 def encoded(suffix: str, image: np.ndarray | None = None, *options: int) -> bytes:
     """A whole file of an image."""
     return cv2.imencode(suffix, picture(1) if image is None else image, list(options))[1].tobytes()
-
-
-def cut_jpeg(progressive: bool = False) -> bytes:
-    """Half a JPEG, with an end mark."""
-    whole = encoded(".jpg", picture(1, 320, 240), cv2.IMWRITE_JPEG_PROGRESSIVE, int(progressive))
-    return whole[: len(whole) // 2] + b"\xff\xd9"
 
 
 def turned_jpeg() -> bytes:
@@ -88,18 +55,6 @@ def turned_jpeg() -> bytes:
     part = b"Exif\0\0" + TURN
     whole = encoded(".jpg")
     return whole[:2] + b"\xff\xe1" + struct.pack(">H", len(part) + 2) + part + whole[2:]
-
-
-def huge_png(width: int = 60000, height: int = 60000) -> bytes:
-    """A PNG of some bytes that declares more pixels than fit into memory."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
-    )
 
 
 def rgbd(change: Callable[[Path], Any]) -> Callable[[Path], Path]:
@@ -138,18 +93,6 @@ def video(path: Path, count: int = 12, walk: bool = False) -> Path:
     return path
 
 
-def holed_video(folder: Path) -> Path:
-    """A video whose data are zeros from four tenths to half, as a download in pieces leaves them."""
-    whole = bytearray(video(folder / "clip.mp4", 40, walk=True).read_bytes())
-    start = whole.index(b"mdat") + 4
-    length = int.from_bytes(whole[start - 8 : start - 4], "big") - 8
-    hole = slice(start + length * 4 // 10, start + length * 5 // 10)
-    whole[hole] = bytes(hole.stop - hole.start)
-    (folder / "clip.mp4").write_bytes(whole)
-    (folder / "calibration.txt").write_text("55 55 31.5 23.5")
-    return folder / "clip.mp4"
-
-
 def problem(**changes: Any) -> Callable[[Path], Path]:
     """A problem file of the flat layout with other arrays; None leaves one out; functions get what was there."""
 
@@ -161,61 +104,6 @@ def problem(**changes: Any) -> Callable[[Path], Path]:
         return folder / "problem.npz"
 
     return make
-
-
-def put(index: Any, value: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """A copy with `value` at `index`."""
-
-    def change(array: np.ndarray) -> np.ndarray:
-        array[index] = value
-        return array
-
-    return change
-
-
-def without_keyframe(number: int) -> Callable[[Path], Path]:
-    """A problem in which no match of positive weight reaches a keyframe."""
-    seen = SCENE.observations
-    touches = lambda edge: (seen.edges[edge] == number).any(axis=1)
-    return problem(
-        pt_weight=np.where(touches(seen.point_edge), 0.0, seen.point_weight),
-        ln_weight=np.where(touches(seen.line_edge), 0.0, seen.line_weight),
-    )
-
-
-def member(name: str, header: dict[str, Any] | None, data: bytes = b"", **changes: Any) -> Callable[[Path], Path]:
-    """A problem file in which the member `name` has a header and data of one's own."""
-
-    def make(folder: Path) -> Path:
-        good = problem(**{name: None}, **changes)(folder)
-        file = io.BytesIO()
-        if header is not None:
-            np.lib.format.write_array_header_1_0(file, header)
-        with zipfile.ZipFile(good, "a", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr(f"{name}.npy", file.getvalue() + data)
-        return good
-
-    return make
-
-
-def saved(
-    arrays: Callable[[dict[str, np.ndarray]], Any] = lambda old: None,
-    header: Callable[[dict[str, Any]], Any] = lambda old: None,
-) -> Callable[[Path], Path]:
-    """A problem that `save_problem` wrote, with other arrays or another header."""
-
-    def make(folder: Path) -> Path:
-        save_problem(folder / "saved.npz", *SCENE.pack())
-        return with_header(with_arrays(folder / "saved.npz", arrays), header)
-
-    return make
-
-
-def nested(header: dict[str, Any]) -> None:
-    """A header whose tree is nested 900 times."""
-    header["tree"] = []
-    for _ in range(900):
-        header["tree"] = [header["tree"]]
 
 
 def file(name: str, content: str | bytes) -> Callable[[Path], Path]:
@@ -236,11 +124,6 @@ def lengthened(path: Path, size: int = 20_000_000_000) -> Path:
     path.touch()
     os.truncate(path, size)
     return path
-
-
-def truth(lines: str | bytes) -> Callable[[Path], Path]:
-    """A trajectory file."""
-    return file("truth.txt", lines)
 
 
 def walk(path: Path, seed: int, count: int = 60, start: float = 0.0) -> Path:

@@ -12,19 +12,6 @@ import numpy as np
 
 from vggtgeo.io.persistence import DATA, HEADER
 
-Arrays = dict[str, np.ndarray]
-
-
-def read(path: Path) -> tuple[dict[str, Any], Arrays]:
-    """Return the header and the named arrays of a file."""
-    with np.load(path) as file:
-        header, data = json.loads(file[HEADER].tobytes()), file[DATA]
-    arrays = {}
-    for name, (kind, first, shape, _) in header["arrays"].items():
-        size = int(np.prod(shape)) * np.dtype(kind).itemsize
-        arrays[name] = data[first : first + size].view(kind).reshape(shape).copy()
-    return header, arrays
-
 
 def write(path: Path, header: Any, data: bytes) -> Path:
     """Write a header and all bytes."""
@@ -41,16 +28,3 @@ def with_header(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
         header, data = json.loads(file[HEADER].tobytes()), file[DATA].tobytes()
     changed = change(header)
     return write(path, changed if isinstance(changed, list | str) else header, data)
-
-
-def with_arrays(path: Path, change: Callable[[Arrays], Any], target: Path | None = None) -> Path:
-    """Change the arrays, in place unless there is a `target`."""
-    header, arrays = read(path)
-    change(arrays)
-    blocks, size = [], 0
-    header["arrays"] = {}
-    for name, values in arrays.items():
-        header["arrays"][name] = [values.dtype.str, size, list(values.shape), None]
-        blocks.append(np.ascontiguousarray(values).tobytes())
-        size += len(blocks[-1])
-    return write(target or path, header, b"".join(blocks))

@@ -23,7 +23,7 @@ from vggtgeo.slam.window_recorder import WindowRecorder
 FRAMES = 9
 # The shape of tests/slam/test_pipeline.py, so that a process that runs both compiles the solver once.
 SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    window=WindowSettings(size=4, point_slots=96, line_slots=48),
     refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))

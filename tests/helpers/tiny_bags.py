@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import tiny_layouts as tiny
 from scipy.spatial.transform import Rotation
@@ -55,26 +54,6 @@ def write(path: Path, **topics: Topic) -> Path:
                     )
                     writer.write(connection, int(1e9 * stamp(number)), raw)
     return path
-
-
-def write_ros2(folder: Path, declared: int = COUNT) -> Path:
-    """A ROS 2 bag of images, whose metadata declares so many of them."""
-    from rosbags.rosbag2 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store, (kind, content) = get_typestore(Stores.ROS2_HUMBLE), image()
-    with Writer(folder, version=8) as writer:
-        connection = writer.add_connection("/c/image", kind, typestore=store)
-        for number in range(COUNT):
-            fields = content(number)
-            assert isinstance(fields, Mapping)
-            whole, rest = divmod(round(1e9 * fields["time"]), 10**9)
-            header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](whole, rest), "c")
-            message = store.types[kind](header, *(value for name, value in fields.items() if name != "time"))
-            writer.write(connection, int(1e9 * stamp(number)), store.serialize_cdr(message, kind))
-    metadata = folder / "metadata.yaml"
-    metadata.write_text(metadata.read_text().replace(f"message_count: {COUNT}", f"message_count: {declared}"))
-    return folder
 
 
 def _made(store: Any, kind: str, fields: Fields) -> Any:
@@ -134,16 +113,6 @@ def image(pixels: Callable[[int], np.ndarray] = tiny.image, encoding: str = "rgb
     return IMAGE, fields
 
 
-def packed(content: Callable[[int], bytes], kind: str = "jpeg") -> Topic:
-    """Compressed images, or depth."""
-    fields = lambda number: {
-        "time": stamp(number),
-        "format": kind,
-        "data": np.frombuffer(content(number), np.uint8),
-    }
-    return COMPRESSED, fields
-
-
 def info(
     size: tuple[int, int] = SIZE,
     matrix: Callable[[int], Any] = lambda number: MATRIX,
@@ -168,23 +137,3 @@ def info(
         "region": region,
     }
     return INFO, fields
-
-
-def pose(
-    place: Callable[[int], tuple[float, ...]] = lambda number: (float(number), 0.0, 0.0),
-    turn: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0),
-    time: Callable[[int], float] = stamp,
-) -> Topic:
-    """The truth."""
-    return POSE, lambda number: {"time": time(number), "place": place(number), "turn": turn}
-
-
-def but(topic: Topic, number: int, content: Fields | bytes | None) -> Topic:
-    """The same topic, with another message of this number."""
-    kind, fields = topic
-    return kind, lambda each: content if each == number else fields(each)
-
-
-def jpeg(number: int) -> bytes:
-    """A picture, as cameras compress it."""
-    return cv2.imencode(".jpg", tiny.image(number))[1].tobytes()

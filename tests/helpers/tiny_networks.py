@@ -228,28 +228,3 @@ def _decoded(view: int, reach: int) -> list[onnx.NodeProto]:
         helper.make_node("Identity", ["confidence"], [f"confidence_{view}"]),
         helper.make_node("Identity", ["confidence"], [f"descriptor_confidence_{view}"]),
     ]
-
-
-def endless(path: Path, size: tuple[int, int] = (28, 42)) -> Path:
-    """Lines that are all zero, after a loop that has no end."""
-    scalar = lambda name, kind: helper.make_tensor_value_info(name, kind, [])
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["on"], ["still on"]), helper.make_node("Add", ["sum", "one"], ["more"])],
-        "body",
-        [scalar("turn", TensorProto.INT64), scalar("on", TensorProto.BOOL), scalar("sum", TensorProto.FLOAT)],
-        [scalar("still on", TensorProto.BOOL), scalar("more", TensorProto.FLOAT)],
-    )
-    nodes = [
-        helper.make_node("Loop", ["", "true", "zero"], ["end"], body=body),
-        helper.make_node("Mul", ["end", "none"], ["pred_lines"]),
-        helper.make_node("Identity", ["logits"], ["pred_logits"]),
-    ]
-    constants = {
-        "true": np.array(True),
-        "zero": np.zeros((), np.float32),
-        "one": np.ones((), np.float32),
-        "none": np.zeros((1, 1, 4), np.float32),
-        "logits": np.zeros((1, 1, 2), np.float32),
-    }
-    outputs = {"pred_logits": (1, 1, 2), "pred_lines": (1, 1, 4)}
-    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, {METADATA_NETWORK: "letr"})

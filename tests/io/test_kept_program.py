@@ -122,41 +122,6 @@ def test_changed_sources_have_another_program(folder: Path, monkeypatch: pytest.
     assert len(list(folder.iterdir())) == 2
 
 
-@pytest.mark.parametrize("content", [b"", b"no program", None], ids=["empty", "text", "half"])
-def test_a_damaged_file_is_made_anew(folder: Path, content: bytes | None) -> None:
-    KeptProgram(pair, _as_pair)(ONE, TWO, 3.0)
-    (file,) = folder.iterdir()
-    whole = file.read_bytes()
-    file.write_bytes(whole[: len(whole) // 2] if content is None else content)
-    _expected(KeptProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
-    _expected(KeptProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
-    assert TRACED == ["pair", "pair"]
-
-
-def test_what_has_no_lasting_name_is_not_kept(folder: Path) -> None:
-    """A function made inside a function, and a kernel of a user's own: another process may mean another by it."""
-
-    class Own(vg.kernels.AbstractKernel):
-        def rho(self, s: jax.Array) -> jax.Array:
-            return s
-
-    _expected(KeptProgram(lambda *given: pair(*given[:2], given[2]), _as_pair)(ONE, TWO, 3.0), 3.0)
-    assert kept_program._lasting_name(Own()) is None
-    assert kept_program._lasting_name((1.0, Own)) is None
-    assert kept_program._lasting_name(vg.kernels.Cauchy(1.0)) is not None
-    assert not folder.exists()
-
-
-def test_a_result_of_another_structure_is_not_kept(folder: Path) -> None:
-    _expected(KeptProgram(pair, lambda first, second, factor: first)(ONE, TWO, 3.0), 3.0)
-    assert not folder.exists()
-
-
-def test_a_folder_that_cannot_be_written_costs_time_alone(folder: Path) -> None:
-    folder.write_text("a file")
-    _expected(KeptProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
-
-
 def test_traced_arguments_pass_through(folder: Path) -> None:
     program = KeptProgram(pair, _as_pair)
     slope = jax.grad(lambda first: jnp.sum(program(first, jnp.asarray(TWO), 3.0).scaled))(jnp.asarray(ONE))

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reported import raises
 
 import vggtgeo as vg
-from vggtgeo.datasets import Frame, without_depth
-from vggtgeo.geometry import rigid
-from vggtgeo.io.errors import InputError
+from vggtgeo.datasets import Frame
 from vggtgeo.learning import (
     Batch,
     ConfidenceNetwork,
     TrackedWindow,
-    compare,
     error_and_gradient,
-    recorded_windows,
     slid_error_and_gradient,
     stack,
     stack_sequences,
@@ -58,18 +51,6 @@ def test_windows_hold_what_they_say(windows: list[TrackedWindow]) -> None:
         assert ((window.saliency >= 0) & (window.saliency <= 1)).all()
 
 
-@pytest.mark.long
-def test_every_match_is_stored_with_its_own_features(windows: list[TrackedWindow], batch: Batch) -> None:
-    """The padded arrays hold each match's features beside its target; oracle: a mark put into one match."""
-    marked = windows[0].features.copy()
-    marked[7] = 1234.5
-    again = stack([replace(windows[0], features=marked)])
-    edge, point, _ = np.nonzero(np.asarray(again.features[0]) == 1234.5)
-    target = np.asarray(again.problem.points.target[0, edge[0], point[0]])
-    np.testing.assert_allclose(target, windows[0].observations.point_target[7])
-    assert int(batch.present.sum()) == sum(len(window.error) for window in windows)
-
-
 def test_a_recording_tells_where_matches_belong() -> None:
     """Corners are carried from frame to frame by measured depth and true poses, and are hidden behind what is nearer;
     oracle: a wall two metres away that a camera moves along, and a board before it in the second frame.
@@ -88,34 +69,6 @@ def test_a_recording_tells_where_matches_belong() -> None:
     np.testing.assert_allclose(target[[0, 1, 3]], pixels[[0, 1, 3]] - [5.0, 0.0], atol=1e-9)
     assert np.isnan(target[2]).all(), "no depth there"
     np.testing.assert_array_equal(shown, [True, False, False, True])
-
-
-@pytest.mark.long
-def test_windows_of_a_recording_are_right_where_the_truth_is_exact() -> None:
-    """A rendered recording gives windows whose poses are the true ones, and whose right matches, solved for, bring the
-    poses back from 3 cm; oracle: the renderer's poses.
-    """
-    sequence = vg.simulate("room", 30, 101, (160, 120), rate=10.0)
-    (window,) = recorded_windows(sequence, 1, keyframes=3, points=24, spacing=4, seed=1)
-    truth = sequence.ground_truth()
-    centres = rigid.invert(rigid.to_matrix(window.poses))[:, :3, 3]
-    away = np.linalg.norm(truth.positions[:, None] - centres, axis=-1).min(0)
-    assert away.max() < 1e-9, away
-    assert np.mean(window.right) > 0.5, window.error
-    batch = stack([window])
-    chosen = batch.select(0)
-    error, _ = error_and_gradient(chosen, jnp.where(chosen.right, 1.0, MIN_CONFIDENCE))
-    start = np.linalg.norm(window.start[1:, 4:] - window.poses[1:, 4:], axis=1)
-    assert float(error) < 0.5 * start.max(), (float(error), start)
-
-
-def test_recordings_without_depth_or_truth_are_refused() -> None:
-    """What lacks is named; oracle: the sentences."""
-    sequence = vg.simulate("room", 30, 101, (160, 120))
-    with pytest.raises(InputError, match="has no depth"):
-        next(recorded_windows(without_depth(sequence), 1))
-    with raises(30, 37):
-        next(recorded_windows(sequence, 1, spacing=12))
 
 
 @pytest.mark.long
@@ -155,24 +108,6 @@ def test_the_gradient_through_slid_windows_is_that_of_the_error(depth: bool) -> 
         found = float(jnp.sum(gradient * along))
         assert found == pytest.approx(by_differences, rel=1e-3, abs=1e-6), (row, found, by_differences)
     assert not np.asarray(gradient)[~np.asarray(windows.present)].any()
-
-
-@pytest.mark.long
-def test_a_failed_solve_is_no_small_error(batch: Batch) -> None:
-    """Weights that are no numbers give NaN, not the error of the start."""
-    window = batch.select(0)
-    error, _ = error_and_gradient(window, jnp.full(window.present.shape, jnp.nan))
-    assert np.isnan(float(error))
-
-
-@pytest.mark.long
-def test_methods_are_told_apart(batch: Batch) -> None:
-    """`compare` with a network that says what the oracle knows gives the oracle's errors."""
-    knows = jax.tree_util.Partial(lambda _: jnp.where(batch.right, jnp.ones_like(batch.saliency), MIN_CONFIDENCE))
-    found = compare(batch, knows)
-    np.testing.assert_array_equal(found.learned, found.oracle)
-    assert not np.allclose(found.uniform, found.saliency)
-    assert set(found.to_dict()) == {"uniform", "saliency", "learned", "oracle"}
 
 
 @pytest.mark.long

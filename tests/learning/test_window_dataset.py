@@ -10,7 +10,6 @@ import pytest
 from reported import raises
 
 import vggtgeo as vg
-from vggtgeo.io.errors import InputError
 from vggtgeo.learning.window_dataset import RunWindows, WindowDataset, WindowWriter, stack_windows
 
 SIZE = vg.PaddedSize(keyframes=3, points=16, lines=0, degree=2)
@@ -143,19 +142,6 @@ def test_grain_takes_it_as_it_is(folder: Path) -> None:
     expected = stack_windows([data[seeds[0]]])
     for a, b in zip(jax.tree.leaves(loaded[0].problem), jax.tree.leaves(expected.problem), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_windows_of_another_shape_are_refused(tmp_path: Path) -> None:
-    # Proves that what could not be stacked is refused when it is written, and that a folder without its index is no
-    # data set.
-    writer = WindowWriter(tmp_path)
-    writer.add(_window(0).pack(size=SIZE))
-    with raises("window 1"):
-        writer.add(vg.simulate_window(4, points=8, lines=0).pack())
-    with pytest.raises(InputError, match="other labels"):
-        writer.add(_window(0).pack(size=SIZE), poses=np.zeros(3))
-    with pytest.raises(InputError, match="no complete folder"):
-        WindowDataset.open(tmp_path)
 
 
 @pytest.mark.slow  # compiles the pipeline

@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import tiny_layouts
 import tiny_sequences
 from recorded_run import RecordedRun, recorded_run
 
-import vggtgeo as vg
 from vggtgeo.cli.run_sequence import _reopen
 from vggtgeo.datasets import open_sequence
-from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.consistency import PosedDepth
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.mapping.depth_map import DepthMap
@@ -115,25 +112,6 @@ def test_the_sensor_s_own_depth_counts_and_holes_are_filled(run: RecordedRun) ->
     assert hole.mean() > 0.5
     np.testing.assert_allclose(np.median((depth / given)[100:140, 100:140][hole]), 1.0, atol=0.02)
     np.testing.assert_array_equal(found[slam.keyframes[1].frame].depth, maps[1].depth)
-
-
-@pytest.mark.long
-def test_a_folder_has_the_depth_of_every_frame(run: RecordedRun, tmp_path: Path) -> None:
-    """`depth="every"` writes a file for each frame, keyframes' as `depth=True` does; frames of another size are
-    refused. Oracle: the folder of keyframes.
-    """
-    result = vg.Result.of(run.slam)
-    result.save(tmp_path / "keyframes", depth=True)
-    result.save(tmp_path / "every", depth="every", frames=run.sequence)
-    places = [tmp_path / place / "depth" for place in ("keyframes", "every")]
-    names = [{file.name for file in place.glob("*.depth.png")} for place in places]
-    assert names[0] < names[1] == {f"{record.frame:06d}.depth.png" for record in run.slam.frames}
-    for name in names[0]:
-        one, other = ((place / name).read_bytes() for place in places)
-        assert one == other
-    assert cv2.imread(str(tmp_path / "every/depth" / min(names[1] - names[0])), cv2.IMREAD_UNCHANGED).any()
-    with pytest.raises(InputError, match=r"`frames` .*160 x 120.*320 x 240"):
-        list(depth_of_frames(run.slam, [None] * len(run.slam.keyframes), vg.simulate("room", 9, size=(160, 120))))
 
 
 def test_a_lost_frame_has_its_own_depth_alone(run: RecordedRun) -> None:

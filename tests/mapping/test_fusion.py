@@ -134,8 +134,6 @@ def test_a_second_view_changes_what_one_view_is_enough_for() -> None:
     assert len(fusion.mesh.faces)
     fusion.update(*opposite)
     same(fusion.mesh, fused_mesh(*opposite, INTRINSICS, VOXEL))
-    with pytest.raises(InputError, match=r"`bound` .*-1"):
-        SurfaceFusion(INTRINSICS, VOXEL, bound=-1)
 
 
 def test_the_mesh_of_a_building_is_joined() -> None:

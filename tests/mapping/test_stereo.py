@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from posed_keyframes import keyframe_of, slots_of
-from vggtgeo.models.classical import SensorDepth
-from vggtgeo.models.roles import DepthEstimate
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.mapping.consistency import PosedDepth, confirm
-from vggtgeo.mapping.dense import check_dense, dense_depths
+from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.plane_sweep import Photo, plane_homographies
 from vggtgeo.mapping.semi_global import EDGE, semi_global
@@ -22,13 +20,6 @@ from vggtgeo.mapping.stereo import StereoSettings, stereo_depths
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 SIZE = (200, 150)
-
-
-class DepthOfANetwork:
-    """A `MetricDepth` that is no sensor's."""
-
-    def estimate(self, image: np.ndarray, sensor_depth: object = None, intrinsics: object = None) -> DepthEstimate:
-        raise NotImplementedError
 
 
 SMOOTH, JUMP = 0.04, 0.5
@@ -176,23 +167,6 @@ def test_pictures_fill_the_holes_of_measured_depth() -> None:
     assert np.mean(np.abs(filled.depth[found] / truths[2][found] - 1) < 0.05) > 0.9
     assert np.isnan(left.depth[hole]).all()
     np.testing.assert_array_equal(filled.depth[~hole], left.depth[~hole])
-
-
-def test_what_cannot_be_is_refused() -> None:
-    # Proves the errors of an unknown mode, of measured depth where there is none, and of impossible settings.
-    with pytest.raises(vg.InputError, match=r"`dense` .*'magic'"):
-        check_dense("magic", True)
-    with pytest.raises(vg.InputError, match="`dense` is 'sensor'"):
-        check_dense("sensor", False)
-    with pytest.raises(vg.InputError, match="`dense` is 'network'"):
-        check_dense("network", True, SensorDepth())
-    with pytest.raises(vg.InputError, match="`dense` is 'sensor'"):
-        check_dense("sensor", True, DepthOfANetwork())
-    check_dense("network", True, DepthOfANetwork())
-    with pytest.raises(vg.InputError, match=r"`window` .*4"):
-        StereoSettings(window=4)
-    with pytest.raises(vg.InputError, match=r"`planes` .*2"):
-        StereoSettings(planes=2)
 
 
 def test_a_keyframe_alone_has_no_depth() -> None:

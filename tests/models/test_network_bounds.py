@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny_networks as tiny
-from recorded_run import SETTINGS
 from vggtgeo.models.onnx.bounds import (
     AVERAGE,
     FARTHEST,
@@ -27,7 +25,6 @@ from vggtgeo.models.onnx.session import NetworkValueError, open_session
 from vggtgeo.models.onnx.vggt import decode_cameras
 from vggtgeo.models.roles import DepthEstimate, Features, Segments
 
-import vggtgeo as vg
 from vggtgeo.slam.verdict.input_findings import check_refusals
 
 SIZE = (48, 64)
@@ -137,25 +134,3 @@ def test_cameras_and_segments_that_are_nowhere(tmp_path: Path) -> None:
 
     far = tiny.letr(tmp_path / "letr.onnx", SIZE, lines=[(0.1, 0.2, 0.8, 0.3), (-1e30, 0.5, 1e30, 0.5)])
     assert len(LetrDetector(open_session(far, LETR)).detect(IMAGE)) == 1
-
-
-@pytest.mark.usefixtures("uncompiled")
-@pytest.mark.parametrize("scale", [1.0, 1e30], ids=["right", "1e30"])
-def test_a_run_tells_what_was_refused(tmp_path: Path, scale: float) -> None:
-    """Networks behind a whole run: with depth of 1e30 m nothing is metric, no coordinate is beyond a room, and the
-    verdict names the network. Oracle: the same run with right depth.
-    """
-    size = (120, 160)
-    tiny.dinov3(tmp_path / "dinov3-small.onnx", (112, 160))
-    tiny.mlsd(tmp_path / "mlsd.onnx")
-    moge(tmp_path / "moge2-small.onnx", scale, size=size)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", vg.io.errors.InputWarning)
-        perceived = vg.perception("light", vg.Roles(), tmp_path)
-        result = vg.reconstruct(vg.simulate("room", 2, 0, size[::-1]), perceived, SETTINGS)
-    counts = result.summary["refused"]["depth"]
-    assert counts["asked"] > 0
-    named = [reason for reason in result.verdict.reasons if "the network of depth gave no valid answer" in reason]
-    assert bool(named) == (scale == 1e30) == (counts["without"] == counts["asked"])
-    assert (result.verdict.level == "good") == (scale == 1.0)
-    assert np.abs(result.cloud.points).max(initial=0.0) < FARTHEST

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from reported import raises
 from synthetic_room import room
 from vggtgeo.models.roles import DenseConfidence, LineDetector, MetricDepth, PointMatcher, WindowGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
@@ -40,35 +39,6 @@ def test_stubs_fulfil_their_roles_and_say_that_they_are_simulated(oracle: Simula
     assert all(stub.simulated for stub in (matcher, lines, depth, confidence, window))
 
 
-@pytest.mark.long
-def test_answers_depend_on_seed_and_frames_not_on_the_order_of_calls(oracle: SimulatedOracle, images: list) -> None:
-    # A second, fresh stub asked in another order gives the same bytes; another seed gives others.
-    one, two, other = (SimulatedMast3r(oracle, seed=seed, count=200) for seed in (1, 1, 2))
-    first = one.match(one.describe(images[3]), one.describe(images[5]))
-    two.match(two.describe(images[7]), two.describe(images[8]))
-    again, different = (s.match(s.describe(images[3]), s.describe(images[5])) for s in (two, other))
-    assert np.array_equal(first.pixels_j, again.pixels_j)
-    assert not np.array_equal(first.pixels_j[:10], different.pixels_j[:10])
-    moge = SimulatedMoge(oracle, seed=1)
-    late, early = moge.estimate(images[9]).depth, moge.estimate(images[2]).depth
-    assert np.array_equal(SimulatedMoge(oracle, seed=1).estimate(images[2]).depth, early)
-    assert np.array_equal(SimulatedMoge(oracle, seed=1).estimate(images[9]).depth, late)
-
-
-def test_an_unknown_image_is_refused(oracle: SimulatedOracle) -> None:
-    # An image that the oracle has not given raises an error that says so.
-    with raises("image", error=ValueError):
-        SimulatedMoge(oracle).estimate(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
-
-
-def test_wrong_settings_are_named(oracle: SimulatedOracle) -> None:
-    # A negative deviation is refused by name.
-    with raises("noise", error=ValueError):
-        SimulatedMast3r(oracle, noise=-1.0)
-    with raises("error", error=ValueError):
-        SimulatedMoge(oracle, error=float("nan"))
-
-
 def test_smooth_fields_have_unit_variance_and_memory() -> None:
     # Over many seeds: mean 0, variance 1, and correlation exp(-(t / memory)^2 / 2) after t, to 4 standard errors.
     count, memory = 500, 1.5
@@ -97,16 +67,6 @@ def test_simulated_depth_has_the_stated_errors(oracle: SimulatedOracle, images: 
     assert np.quantile(steps, 0.5) < 0.003, f"{np.quantile(steps, 0.5)=}"
     exact = SimulatedMoge(oracle, error=0.0, wobble=0.0).estimate(images[0])
     assert np.abs(exact.depth - oracle.depth(0)).max() < 1e-5
-
-
-@pytest.mark.long
-def test_simulated_depth_wobbles_in_scale_from_frame_to_frame(oracle: SimulatedOracle, images: list) -> None:
-    # With the smooth error off, each frame is off by one factor, whose logarithm has the stated deviation.
-    moge = SimulatedMoge(oracle, error=0.0, wobble=0.05)
-    scales = np.array([np.log(moge.estimate(image).depth / oracle.depth(EVERY * k)) for k, image in enumerate(images)])
-    assert scales.std(axis=(1, 2)).max() < 1e-5
-    deviation = scales[:, 0, 0].std()
-    assert abs(deviation / 0.05 - 1) < 4 / np.sqrt(2 * len(images)), f"{deviation=}"
 
 
 def test_simulated_matches_have_the_stated_noise_gaps_and_outliers(oracle: SimulatedOracle, images: list) -> None:

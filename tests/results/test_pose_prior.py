@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
 from vggtgeo.results.pose_prior import with_pose_prior
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.source import Source, open_source
@@ -45,15 +44,6 @@ def test_poses_of_a_file_leave_the_truth(source: Source, tmp_path: Path) -> None
     assert same.truth is source.truth
     assert recorded is not None
     np.testing.assert_allclose(recorded.trajectory.poses, source.truth.poses, atol=1e-6)
-
-
-def test_a_prior_that_is_none_is_named(source: Source) -> None:
-    """Without recorded poses, and for a file that is not there, the error names the argument or the file."""
-    hidden, _ = with_pose_prior(source, "recorded")
-    with pytest.raises(InputError, match=r"`pose_prior`.*recorded"):
-        with_pose_prior(hidden, "recorded")
-    with pytest.raises(InputError, match=r"none-such\.txt"):
-        with_pose_prior(source, "none-such.txt")
 
 
 def test_a_run_says_what_became_of_the_prior() -> None:

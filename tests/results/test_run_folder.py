@@ -19,8 +19,7 @@ from typer.testing import CliRunner
 
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import write_text
-from vggtgeo.io.interruption import end_on_signals, interruption
+from vggtgeo.io.interruption import end_on_signals
 from vggtgeo.io.locks import LockedError, locked
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.results.files import write_depth
@@ -193,22 +192,6 @@ def test_a_second_signal_ends_at_once_and_the_old_run_stays(
         Result.load(out)
 
 
-def test_two_runs_into_one_folder(frames: Path, tmp_path: Path) -> None:
-    """The second is refused with a sentence, also by another name of the folder, and touches nothing; once the first is
-    over, it may. Oracle: the files before and after.
-    """
-    out = tmp_path / "out"
-    before = old_run(out)
-    (tmp_path / "link").symlink_to(out)
-    with open_run_folder(out):
-        for name in ("out", "link"):
-            done = call(frames, tmp_path / name)
-            assert done.exit_code == 2
-            assert "is in use by another run" in done.stderr
-    assert contents(out) == before
-    assert call(frames, out).exit_code == 3
-
-
 def test_the_lock_of_a_killed_run_is_given_back(tmp_path: Path) -> None:
     """A process that is killed while it holds the folder leaves its lock file, and the next run takes the folder;
     oracle: SIGKILL of a real process.
@@ -230,31 +213,6 @@ with open_run_folder({str(out)!r}) as run:
     with open_run_folder(out) as run:
         assert [path.name for path in run.stage.iterdir()] == ["README.txt"]
     assert not out.exists() or contents(out) == {}
-
-
-@pytest.mark.parametrize("inside", ["", "run"])
-def test_nothing_is_left_where_nothing_was_done(tmp_path: Path, inside: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run that is refused leaves no folder and none above it; oracle: the folder that was there."""
-    tiny.images(tmp_path / "frames")
-    out = tmp_path / "a" / "b" / inside
-    monkeypatch.setattr("vggtgeo.slam.run.step", lambda *_: (_ for _ in ()).throw(InputError("nothing works")))
-    assert call(tmp_path / "frames", out).exit_code == 2
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames"]
-
-
-@pytest.mark.parametrize("where", ["itself", "another", "tum"])
-def test_images_are_never_mixed_with_results(tmp_path: Path, where: str) -> None:
-    """A folder of images is refused as output, that of the run or any other, before anything is written; oracle: its
-    files.
-    """
-    tiny.images(tmp_path / "itself")
-    tiny.images(tmp_path / "another")
-    tiny.tum(tmp_path / "tum")
-    before = contents(tmp_path)
-    done = call(tmp_path / "itself", tmp_path / where)
-    assert done.exit_code == 2
-    assert "give another folder for the results" in done.stderr
-    assert contents(tmp_path) == before
 
 
 def test_an_output_that_cannot_be_written_is_found_before_the_first_frame(
@@ -281,47 +239,6 @@ def test_an_output_that_cannot_be_written_is_found_before_the_first_frame(
         in done.stderr
     )
     assert not (tmp_path / "out").exists()
-
-
-def test_a_disk_that_fills_up_names_the_file_and_keeps_old_and_poses(
-    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where the disk is full at the end, the error names the file, the old run stays whole, and the poses are there;
-    oracle: the files.
-    """
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    out = tmp_path / "out"
-    before = old_run(out)
-    monkeypatch.setattr("vggtgeo.io.files.json.dumps", full)
-    done = call(frames, out)
-    assert done.exit_code == 2, done.output
-    after = contents(out)
-    assert {name: after[name] for name in before} == before
-    assert len(after["unfinished/trajectory.txt"].splitlines()) == 2
-    monkeypatch.setattr("vggtgeo.io.files.os.fsync", full)
-    with raises("map.ply", error=OSError):
-        write_text(tmp_path / "map.ply", "points")
-
-
-def test_signals_are_noted_once_and_then_raise() -> None:
-    """Inside, the first is noted and the second raises; `at_once` raises at the first; handlers are as before at the
-    end. Oracle: signals sent to this process.
-    """
-    send = lambda: os.kill(os.getpid(), signal.SIGINT)
-    before = signal.getsignal(signal.SIGINT)
-    with interruption() as stop:
-        send()
-        assert stop.asked
-        with interruption() as inner:
-            assert inner is stop
-        with pytest.raises(KeyboardInterrupt):
-            send()
-    with interruption() as stop, pytest.raises(KeyboardInterrupt), stop.at_once():
-        send()
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_lock_is_held_once(tmp_path: Path) -> None:
@@ -355,25 +272,3 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     with warns("depth"):
         write_depth(tmp_path / "none", [keyframe], [None])
     assert not (tmp_path / "none").exists()
-
-
-def test_a_folder_whose_name_is_no_utf8(frames: Path, tmp_path: Path) -> None:
-    """A name in another encoding costs nothing of the result; oracle: the files of any run."""
-    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/B\xfcro"))
-    try:
-        frames.rename(odd)
-    except OSError:
-        pytest.skip("this file system takes no such name")
-    out = tmp_path / "out"
-    done = call(odd, out)
-    assert done.exit_code == 3, done.output
-    check_one_run(out, FRAMES)
-
-
-def test_hidden_files_of_a_file_manager_are_no_results(tmp_path: Path) -> None:
-    """A `.DS_Store` beside the results harms nothing, and does not come with them. Oracle: what is there."""
-    with open_run_folder(tmp_path / "out") as run:
-        (run.stage / "trajectory.txt").write_text("")
-        (run.stage / ".DS_Store").write_text("")
-        run.publish()
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["trajectory.txt"]

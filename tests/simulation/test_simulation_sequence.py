@@ -11,7 +11,6 @@ from synthetic_room import room
 from vggtgeo.cli.simulate import parse_size
 from vggtgeo.cli.simulate import simulate as simulate_command
 from vggtgeo.datasets import open_sequence
-from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
 from vggtgeo.simulation.raster import encode
 from vggtgeo.simulation.room import build_room
@@ -135,29 +134,6 @@ def test_exposure_swings_by_the_stated_amount() -> None:
     assert 1.2 < max(gains) <= 1.3
 
 
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [
-        ({"scene": "cave"}, "scene"),
-        ({"frames": 0}, "frames"),
-        ({"size": (0, 10)}, "size"),
-        ({"rate": -1.0}, "rate"),
-        ({"speed": 0.0}, "speed"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments: dict, name: str) -> None:
-    # A wrong argument raises InputError that names it.
-    with raises(name):
-        simulate(**arguments)
-
-
-def test_wrong_sensors_are_named() -> None:
-    # Negative noise, an empty range and no samples are refused by name.
-    for setting in ({"noise": -1.0}, {"depth_range": (2.0, 1.0)}, {"blur_samples": 0}):
-        with raises(f"`{next(iter(setting))}`"):
-            Sensor(**setting)
-
-
 def test_tum_folder_reads_back(tmp_path: Path, walk: SyntheticSequence) -> None:
     # A written folder, read by the TUM reader: same images, depth to its quantum, poses, times and intrinsics.
     few = replace(walk, count=3)
@@ -173,18 +149,6 @@ def test_tum_folder_reads_back(tmp_path: Path, walk: SyntheticSequence) -> None:
     assert np.abs(read.ground_truth().poses - few.ground_truth().poses).max() < 1e-8
     with raises(tmp_path.name):
         next(write_tum_folder(few, folder))
-
-
-def test_a_walk_that_was_killed_is_read_in_its_own_unit(tmp_path: Path, walk: SyntheticSequence) -> None:
-    # After one frame of three: times and metres are those of the walk, and the others are told as missing.
-    few = replace(walk, count=3)
-    first = next(write_tum_folder(few, tmp_path / "room"))
-    read = open_sequence(tmp_path / "room")
-    with pytest.warns(InputWarning, match="No such file or directory; the frame is skipped"):
-        frames = list(read.frames())
-    assert [frame.timestamp for frame in frames] == [first.timestamp]
-    assert np.nanmax(np.abs(frames[0].depth - first.depth)) <= 0.51 / 5000
-    assert np.allclose(read.camera.intrinsics, walk.camera.intrinsics, atol=1e-6)
 
 
 def test_the_command_writes_a_folder_and_names_wrong_sizes(tmp_path: Path) -> None:

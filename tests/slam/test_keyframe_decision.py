@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bad_rows_maps import keyframe
 from scipy.spatial.transform import Rotation
+from tiny_state import keyframe
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.keyframe_decision import nearest_keyframe, needs_keyframe, view_change

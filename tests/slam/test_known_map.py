@@ -12,27 +12,22 @@ from typing import Any
 import numpy as np
 import pytest
 from recorded_run import ROLES, SETTINGS
-from reported import raises, warns
+from reported import raises
 from same_leaves import differences
 from typer.testing import CliRunner
-from vggtgeo.models.classical import NoDepth, OrbMatcher, SiftMatcher
+from vggtgeo.models.classical import OrbMatcher, SiftMatcher
 from vggtgeo.models.roles import Features
 
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
 from vggtgeo.datasets import without_depth
-from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
-from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.known_map import as_map, entered, save_map
 from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.state_file import save_state
 from vggtgeo.slam.submaps import submaps_by_size
-from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.judge import judge
 
 FRAMES, HALF = 18, 9
 FIXED = replace(SETTINGS, keyframes=replace(SETTINGS.keyframes, localise_only=True))
@@ -102,28 +97,6 @@ def test_a_map_comes_back_to_the_bit(known: Slam) -> None:
         assert list(differences(moved, after)) == []
 
 
-@pytest.mark.long
-def test_when_keyframes_were_recorded_outlasts_two_maps(known: Slam, tmp_path: Path) -> None:
-    """The time stamps of two runs in one map are those of their clocks, through two files and in the run's folder,
-    where each line belongs to one keyframe; oracle: the time stamps of the runs.
-    """
-    first = [keyframe.timestamp for keyframe in first_half().keyframes]
-    slam = run(HALF, known_map=known)
-    second = [keyframe.timestamp for keyframe in slam.keyframes[len(known.keyframes) :]]
-    assert second
-    save_map(tmp_path / "both.map", slam)
-    both = vg.load_map(tmp_path / "both.map")
-    assert [keyframe.recorded for keyframe in both.keyframes] == [*first, *second]
-    write_trajectories(tmp_path, slam)
-    written = np.loadtxt(tmp_path / "map-times.txt")
-    assert written.tolist() == [[k.timestamp, k.recorded] for k in slam.keyframes[: len(known.keyframes)]]
-    listed = np.loadtxt(tmp_path / "keyframes.txt", ndmin=2)[:, 0]
-    assert set(written[:, 0]) < set(listed)
-    assert len(set(listed)) == len(listed)
-    write_trajectories(tmp_path / "alone", first_half())
-    assert not (tmp_path / "alone/map-times.txt").exists()
-
-
 def test_the_state_of_a_run_is_a_map(known: Slam) -> None:
     """A run goes on in the map of another that is still in memory, whose frames and clock are not its own: it yielded
     nothing before, as no time came after theirs. Oracle: the map that was saved and read.
@@ -162,71 +135,6 @@ def test_localising_leaves_the_map_as_it_is(known: Slam) -> None:
     assert list(differences(known.map, slam.map)) == []
     assert list(differences(known.intrinsics, slam.intrinsics)) == []
     assert np.mean([record.tracked for record in slam.frames]) > 0.5
-    assert worst_error(slam) < 0.03
-
-
-@pytest.mark.long
-def test_another_place_is_not_found_in_the_map(known: Slam) -> None:
-    """Frames of another room have no pose in the map; oracle: it is another room."""
-    slam = run(0, 6, seed=3, settings=FIXED, known_map=known)
-    assert not any(record.tracked for record in slam.frames)
-    assert len(slam.tracker.waiting) == 6
-    assert judge(slam).reasons[0].startswith("0 of 6 ")
-    assert not Claim.of(first_half()).began_in_known_map
-
-
-def test_maps_that_cannot_be_used(known: Slam, tmp_path: Path) -> None:
-    """Another camera, other images, no map, a state in place of a map: one sentence; oracle: the sentence."""
-    camera = sequence().camera
-    longer = replace(camera, intrinsics=(300.0, 300.0, 159.5, 119.5))
-    for other, named in (
-        (replace(camera, width=640), ("320 x 240", "640 x 240")),
-        (longer, ("266.2, 266.2, 159.5, 119.5", "300.0")),
-    ):
-        with raises("known_map", *named):
-            next(vg.run(sequence().frames(), ROLES, SETTINGS, camera=other, known_map=known))
-    with pytest.raises(vg.InputError, match=r"localise_only` .*`known_map`"):
-        vg.reconstruct(sequence(), ROLES, FIXED)
-    save_state(tmp_path / "state", first_half())
-    with raises(tmp_path / "state", "'map'"):
-        vg.load_map(tmp_path / "state")
-    slam = first_half()
-    with pytest.raises(vg.InputError, match="there is no keyframe to save"):
-        save_map(tmp_path / "map", replace(slam, map=replace(slam.map, keyframes=())))
-    read = object.__new__(Result)
-    object.__setattr__(read, "record", None)
-    with raises("save_map"):
-        read.save_map(tmp_path / "map")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("localise_only", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_map_without_a_unit_serves_with_and_without_depth(localise_only: bool, tmp_path: Path) -> None:
-    """A map made of images alone places later frames, of images alone or with depth, in its own unit, and the depth
-    that is not used is told; oracle: the truth after Sim(3) alignment, the warning.
-    """
-    roles = replace(ROLES, depth=NoDepth())
-    settings = FIXED if localise_only else SETTINGS
-    *_, slam = vg.run(without_depth(sequence()), roles, SETTINGS, end=HALF + 4)  # two views start it
-    save_map(tmp_path / "free.map", slam)
-    known = vg.load_map(tmp_path / "free.map")
-    assert not known.metric
-    given = {"settings": settings, "dense": "none", "end": HALF + 7, "known_map": known}
-    alone = vg.reconstruct(without_depth(sequence()), roles, **given)
-    with warns("known_map"):
-        with_depth = vg.reconstruct(sequence(), ROLES, **given)
-    for result in (alone, with_depth):
-        assert not result.metric
-        assert len(result.trajectory) >= HALF
-        error = evaluate_trajectory(result.trajectory, sequence().ground_truth()).sim3.statistics.rmse
-        assert error < 0.02, error
-
-
-@pytest.mark.long
-def test_a_run_without_depth_is_metric_in_a_metric_map(known: Slam) -> None:
-    """Images alone are placed in metres; oracle: the truth, without any scale."""
-    slam = run(0, HALF, roles=replace(ROLES, depth=NoDepth()), known_map=known)
-    assert all(record.tracked for record in slam.frames)
     assert worst_error(slam) < 0.03
 
 

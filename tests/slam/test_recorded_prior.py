@@ -22,7 +22,7 @@ from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.recorded_prior import prior_summary
-from vggtgeo.slam.run import finish, frame_trajectory, run_frames
+from vggtgeo.slam.run import frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.connected import submap_of
@@ -36,7 +36,7 @@ from vggtgeo.slam.tracking.tracker import FramePose, Tracker
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
 SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    window=WindowSettings(size=4, point_slots=96, line_slots=48),
     refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
@@ -223,7 +223,7 @@ def test_black_frames_are_bridged(walk: Walk) -> None:
     renderer's poses.
     """
     truth = walk[2]
-    torn = _run(walk, ROLES)
+    torn = _run((walk[0][: DARK.stop], *walk[1:]), ROLES)
     assert not all(record.tracked for record in torn.frames)
     slam = _run(walk, replace(ROLES, recorded=RecordedPoses(_disturbed(truth))))
     assert submap_of(slam.map).max() == 0
@@ -232,20 +232,10 @@ def test_black_frames_are_bridged(walk: Walk) -> None:
     assert prior_summary(slam, replace(ROLES, recorded=RecordedPoses(_disturbed(truth))))["pose_prior"]["used"]
 
 
-@pytest.mark.long
-def test_black_frames_are_bridged_without_depth(walk: Walk) -> None:
-    """The same where nothing but the recording tells the scale behind the dark."""
-    truth = walk[2]
-    roles = replace(ROLES, depth=NoDepth(), recorded=RecordedPoses(_disturbed(truth)))
-    slam = finish(_run(walk, roles), roles, replace(SETTINGS, refinement=GlobalMapSettings(rolling_shutter=False)))
-    assert submap_of(slam.map).max() == 0
-    assert evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse < 0.04
-
-
 def test_another_recording_changes_nothing(walk: Walk) -> None:
     """With poses of another walk the run is that without, bit for bit, and says that they are not used."""
     frames, camera, truth = walk
-    bright = frames[: DARK.start], camera, truth
+    bright = frames[:10], camera, truth
     roles = replace(ROLES, recorded=RecordedPoses(_other(truth)))
     slam, plain = _run(bright, roles), _run(bright, ROLES)
     np.testing.assert_array_equal(frame_trajectory(slam).poses, frame_trajectory(plain).poses)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from killed import Killed, KilledAfter
 from recorded_run import FRAMES, ROLES, SETTINGS, recorded_run, walk
 from vggtgeo.models.onnx.bounds import Refusals
 
@@ -19,7 +17,6 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.slam import self_calibration
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pending_window import merge_pending_window
@@ -213,19 +210,6 @@ def test_no_self_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
     run(monkeypatch, passes, iter(recorded_run().frames[:3]))
     run(monkeypatch, passes, settings=settings(0), end=3)
     assert passes.counts == []
-
-
-@pytest.mark.long
-def test_a_resumed_run_seeks_no_camera_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that a run which was killed after self-calibration goes on with the camera that it found.
-    kept = Checkpoints(tmp_path / "kept", every=0)
-    with pytest.raises(Killed):
-        run(monkeypatch, _Passes(), callbacks=[KilledAfter(3)], checkpoints=kept)
-    again = _Passes()
-    result = run(monkeypatch, again, checkpoints=replace(kept, resume=True))
-    assert again.counts == []
-    assert result.record.slam.camera.self_calibrated
-    assert result.intrinsics == pytest.approx(np.array(LENS.intrinsics), abs=0.1)
 
 
 def test_warnings_of_calibration_frames_count_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,11 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from changed_file import with_header
 from recorded_run import ROLES, SETTINGS, recorded_run
 from reported import raises
 from same_leaves import differences
-from vggtgeo.models.roles import LineMatches
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.bundle.marginalisation import empty_prior
@@ -29,9 +26,9 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRotation
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import PendingWindow, Slam
-from vggtgeo.slam.state_file import STATE, load_state, save_state
+from vggtgeo.slam.state_file import load_state, save_state
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import SeenPoints, UnplacedFrame
 from vggtgeo.slam.window.window import WindowPrior
@@ -186,65 +183,6 @@ def box(tmp_path: Path, value: Any = 1.5) -> Path:
     return tmp_path / "box"
 
 
-NAME = "content[0]"
-BAD_HEADERS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
-    "another kind": (lambda h: h.update(vggtgeo="state"), "state"),
-    "a later version": (lambda h: h.update(version=3), "3"),
-    "an earlier version": (lambda h: h.update(version=0), "0"),
-    "a version that is a list": (lambda h: h.update(version=[]), "[]"),
-    "facts that are a number": (lambda h: h.update(facts=5), "int"),
-    "no version": (lambda h: h.pop("version"), "version"),
-    "no object": (lambda h: ["text"], "header"),
-    "an unknown class": (lambda h: h["classes"].append(["Popen", []]), "Popen"),
-    "a field less": (lambda h: h["classes"][0][1].clear(), "['content']"),
-    "beyond the data": (lambda h: h["arrays"][NAME].__setitem__(1, 8), NAME),
-    "before the data": (lambda h: h["arrays"][NAME].__setitem__(1, -8), "-8"),
-    "a huge shape": (lambda h: h["arrays"][NAME].__setitem__(2, [2**62]), NAME),
-    "objects": (lambda h: h["arrays"][NAME].__setitem__(0, "|O"), "|O"),
-    "a record": (lambda h: h["arrays"][NAME].__setitem__(0, "(,)f8"), "(,)f8"),
-    "numbers of 3 bytes": (lambda h: h["arrays"][NAME].__setitem__(0, "<f3"), "f3"),
-    "wide strides": (lambda h: h["arrays"][NAME].__setitem__(3, [2**40]), NAME),
-    "an unknown token": (lambda h: h.update(tree={"x": 1}), "'x'"),
-    "too deep": (lambda h: h.update(tree=None) or _deep(h), "recursion"),
-    "no array": (lambda h: h["arrays"].clear(), NAME),
-}  # fmt: skip
-
-
-def _deep(header: dict[str, Any]) -> None:
-    for _ in range(900):
-        header["tree"] = [header["tree"]] * 1 if header["tree"] is not None else [{"l": [{"f": []}]}]
-
-
-@pytest.mark.parametrize("name", BAD_HEADERS)
-def test_a_header_that_is_wrong(name: str, tmp_path: Path) -> None:
-    """An invalid header is an error that names the file and the value; oracle: the table."""
-    change, named = BAD_HEADERS[name]
-    path = with_header(box(tmp_path), change)
-    with raises(path, named):
-        BOX.read(path)
-
-
-def test_files_that_are_no_states(tmp_path: Path) -> None:
-    """A file that is missing, foreign, compressed or truncated is an error that names it; oracle: the name."""
-    path = tmp_path / "box"
-    with raises(path):
-        BOX.read(path)
-    path.write_bytes(b"text")
-    with raises(path):
-        BOX.read(path)
-    np.savez(path.with_suffix(".npz"), description=np.zeros(3))
-    with raises(path.with_suffix(".npz"), "header", "data"):
-        BOX.read(path.with_suffix(".npz"))
-    replace(BOX, compressed=True).write(path, Box(np.zeros(1000)))
-    with raises(path):
-        BOX.read(path)
-    whole = box(tmp_path).read_bytes()
-    for end in range(0, len(whole), 37):
-        path.write_bytes(whole[:end])
-        with raises(path):
-            BOX.read(path)
-
-
 def test_every_flipped_bit_of_the_content_is_noticed(tmp_path: Path) -> None:
     """A bit changed in header or data is an InputError, never another value; oracle: zip's checksums."""
     path = box(tmp_path)
@@ -257,96 +195,6 @@ def test_every_flipped_bit_of_the_content_is_noticed(tmp_path: Path) -> None:
         except InputError:
             continue
         assert list(differences(Box((np.arange(3.0), 1.5)), read)) == [], place
-
-
-def _first(slam: Slam, **changes: Any) -> Slam:
-    """The state with another first keyframe."""
-    return replace(slam, map=replace(slam.map, keyframes=(replace(slam.keyframes[0], **changes), *slam.keyframes[1:])))
-
-
-def _last(slam: Slam, **values: Any) -> Slam:
-    """The state with other values in its last frame."""
-    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames[:-1], replace(slam.frames[-1], **values))))
-
-
-def _camera(slam: Slam, **values: Any) -> Slam:
-    """The state with another camera."""
-    return replace(slam, camera=replace(slam.camera, **values))
-
-
-def _cut(slots: Slots) -> Slots:
-    return Slots(*(getattr(slots, field.name)[1:] for field in dataclasses.fields(slots)))
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        (lambda slam: replace(slam, window=replace(slam.window, members=(7,))), "keyframes"),
-        (lambda slam: replace(slam, map=replace(slam.map, keyframes=())), "keyframes"),
-        (lambda slam: _camera(slam, intrinsics=np.ones(3)), "intrinsics"),
-        (lambda slam: _camera(slam, given=-slam.intrinsics), "given"),
-        (lambda slam: _first(slam, number=1), "number"),
-        (lambda slam: _first(slam, pose=2.0 * np.eye(4)), "pose"),
-        (lambda slam: _first(slam, pose=np.full((4, 4), np.nan)), "pose"),
-        (lambda slam: _first(slam, points=_cut(slam.keyframes[0].points)), "pixels of points"),
-        (lambda slam: _first(slam, samples=_cut(slam.keyframes[0].samples)), "pixels of samples"),
-        (lambda slam: _first(slam, sample_segment=slam.keyframes[0].sample_segment + 10_000), "sample_segment"),
-        (lambda slam: _first(slam, line_depths=np.zeros((0, 2))), "line_depths"),
-        (
-            lambda slam: _first(slam, images=replace(slam.keyframes[0].images, depth=np.zeros((2, 2), np.float16))),
-            "depth",
-        ),
-        (
-            lambda slam: replace(
-                slam, map=replace(slam.map, pairs=(replace(slam.map.pairs[0], second=9), *slam.map.pairs[1:]))
-            ),
-            "keyframes",
-        ),
-        (lambda slam: _last(slam, seen=SeenPoints(np.array([99_999], np.int32), np.ones((1, 2)))), "slots"),
-        (lambda slam: _last(slam, seen=SeenPoints(np.zeros(2, np.int32), np.ones((1, 2)))), "pixels"),
-        (lambda slam: _last(slam, arrival=(9, np.eye(4))), "keyframes"),
-        (lambda slam: Evidence(), "Evidence"),
-    ],
-)
-def test_states_whose_parts_do_not_belong_together(tmp_path: Path, change: Callable[[Slam], Any], named: str) -> None:
-    """A state with inconsistent parts is refused when it is read; oracle: what the error names."""
-    STATE.write(tmp_path / "state.npz", change(recorded_run().slam))
-    with raises("state.npz", named):
-        load_state(tmp_path / "state.npz")
-
-
-def test_matches_of_key_points_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    """Matches of points and of lines with rows that do not exist are refused; oracle: what the error names."""
-    slam = recorded_run().slam
-    pair = slam.map.pairs[0]
-    points = replace(pair.points, index_j=pair.points.index_j + 10_000)
-    lines = LineMatches(np.array([0]), np.array([10_000]), np.array([1.0]))
-    for wrong, named in (
-        (replace(pair, points=points), "index_j of points"),
-        (replace(pair, lines=lines), "of lines"),
-    ):
-        STATE.write(tmp_path / "state.npz", replace(slam, map=replace(slam.map, pairs=(wrong, *slam.map.pairs[1:]))))
-        with raises("state.npz", named):
-            load_state(tmp_path / "state.npz")
-
-
-def test_a_damaged_image_of_a_keyframe_is_told(tmp_path: Path) -> None:
-    """Bytes that are no image, or one of another kind, are an error when the file is read. Oracle: the file, the image
-    and the keyframe that it names.
-    """
-    slam = merge_pending_window(recorded_run().slam)
-    small = slam.keyframes[0].compressed()
-    for name, wrong in (
-        ("colour", {"data": b""}),
-        ("depth", {"data": bytes(50)}),
-        ("depth_sigma", {"data": small.images.depth_sigma.data[:-30]}),
-        ("depth_confidence", {"data": small.images.colour.data}),
-    ):
-        images = replace(small.images, **{name: replace(getattr(small.images, name), **wrong)})
-        keyframes = (replace(small, images=images), *slam.keyframes[1:])
-        STATE.write(tmp_path / "state.npz", replace(slam, map=replace(slam.map, keyframes=keyframes)))
-        with raises("state.npz", f"{name} of keyframe 0"):
-            load_state(tmp_path / "state.npz")
 
 
 def test_reading_keeps_the_callers_precision(saved: Path) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import MagicMock
 
-import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -22,12 +20,10 @@ from vggtgeo.benchmark.worker import recording as recorded
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.results.files import write_depth, write_trajectories
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.state import Slam
-from vggtgeo.viewing.folder import _log_depth
 
 
 @pytest.fixture(scope="module")
@@ -253,17 +249,3 @@ def test_a_run_folder_becomes_a_recording(run: RecordedRun, tmp_path: Path) -> N
     assert result.exit_code == 0, result.output
     found = entities_of(tmp_path / "out" / "v.rrd")
     assert {"/world/trajectory", "/world/map", "/keyframe/depth", "/keyframe/confidence"} <= set(found)
-
-
-@pytest.mark.parametrize(
-    ("name", "image", "message"),
-    [
-        ("first.depth.png", np.zeros((4, 4), np.uint16), "must be named by a frame number"),
-        ("000001.depth.png", np.zeros((4, 4, 3), np.uint8), r"is uint8 \(4, 4, 3\); expected uint16"),
-    ],
-)
-def test_depth_that_no_run_wrote_is_named(name: str, image: np.ndarray, message: str, tmp_path: Path) -> None:
-    """Oracle: the error."""
-    cv2.imwrite(str(tmp_path / name), image)
-    with pytest.raises(InputError, match=message):
-        _log_depth(MagicMock(), tmp_path / name)

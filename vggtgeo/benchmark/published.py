@@ -87,11 +87,7 @@ def published(name: str) -> PublishedTable:
         system: tuple(None if number == "" else LOST if number == LOST else Printed(number) for number in numbers)
         for system, numbers in values.pop("rows").items()
     }
-    if any(len(numbers) != len(columns) for numbers in rows.values()):
-        raise InputError(f"published table `{name}`: each row must have {len(columns)} numbers")
     papers = tomllib.loads((files("vggtgeo.benchmark") / "systems.toml").read_text("utf-8"))
-    if unknown := rows.keys() - papers.keys():
-        raise InputError(f"published table `{name}`: `systems.toml` has no paper of {', '.join(sorted(unknown))}")
     own = {system: papers[system] for system in rows}
     return PublishedTable(
         name, columns=columns, rows=rows, papers=own, **{key: _value(value) for key, value in values.items()}

@@ -31,7 +31,7 @@ from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import whole_path, write_text
+from vggtgeo.io.files import write_text
 from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import locked_folder
 
@@ -168,8 +168,6 @@ def _check_output(folder: Path) -> None:
     """Raise InputError if the batch would replace files of something else, for example of a single run."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
-    if whole_path(folder) == Path(whole_path(folder).anchor):
-        raise InputError(f"`output` is `{folder}`, the root of the file system; give a folder")
     there = [name for name in OUTPUTS if (folder / name).exists()]
     if there and not (folder / "runs").is_dir() and not {"tables.md", "runs.csv"} <= set(there):
         raise InputError(

@@ -7,7 +7,6 @@ file is read.
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 import tomllib
 from collections.abc import Callable, Mapping
@@ -113,11 +112,6 @@ PROTOCOLS: dict[str, Protocol] = {
 
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
-_MAX_NAME = 100
-"""Characters: the folder name of a run has two names and a seed, and at most 255 characters."""
-_MAX_RUNS = 1_000_000
-_LAST_SEED = 2**31 - 1
-_FIELDS = re.compile(r"\{(sequence|seed)\}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,8 +136,6 @@ class WalkTable(CheckedTable):
     speed: float | None = None
 
     def __post_init__(self) -> None:
-        if len(self.size) != 2:
-            raise InputError(f"`size` is {list(self.size)}; it must be a width and a height")
         check_walk(self.scene, self.frames, (self.size[0], self.size[1]), self.rate, self.speed)
 
 
@@ -189,24 +181,14 @@ class SequenceTable(CheckedTable):
         if bool(self.path) == bool(self.simulate):
             raise InputError("a sequence has either a `path` or a table `simulate`")
         _one_of("degrade", self.degrade, tuple(DEGRADATIONS))
-        if self.path and self.degrade != "base":
-            raise InputError(f"`degrade` is {self.degrade!r}; it is for rendered walks")
         if self.simulate:
             WalkTable.read("`simulate`", self.simulate)
         if self.kind is not None:
             _one_of("kind", self.kind, KINDS)
         _one_of("vertical", self.vertical, tuple(AXES))
-        if self.start < 0:
-            raise InputError(f"`start` is {self.start}; it must be at least 0")
-        if self.end is not None and self.end <= self.start:
-            raise InputError(f"`end` is {self.end}; it must be above `start`, {self.start}")
         if self.key_points < 1:
             raise InputError(f"`key_points` is {self.key_points}; it must be at least 1")
-        if self.simulate and self.exact_depth:
-            raise InputError("`exact_depth` is for recordings; the depth of a rendered walk is always exact")
         _check_protocol(self.protocol)
-        if not (math.isfinite(self.threshold) and self.threshold > 0):
-            raise InputError(f"`threshold` is {self.threshold}; it must be positive metres")
         updated(SlamSettings(), self.set)
 
 
@@ -242,12 +224,8 @@ class SettingTable(RowTable):
         _one_of("perception", self.perception, ("classical", "light", "paper", "simulated"))
         _one_of("features", self.features, ("sift", "orb"))
         _one_of("start_of_pose", self.start_of_pose, ("pnp", "constant-velocity", "window"))
-        if self.start_of_pose == "window" and self.perception != "simulated":
-            raise InputError("`start_of_pose` is 'window', which is for simulated roles; networks always use it")
         if self.seeds is not None and self.seeds < 1:
             raise InputError(f"`seeds` is {self.seeds}; it must be at least 1")
-        if not 0.0 <= self.depth_errors < math.inf:
-            raise InputError(f"`depth_errors` is {self.depth_errors}; it must be a factor of at least 0")
         updated(SlamSettings(), self.set)
 
 
@@ -262,8 +240,6 @@ class ExternalTable(RowTable):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if unknown := re.findall(r"\{[^{}]*\}?|\}", _FIELDS.sub("", self.files)):
-            raise InputError(f"`files` has `{unknown[0]}`; it may have `{{sequence}}` and `{{seed}}`")
 
     def file(self, sequence: str, seed: int) -> Path:
         """Return the file of a run's trajectory, relative to the suite's folder."""
@@ -309,13 +285,6 @@ class Suite(CheckedTable):
         for name in ("seeds", "timeout_minutes", "memory_gb"):
             if not getattr(self, name) > 0:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
-        if self.first_seed < 0:
-            raise InputError(f"`first_seed` is {self.first_seed}; it must be at least 0")
-        most = max((self.seeds, *(table.seeds or 0 for table in self.setting)))
-        if self.first_seed + most > _LAST_SEED:
-            raise InputError(f"`seeds` go to {self.first_seed + most - 1}, at most {_LAST_SEED - 1} is allowed")
-        if (runs := len(self.sequence) * sum(table.seeds or self.seeds for table in self.setting)) > _MAX_RUNS:
-            raise InputError(f"sequences x settings x `seeds` are {runs:,} runs, at most {_MAX_RUNS:,} are allowed")
         for name in self.published:
             check_published(name)
         for key in ("sequence", "setting"):
@@ -327,8 +296,6 @@ class Suite(CheckedTable):
         for table in self.setting:
             if unknown := set(table.sequences) - names:
                 raise InputError(f"setting `{table.name}`: `sequences` has {sorted(unknown)}, which do not exist")
-        if self.baseline and self.baseline not in {table.name for table in self.setting}:
-            raise InputError(f"`baseline` is {self.baseline!r}, which is not the name of a setting")
         updated(SlamSettings(), self.set)
 
     @property
@@ -442,8 +409,6 @@ def _chosen(what: str, wanted: tuple[str, ...], tables: tuple[Any, ...]) -> tupl
 def _check_name(name: object) -> None:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InputError(f"`name` must consist of letters, digits, `-`, `_` and `+`, got {name!r}")
-    if len(name) > _MAX_NAME:
-        raise InputError(f"`name` must have at most {_MAX_NAME} characters, got {len(name)}: {name[:20]}...")
 
 
 def _check_protocol(name: str) -> None:

@@ -13,8 +13,7 @@ import optimistix as optx
 from jax.sharding import PartitionSpec
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
-from vggtgeo.bundle.packing import as_arrays, pack
-from vggtgeo.bundle.packing_checks import as_poses, check_observations
+from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex
 from vggtgeo.bundle.pair_checks import check_kinds
 from vggtgeo.bundle.problem import Problem, State
@@ -56,7 +55,6 @@ def pack_batch(
     check_kind("windows", windows, Sequence, "a list of windows")
     if not windows:
         raise InputError("`windows` must have at least one window, got none")
-    _check_windows(windows)
     given = _same_terms([(*terms, *(term for own in window[4:] for term in own)) for window in windows])
     if size is None:
         sizes = [PaddedSize.of(window[0], len(window[1]), own) for window, own in zip(windows, given, strict=True)]
@@ -67,18 +65,6 @@ def pack_batch(
             packed.append(pack(*window[:4], size=size, terms=own, **options))
     problems, states, indices = zip(*packed, strict=True)
     return stack(problems), stack(states), list(indices)
-
-
-def _check_windows(windows: Sequence[Any]) -> None:
-    for number, window in enumerate(windows):
-        if not isinstance(window, tuple | list) or not 4 <= len(window) <= 5:
-            raise InputError(
-                f"`windows[{number}]` must be (observations, poses, intrinsics, inverse_depth), optionally with a list "
-                f"of terms, got the type `{type(window).__name__}`"
-            )
-        check_kind(f"windows[{number}][0]", window[0], Observations, "`vggtgeo.Observations`")
-        with _named(number):
-            check_observations(as_arrays(window[0]), as_poses(window[1]))
 
 
 @contextmanager
@@ -95,9 +81,6 @@ def _same_terms(windows: Sequence[Sequence[GivenTerm]]) -> list[list[GivenTerm]]
     # Reversed, so that of a name the first window's term decides the order and the kind.
     kinds = {term.name: term for terms in reversed(windows) for term in terms}
     own = [{term.name: term for term in terms} for terms in windows]
-    for number, (found, terms) in enumerate(zip(own, windows, strict=True)):
-        if len(found) < len(terms):
-            raise InputError(f"`windows[{number}]` has terms with equal names, got {[term.name for term in terms]}")
     return [[terms.get(name, _without_observations(kind)) for name, kind in kinds.items()] for terms in own]
 
 
@@ -144,28 +127,8 @@ def solve_batch(
 
     """
     check_kinds(problems, initials, "initials")
-    if jnp.ndim(initials.inverse_depth) != 3:
-        raise InputError(
-            "`initials` must have a leading batch axis: pass the result of `vggtgeo.batches.pack_batch`, or call "
-            "`vggtgeo.solve`"
-        )
-    count = len(initials.intrinsics)
-    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves((problems, initials))}
-    if lengths != {(count,)}:
-        found = ", ".join(str(length[0]) if length else "none" for length in sorted(lengths))
-        raise InputError(
-            f"`problems` and `initials` must have one number of windows in all arrays, got {found}: pass both as "
-            "returned by `vggtgeo.batches.pack_batch`"
-        )
     if at_once is not None:
         check_whole("at_once", at_once, 1)
-    if devices is not None and not (devices and all(isinstance(device, jax.Device) for device in devices)):
-        raise InputError(f"`devices` must be a list of devices, such as `jax.devices()`, or None, got {devices!r:.60}")
-    if devices is not None and count % len(devices):
-        raise InputError(
-            f"`problems` has {count} windows, which must be a multiple of the {len(devices)} `devices`: pad the batch, "
-            "for instance with copies of a window"
-        )
     platform = devices[0].platform if devices else jax.default_backend()
     size = at_once or (1 if platform == "cpu" else None)
 

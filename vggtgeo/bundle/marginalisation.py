@@ -25,7 +25,6 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
@@ -87,7 +86,6 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     """
     check_pair(problem, state)
     check_finite(state)
-    check_weights(problem)
     if not isinstance(leaving, jax.core.Tracer):
         given = np.asarray(leaving)
         check_whole("leaving", given.item() if given.size == 1 else leaving, 0, problem.num_keyframes - 1)

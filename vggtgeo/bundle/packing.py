@@ -31,8 +31,6 @@ from vggtgeo.bundle.packing_checks import (
     check_observations,
     check_positive,
     check_size,
-    check_whole_size,
-    warn_if_far,
 )
 from vggtgeo.bundle.padding import (
     GivenTerm,
@@ -44,7 +42,7 @@ from vggtgeo.bundle.padding import (
     rows_of_keyframes,
     sort_edges,
 )
-from vggtgeo.bundle.precision import check_precision, weight_of
+from vggtgeo.bundle.precision import weight_of
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.resolution import check_resolution
 from vggtgeo.bundle.term_checks import check_terms
@@ -59,9 +57,6 @@ from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, with_shared_
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
-
-POSITIVE = ("depth_mean", "depth_sigma", "inverse_depth", "kernel.delta")
-"""Arguments that must not underflow to zero in the precision of the problem."""
 
 
 def pack(
@@ -126,8 +121,6 @@ def pack(
     check_dtype(dtype)
     check_kind("observations", observations, Observations, "`vggtgeo.Observations`")
     check_kind("size", size, PaddedSize | None, "a `vggtgeo.PaddedSize`")
-    if size is not None:
-        check_whole_size(size)
     observations, poses = as_arrays(observations), as_poses(poses)
     intrinsics, inverse_depth = real_numbers("intrinsics", intrinsics), real_numbers("inverse_depth", inverse_depth)
     mean = intrinsics if intrinsics_mean is None else real_numbers("intrinsics_mean", intrinsics_mean)
@@ -135,13 +128,10 @@ def pack(
     check_kernel("kernel", kernel)
     check_observations(observations, poses)
     check_positive("inverse_depth", inverse_depth, len(observations.host))
-    warn_if_far(inverse_depth)
     check_camera(camera)
     camera = with_shared_focal(camera) if shared_focal else camera
     check_intrinsics(camera, intrinsics, camera_of, len(poses))
     terms = check_terms(terms, observations, len(poses))
-    guess = {"poses": poses, "intrinsics": intrinsics, "inverse_depth": inverse_depth, "intrinsics_mean": mean}
-    check_precision({**vars(observations), **guess, "kernel.delta": getattr(kernel, "delta", 1.0)}, dtype, POSITIVE)
     focal = np.atleast_2d(intrinsics)[np.zeros(len(poses), int) if camera_of is None else camera_of, 0]
     check_resolution(observations, poses, focal, inverse_depth, dtype)
     size, graph, host, index = _layout(observations, len(poses), size)

@@ -114,8 +114,3 @@ def _check_alike(problem: Problem, following: Problem) -> None:
             f"`next_problem` must have {wanted}, as `problem`, got {found}: "
             "pack all windows to one shape with `vggtgeo.batches.pack_batch`"
         )
-    if following.camera is not problem.camera:
-        raise InputError(
-            f"`next_problem` must have the camera model of `problem`, `{problem.camera.__name__}`, got "
-            f"`{following.camera.__name__}`: pack all windows with one `camera`"
-        )

@@ -6,17 +6,21 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
-from vggtgeo.bundle.packing_checks import check_kernel, check_matches, check_weight
+from vggtgeo.bundle.packing_checks import UNIT, check_kernel, check_matches, check_weight
 from vggtgeo.bundle.padding import COUNTED
+from vggtgeo.bundle.terms.baseline import BaselinePrior
 from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.node import PairTerm, PoseTerm
 from vggtgeo.bundle.terms.point import PointTerm
+from vggtgeo.bundle.terms.relative_pose import RelativePose
+from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.io.errors import InputError
@@ -24,6 +28,14 @@ from vggtgeo.io.given import check_kind, real_numbers
 
 _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsPrior))
 """Names of the terms that `pack` creates from its other arguments."""
+
+
+_ROWS: dict[type, dict[str, tuple[int, ...]]] = {
+    BaselinePrior: {"length": (), "sigma": ()},
+    RelativePose: {"measured": (7,), "root": (6, 6)},
+    RotationPrior: {"measured": (4,), "root": (3, 3)},
+}
+"""Shapes of the data of one observation."""
 
 
 def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int) -> list[AbstractTerm | FlatTerm]:
@@ -52,6 +64,7 @@ def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int
             _check_flat(term, observations)
         elif isinstance(term, PoseTerm | PairTerm):
             _check_touched(term, keyframes)
+            _check_measured(term)
     return terms
 
 
@@ -71,8 +84,6 @@ def _check_flat(term: FlatTerm, observations: Observations) -> None:
     landmark = _check_range(f"{term.name}.landmark", term.landmark, len(observations.host), "landmarks")
     if term.edge is not None:
         edge = _check_range(f"{term.name}.edge", term.edge, len(observations.edges), "edges")
-        if len(edge) != count:
-            raise InputError(f"`{term.name}.edge` must have {count} entries, one a landmark, got {len(edge)}")
         check_matches((f"{term.name}.edge", f"{term.name}.landmark"), edge, landmark, observations)
     elif len(np.unique(landmark)) < count:
         raise InputError(f"`{term.name}.landmark` must be distinct: at most one observation for each landmark")
@@ -98,3 +109,26 @@ def _check_range(name: str, given: Any, limit: int, what: str) -> np.ndarray:
             f"`{name}` must be from 0 to {limit - 1} ({limit} {what}), got {values.min()} to {values.max()}"
         )
     return values
+
+
+def _check_measured(term: PoseTerm | PairTerm) -> None:
+    """Check the shapes of the data of a term of this package and, unless traced, unit quaternions and positive lengths.
+
+    A quaternion that is not normalised would rotate by another angle without any warning.
+    """
+    rows: dict[str, tuple[int, ...]] = next((rows for kind, rows in _ROWS.items() if isinstance(term, kind)), {})
+    for field, shape in rows.items():
+        value = getattr(term, field)
+        wanted = (*jnp.shape(term.weight), *shape)
+        if jnp.shape(value) != wanted:
+            raise InputError(f"`{term.name}.{field}` must have shape {wanted}, got {jnp.shape(value)}")
+        if isinstance(value, jax.core.Tracer) or isinstance(term.weight, jax.core.Tracer):
+            continue
+        # Placeholders of padding are not checked.
+        known = np.asarray(value, np.float64)[np.asarray(term.weight) > 0]
+        if field == "measured":
+            known = np.linalg.norm(known[:, :4], axis=1)
+        wrong = ~(np.abs(known - 1) <= UNIT) if field == "measured" else ~(known > 0)
+        if field != "root" and wrong.any():
+            what = "a quaternion of length 1, w first" if field == "measured" else "positive numbers"
+            raise InputError(f"`{term.name}.{field}` must be {what}, got {known[wrong][0]:.3g}")

@@ -17,7 +17,6 @@ import typer
 from typer.core import TyperGroup
 
 from vggtgeo.cli.environment import (
-    check_address_space,
     set_jax_flags,
     show_unknown_characters,
 )
@@ -161,8 +160,6 @@ class _LazyGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, stand_in, rest = super().resolve_command(ctx, args)
         entry = next((entry for entry in COMMANDS if entry.name == name), None)
-        if entry is not None and not set(ctx.help_option_names) & set(rest):
-            check_address_space(entry.name)
         return name, load_command(entry) if entry else stand_in, rest
 
     def invoke(self, ctx: Any) -> Any:

@@ -78,8 +78,6 @@ def run(
     from vggtgeo.slam.run import default_roles
 
     slam_settings = pipeline_settings(settings, options.assignments or (), tables_of_switches(switches, options))
-    if options.save_map is not None:
-        check_map_file(options.save_map)
     perceived = make_perception(perception, default_roles(sequence.has_depth), switches)
     flags = settings.values() if settings else {}
     run_and_write(
@@ -113,7 +111,7 @@ def tables_of_switches(switches: SwitchOptions, options: RunOptions) -> dict[str
     depth_weight = DepthSettings.depth_weight if switches.depth_prior else 0.0
     tables: dict[str, Tables] = {
         "no_lines": {"line": {"use_lines": not switches.no_lines}},
-        "no_confidence": {"weights": {"use_confidence": not switches.no_confidence}},
+        "no_confidence": {"weights": {"confidence": "none" if switches.no_confidence else "measured"}},
         "depth_prior": {"depth_terms": {"depth_weight": depth_weight}},
         "global_adjustment": {"refinement": {"global_adjustment": switches.global_adjustment}},
         "refine_intrinsics": {"camera": {"refine_intrinsics": REFINE[switches.refine_intrinsics]}},
@@ -130,8 +128,6 @@ def check_map_place(file: Path, output: Path) -> None:
     from vggtgeo.io.files import whole_path
     from vggtgeo.results.output_checks import is_result
 
-    if file.exists() and not file.is_file():
-        raise InputError(f"`--save-map` is `{file}`, which is a device, a pipe or a socket; give the name of a file")
     if is_result(output, file) or whole_path(file) == whole_path(output):
         raise InputError(
             f"`--save-map` is `{file}`, the name of a result of the run itself, or its folder; give another, such as "
@@ -144,12 +140,6 @@ def check_map_place(file: Path, output: Path) -> None:
         raise InputError(f"`--save-map` is `{file}`, which cannot be written: {error.strerror or error}") from None
 
 
-def check_map_file(file: Path) -> None:
-    """Raise InputError if the map would replace a file that is not a map."""
-    if file.is_file() and file.stat().st_size and not _is_map(file):
-        raise InputError(f"`--save-map` is `{file}`, which exists and is not a map; give the name of a new file")
-
-
 def check_recording_file(target: str, output: Path) -> None:
     """Raise InputError if the run's results would replace the recording."""
     from vggtgeo.results.output_checks import is_in_results
@@ -158,16 +148,6 @@ def check_recording_file(target: str, output: Path) -> None:
         raise InputError(
             f"`--rerun` is `{target}`, in a folder that the run replaces; give another, for example `{output}/run.rrd`"
         )
-
-
-def _is_map(file: Path) -> bool:
-    from vggtgeo.slam.known_map import MAP
-
-    try:
-        MAP.facts(file)
-    except InputError:
-        return False
-    return True
 
 
 def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool) -> dict[str, str]:

@@ -32,7 +32,7 @@ from vggtgeo.results.unfinished import EXPORTS, SUMMARY
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.settings.table import changed, updated
+from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
 from vggtgeo.viewing.target import STAND_IN, open_target
@@ -99,8 +99,6 @@ def run_and_write(
         if output.resume and not folder.checkpoint.is_file():
             typer.echo(f"nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)
         viewed, url = _rerun_callbacks(output, folder, title, settings.window.size)
-        if viewed:
-            settings = updated(settings, {"window": {"record_iterations": True}})
         with as_input_errors(), ProgressBar(console) as bar:
             result = reconstruct(
                 sequence,

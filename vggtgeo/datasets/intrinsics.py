@@ -3,7 +3,7 @@
 import math
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,6 @@ MAX_ASPECT = 4.0
 _OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
 _FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
 """Names of the two lens models in ROS, Kalibr, EuRoC and RealSense."""
-SAME_SHAPE = 0.01
-"""Maximum relative difference of the aspects of images of one shape."""
-ONE_CAMERA = 0.02
-"""Maximum relative difference of the focal lengths of one camera; autofocus changes them by less."""
 MAX_BYTES = 100_000
 """Maximum size of a file with a few numbers and comments."""
 CALIBRATION, DISTORTION = "calibration.txt", "distortion.txt"
@@ -162,23 +158,6 @@ def check_plausible(where: str, camera: Camera) -> None:
                 f"{where}: the distortion {camera.distortion} leaves {100 * share:.0f} % of the image; it must be "
                 "k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order"
             )
-
-
-def check_same_shape(file: Path, stated: tuple[float, float], size: tuple[int, int]) -> None:
-    """Raise InputError if a camera's file is of images of another aspect than those of `size`."""
-    if abs(stated[0] * size[1] - stated[1] * size[0]) > SAME_SHAPE * stated[0] * size[1]:
-        raise InputError(
-            f"`{file}` is of images of {stated[0]:g} x {stated[1]:g} pixels; those here are {size[0]} x {size[1]}, "
-            "which is another shape: were they turned or cut afterwards?"
-        )
-
-
-def warn_of_zoom(file: Path, focal_lengths: Sequence[float]) -> None:
-    """Warn if focal lengths of the frames of one camera differ by more than autofocus changes them."""
-    low, high = min(focal_lengths), max(focal_lengths)
-    if high - low > ONE_CAMERA * abs(low):
-        text = f"focal lengths of its frames go from {low:g} to {high:g} pixels; the median is taken for all"
-        warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=5)
 
 
 def published_camera(name: str, width: int, height: int) -> Camera | None:

@@ -25,7 +25,7 @@ from vggtgeo.datasets.depth_files import MILLIMETRES
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, is_there
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
-from vggtgeo.datasets.intrinsics import check_same_shape, guess_with_warning, intrinsics_of, warn_of_zoom
+from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
 from vggtgeo.datasets.pose_files import parsing, read_json, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
@@ -126,13 +126,10 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
     def number(key: str, default: float = 0.0) -> float:
         places = (content,) if content.get(key) is not None else frames
         stated = [float(one[key]) for one in places if one.get(key) is not None]
-        if key == "fl_x" and stated:
-            warn_of_zoom(file, stated)
         return statistics.median(stated) if stated else default
 
     with parsing(file, _EXPECTED):
         across, down = number("w", width), number("h", height)
-        check_same_shape(file, (across, down), (width, height))
         angle = number("camera_angle_x")
         fx = number("fl_x", 0.5 * across / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0)
         if not fx and not {"fl_x", "camera_angle_x"} & {*content, *(key for frame in frames for key in frame)}:

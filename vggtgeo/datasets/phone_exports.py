@@ -24,7 +24,7 @@ import numpy as np
 from vggtgeo.datasets.depth_files import read_depth
 from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
-from vggtgeo.datasets.intrinsics import check_plausible, check_same_shape, intrinsics_of, warn_of_zoom
+from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.datasets.phones import remove_doubtful
 from vggtgeo.datasets.pose_files import parsing, read_json, trajectory_of
@@ -174,9 +174,7 @@ def _times(folder: Path, stated: list[float]) -> list[float]:
 
 def _camera(folder: Path, views: list[_View], width: int, height: int) -> Camera:
     """Return the median of the intrinsics of all frames; autofocus changes them by a few tenths of a per cent."""
-    warn_of_zoom(folder, [view.camera[0] for view in views])
     size = views[0].size or (width, height)
-    check_same_shape(folder, size, (width, height))
     middle = intrinsics_of(folder, np.median([view.camera for view in views], axis=0))
     camera = Camera(middle, round(size[0]), round(size[1])).resized(width, height)
     check_plausible(f"`{folder}`", camera)

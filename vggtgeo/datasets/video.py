@@ -237,8 +237,6 @@ def _check_content(path: Path) -> None:
             head = file.read(_HEAD)
     except OSError as error:  # a disk that fails
         raise InputError(f"`{path}` cannot be read: {error.strerror}; give a copy on a disk that works") from None
-    if not head:
-        raise InputError(f"`{path}` is empty; copy or record it again")
     if not _NO_TEXT.search(head):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
 

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from vggtgeo.geometry.trajectory import MAX_COORDINATE
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_positive, real_array
 
@@ -66,12 +65,6 @@ def checked_points(name: str, given: Float[np.ndarray, "n 3"]) -> Float[np.ndarr
     points = real_array(name, given, (None, 3)).astype(np.float64)
     if not len(points):
         raise InputError(f"`{name}` must be [n, 3], n at least 1, got shape {points.shape}")
-    if not np.isfinite(points).all():
-        raise InputError(f"`{name}` must be finite; leave points with NaN or infinity out")
-    if np.abs(points).max() > MAX_COORDINATE:
-        raise InputError(
-            f"`{name}` has coordinates up to {np.abs(points).max():.3g} m, at most {MAX_COORDINATE:g} are valid"
-        )
     return points
 
 

@@ -37,8 +37,6 @@ def depth_error(
     """
     depth, truth = real_numbers("depth", depth), real_numbers("truth", truth)
     mask = None if mask is None else real_numbers("mask", mask)
-    if mask is not None and mask.dtype != np.bool_:
-        raise InputError(f"`mask` must be bool, got {mask.dtype}")
     if depth.shape != truth.shape or (mask is not None and mask.shape != truth.shape):
         shapes = f"`depth` has shape {depth.shape}, `truth` {truth.shape}"
         raise InputError(shapes + ("" if mask is None else f", `mask` {mask.shape}") + "; they must be equal")
@@ -73,8 +71,6 @@ def depth_of_cloud(
     if camera.distorts:
         raise InputError("`camera` must not have distortion; give `camera.pinhole`, and compare with undistorted depth")
     points, pose = real_array("points", points, (None, 3)), real_array("pose", pose, (4, 4))
-    if not (np.isfinite(points).all() and np.isfinite(pose).all()):
-        raise InputError("`points` and `pose` must be finite; leave points with NaN or infinity out")
     local = points @ pose[:3, :3].T + pose[:3, 3]
     inside, rows, columns = pinhole.visible(local, camera.intrinsics, (camera.height, camera.width), nearest=0.0)
     depth = np.full((camera.height, camera.width), np.inf)

@@ -9,8 +9,6 @@ from vggtgeo.evaluation.clouds import CloudError, checked_points, cloud_error
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_positive, check_whole, real_numbers
 
-MAX_POINTS = 50_000_000
-"""Of a surface: 1.2 GB, and several times as much while they are sampled."""
 Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices, metres, and the vertex indices of each face."""
 
@@ -30,11 +28,6 @@ def surface_points(mesh: Mesh, spacing: float, seed: int = 0) -> Float[np.ndarra
     total = float(areas.sum())
     if not total > 0:
         raise InputError("`mesh` has no face with an area")
-    if total / spacing**2 > MAX_POINTS:
-        raise InputError(
-            f"`spacing` is {spacing:g} m, which gives {total / spacing**2:.3g} points on {total:.3g} square metres, "
-            f"more than {MAX_POINTS}: give a larger one, or a larger threshold"
-        )
     rng = np.random.default_rng(seed)
     face = rng.choice(len(faces), max(round(total / spacing**2), 1), p=areas / total)
     s, v = np.sqrt(rng.random((len(face), 1))), rng.random((len(face), 1))
@@ -52,15 +45,11 @@ def mesh_error(estimate: Mesh, truth: Mesh, threshold: float = 0.05, seed: int =
 
 
 def _checked(mesh: Any) -> Mesh:
-    if not isinstance(mesh, tuple | list) or len(mesh) != 2:
-        raise InputError(f"`mesh` must be a pair of vertices and faces, got `{type(mesh).__name__}`")
     vertices, faces = real_numbers("vertices of `mesh`", mesh[0]), real_numbers("faces of `mesh`", mesh[1])
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise InputError(
             f"`mesh` must have vertices and faces [n, 3], not empty, got shapes {vertices.shape} and {faces.shape}"
         )
-    if faces.dtype.kind not in "iu":
-        raise InputError(f"`mesh` must have faces of integers, the indices of their vertices, got {faces.dtype}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"`mesh` has {len(vertices)} vertices, but vertex indices from {faces.min()} to {faces.max()}")
     return checked_points("vertices of `mesh`", vertices), faces

@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,7 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.datasets.depth_files import read_codes
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
-from vggtgeo.datasets.images import image_files
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.datasets.opening import FOLDER_KINDS
 from vggtgeo.export.colmap import write_colmap
 from vggtgeo.export.contents import EmptyRunError, cloud_of, copy_pictures, picture_mask, scene_of
 from vggtgeo.export.surfaces import write_glb, write_las, write_ply
@@ -201,19 +198,12 @@ def _check_target(output: Path, run: Path) -> None:
     """Raise InputError if the export would mix with the run's own files or a recording, or `output` is a file."""
     if whole_path(output) == whole_path(run):
         raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
-    if output.is_dir() and not (output / _RECORD).is_file() and _is_recording(output):
-        raise InputError(f"`{output}` is a recording; give another folder for the export with `-o`")
     for name in ("images", "depth"):
         if whole_path(output).is_relative_to(whole_path(run / name)):
             raise InputError(f"`{output}` is in `{run / name}`, which is the run's own; give another for the export")
     for folder in (output, *output.parents):
         if os.path.lexists(folder) and not folder.is_dir():
             raise InputError(f"`{folder}` is not a folder; give a new one for the export with `-o`")
-
-
-def _is_recording(folder: Path) -> bool:
-    """Return whether the folder has the layout of a dataset, other than plain images."""
-    return any(reader.matches(folder) for name, reader in FOLDER_KINDS.items() if name != "images")
 
 
 def _record(output: Path, names: list[str], ours: bool) -> None:
@@ -232,18 +222,4 @@ def _record(output: Path, names: list[str], ours: bool) -> None:
             f"`{output / foreign[0]}` exists and was not written by an export, which would replace it; give a new "
             "folder with `-o`"
         )
-    if not ours and (image := _foreign_image(output, names, known)):
-        raise InputError(
-            f"`{image}` is an image that no export wrote, and the export would add images beside it: is `{output}` a "
-            "recording? Give a new folder with `-o`"
-        )
     write_text(record, "\n".join(sorted({*known, *names})) + "\n")
-
-
-def _foreign_image(output: Path, names: list[str], known: Collection[str]) -> Path | None:
-    """Return an image that no export wrote, in a folder to which images are exported."""
-    for folder in sorted({(output / name).parent for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES}):
-        for path in image_files(folder) if folder.is_dir() else ():
-            if path.relative_to(output).as_posix() not in known:
-                return path
-    return None

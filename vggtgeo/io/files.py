@@ -62,8 +62,6 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 @contextmanager
 def atomic_open(path: str | os.PathLike[str], mode: str = "w") -> Iterator[IO[Any]]:
     """Open `path` for writing (`mode` "w" or "wb"); the file appears at the end of the block."""
-    if mode not in ("w", "wb"):
-        raise ValueError(f"`mode` is {mode!r}; an atomic write replaces the whole file: use 'w' or 'wb'")
     # Texts may quote file names that are not UTF-8.
     text: dict[str, Any] = {"encoding": "utf-8", "errors": "backslashreplace"} if mode == "w" else {}
     with atomic_path(path) as temporary, open(temporary, mode, **text) as handle:

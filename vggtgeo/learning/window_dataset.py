@@ -168,13 +168,6 @@ class WindowDataset:
             raise InputError(f"`{place}` is no complete folder of windows; write one first") from None
         if type(version) is not int or version != VERSION:
             raise InputError(f"`{place / _INDEX}` is of version {version!r:.20}; this program reads {VERSION}")
-        if type(count) is not int or count < 0:
-            raise InputError(f"`{place / _INDEX}` counts {count!r:.20} windows; expected a number: write it again")
-        for row in {0, count - 1} - {-1}:
-            if not (place / _name(row)).is_file():
-                raise InputError(f"`{place / _name(row)}` is not there, and `{_INDEX}` counts {count} windows")
-        if is_there(place / _name(count)):
-            raise InputError(f"`{place / _name(count)}` is there, and `{_INDEX}` counts {count} windows")
         return cls(place, count, tuple(terms))
 
     def __len__(self) -> int:
@@ -215,8 +208,6 @@ class WindowDataset:
             if value is not None:
                 check_whole(name, value)
         check_kind("share", share, tuple, "(k, n) with 0 <= k < n")
-        if len(share) != 2:
-            raise InputError(f"`share` is {share!r:.60}; it must be (k, n) with 0 <= k < n")
         part, parts = share
         for value in share:
             check_whole("share", value)
@@ -256,12 +247,8 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
 
     """
     check_kind("windows", windows, Sequence, "a list of windows, as `WindowDataset` gives them")
-    if not windows:
-        raise InputError("`windows` is empty; give at least one")
     for row, window in enumerate(windows):
         check_kind(f"windows[{row}]", window, LabelledWindow, "a window, as `WindowDataset` gives it")
-        if _shapes(window) != _shapes(windows[0]):
-            raise InputError(f"`windows[{row}]` has another padded shape, other terms or other labels than the first")
     stack: LabelledWindow = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
     return stack
 

@@ -11,7 +11,6 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.camera import check_intrinsics
 from vggtgeo.geometry.mesh import Mesh
-from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_positive, check_real, check_whole, real_array
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.tsdf import (
@@ -99,8 +98,6 @@ class SurfaceFusion:
     def __init__(self, intrinsics: np.ndarray, voxel: float = 0.02, min_views: int = 2, bound: float = 0.5):
         check_positive("voxel", voxel, "metres")
         check_real("bound", bound, "voxels, 0 or more")
-        if not bound >= 0:
-            raise InputError(f"`bound` must be voxels, 0 or more, got {bound}")
         check_whole("min_views", min_views, 1)
         given = real_array("intrinsics", intrinsics, (4,)).astype(np.float64)
         self._intrinsics = np.array(check_intrinsics(given.tolist()))
@@ -123,8 +120,6 @@ class SurfaceFusion:
         check_kind("keyframes", keyframes, Sequence, "a sequence of keyframes, such as `state.adjusted_keyframes`")
         for keyframe in keyframes:
             check_kind("keyframes", keyframe, Keyframe, "a sequence of keyframes, such as `state.adjusted_keyframes`")
-        if depth_maps is not None and len(depth_maps) != len(keyframes):
-            raise InputError(f"`depth_maps` must have an entry per keyframe ({len(keyframes)}), got {len(depth_maps)}")
         maps = [None] * len(keyframes) if depth_maps is None else depth_maps
         stale: set[Block] = set()
         for number in self._fused.keys() - {keyframe.number for keyframe in keyframes}:

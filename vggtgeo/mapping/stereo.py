@@ -55,10 +55,6 @@ class StereoSettings:
         for name, minimum in minima.items():
             if getattr(self, name) < minimum:
                 raise InputError(f"`{name}` must be at least {minimum}, got {getattr(self, name)}")
-        if self.window % 2 == 0:
-            raise InputError(f"`window` must be odd, got {self.window}")
-        if not 0 < self.smooth <= self.jump:
-            raise InputError(f"`smooth` must be positive and at most `jump`, got {self.smooth} and {self.jump}")
 
 
 def stereo_depths(

@@ -25,7 +25,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.checkpoint_pace import EVERY, SHARE
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.given import check_real, path_of
-from vggtgeo.io.persistence import AGAIN, Format, by_name
+from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.output_checks import check_checkpoint_path
 from vggtgeo.results.summary import versions
@@ -114,15 +114,7 @@ class RunSoFar:
         return [*(notice.warning() for notice in self.notices), *fresh]
 
     def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
-        """Add the checkpoint's counts to `refusals`; raise InputError if they are invalid or of other networks."""
-        known = {role: len(dataclasses.fields(counts)) for role, counts in refusals.items()}
-        found = {role: len(counts) for role, counts in self.refused.items()}
-        invalid = any(known.get(role) != count for role, count in found.items())
-        if invalid or min((value for counts in self.refused.values() for value in counts), default=0) < 0:
-            raise InputError(
-                f"`refused` in the checkpoint is {dict(self.refused)}; expected counts of "
-                f"{', '.join(known) or 'no network'}: start again with `--no-resume`"
-            )
+        """Add the checkpoint's counts to `refusals`."""
         for role, counts in self.refused.items():
             for entry, value in zip(dataclasses.fields(Refusals), counts, strict=True):
                 setattr(refusals[role], entry.name, value)
@@ -176,8 +168,6 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
         if not isinstance(found, RunSoFar) or not found.slam.frames:
             raise InputError(f"`{asked.path}` contains no run")
         checked_state(asked.path, found.slam)
-        if not all(0 <= took < math.inf for took in (*found.seconds.values(), found.tracking, found.whole)):
-            raise InputError(f"`seconds` in `{asked.path}` is {dict(found.seconds)}, must be positive: {AGAIN}")
     except InputError as error:
         raise InputError(f"{error}; start again with `--no-resume`") from None
     return found

@@ -139,7 +139,6 @@ def simulate(
     """
     check_walk(scene, frames, size, rate, speed)
     check_kind("sensor", sensor, Sensor | None, "a `vggtgeo.simulation.Sensor`")
-    check_within_frame(sensor or Sensor(), rate)
     check_whole("seed", seed)
     build, walk = WORLDS[scene]
     motion = HandheldMotion.along(walk, seed)
@@ -170,16 +169,6 @@ def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, spee
             raise InputError(f"`{name}` is {value}; it must be positive")
         if not _LEAST <= value <= _MOST:  # times or places that are the same, or none
             raise InputError(f"`{name}` is {value}; it must be from {_LEAST:g} to {_MOST:g}")
-
-
-def check_within_frame(sensor: Sensor, rate: float) -> None:
-    """Raise InputError for an image that lasts longer than a frame of this rate."""
-    for name in ("exposure_time", "readout_time"):
-        if getattr(sensor, name) * rate > 1 + 1e-9:
-            raise InputError(
-                f"`{name}` is {getattr(sensor, name):g} s, and a frame lasts {1 / rate:.3g} s at {rate:g} a second: "
-                "give at most that"
-            )
 
 
 def camera_of(size: tuple[int, int]) -> Camera:
@@ -224,8 +213,6 @@ def _name(time: float) -> str:
 
 def check_new(folder: Path) -> None:
     """Raise InputError if `folder` exists and is not an empty folder."""
-    if folder.is_symlink() and not folder.exists():
-        raise InputError(f"`{folder}` is a broken link; give the name of a new folder")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"`{folder}` exists and is not an empty folder; give the name of a new one")
 

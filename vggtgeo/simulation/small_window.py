@@ -153,12 +153,6 @@ def simulate_window(
             raise InputError(
                 f"`{name}` is {share}; it must be at least 0, and {'at most 1' if most == 1 else 'finite'}"
             )
-    matches = keyframes * (keyframes - 1) * (points + _SAMPLES * lines)
-    if matches > _MAX_MATCHES:
-        raise InputError(
-            f"{keyframes} `keyframes` with {points} `points` and {lines} `lines` each make {matches} observations, as "
-            f"each sees those of all others; at most {_MAX_MATCHES} are made: give fewer"
-        )
     rng = np.random.default_rng(seed)
     poses = _arc(keyframes)
     host = np.repeat(np.arange(keyframes), points)

@@ -27,7 +27,6 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.start import (
-    MAX_FRAMES_WITHOUT_POSE,
     begin_again_with_depth,
     start_without_depth,
     without_depth,
@@ -56,7 +55,7 @@ from vggtgeo.slam.tracking.track import (
     track_by_rays,
     unless_contradicted,
 )
-from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose
 from vggtgeo.slam.tracking.two_view_motion import usual_step
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
@@ -374,7 +373,7 @@ def _handle_lost_frame(
     if slam.tracker.lost == 0:
         note = f"tracking was lost at frame {frame.index} ({frame.name})"
         slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
-    waiting = wait(slam.tracker, frame, features, MAX_FRAMES_WITHOUT_POSE)
+    waiting = wait(slam.tracker, frame, features, MAX_UNPLACED)
     slam = replace(slam, tracker=replace(slam.tracker, lost=slam.tracker.lost + 1))
     shown = sum(len(other.features) > settings.keyframes.min_inliers for other in waiting)
     patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE

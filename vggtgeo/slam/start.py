@@ -16,12 +16,10 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track
-from vggtgeo.slam.tracking.tracker import FramePose, UnplacedFrame, given_up
+from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, UnplacedFrame, given_up
 from vggtgeo.slam.window.sliding_window import scale_anchor
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
-MAX_FRAMES_WITHOUT_POSE = 90
-"""Maximum number of frames that are kept to be tracked once there is a map, or tracking goes on."""
 MIN_SHARED = 100
 """Matches that a waiting frame must share with the current one to start the map instead of the first keyframe:
 `TwoViewStart` needs 60 inliers. The initialiser of ORB-SLAM (Mur-Artal, Montiel, Tardos, 2015) changes its reference
@@ -152,16 +150,14 @@ def _later_first(slam: Slam, features: Features, roles: Roles, settings: SlamSet
     return replace(
         slam,
         map=replace(slam.map, keyframes=(*slam.keyframes[:-1], first)),
-        tracker=replace(slam.tracker, frames=tuple(records), waiting=(back, *others)[-MAX_FRAMES_WITHOUT_POSE:]),
+        tracker=replace(slam.tracker, frames=tuple(records), waiting=(back, *others)[-MAX_UNPLACED:]),
     )
 
 
 def _wait(slam: Slam, frame: Frame, features: Features) -> Slam:
     waiting = (*slam.tracker.waiting, UnplacedFrame(frame.index, frame.timestamp, frame.image, features))
     record = FramePose(frame.index, frame.timestamp, slam.window.members[-1], np.eye(4), False, 0)
-    return replace(
-        slam, tracker=replace(slam.tracker, waiting=waiting[-MAX_FRAMES_WITHOUT_POSE:], frames=(*slam.frames, record))
-    )
+    return replace(slam, tracker=replace(slam.tracker, waiting=waiting[-MAX_UNPLACED:], frames=(*slam.frames, record)))
 
 
 def _place_in_new_map(slam: Slam, first: Keyframe, roles: Roles) -> Slam:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import socket
 import sys
@@ -16,7 +15,7 @@ from typing import Any
 from urllib.parse import quote
 
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import make_parent, whole_path
+from vggtgeo.io.files import make_parent
 
 ORIGINS = (
     *("/world", "/world/camera/image", "/keyframe/image", "/keyframe/depth", "/keyframe/confidence", "/window"),
@@ -33,8 +32,6 @@ WEB_PORT = 9090
 _MAGIC = b"RRF"
 _TIMEOUT = 10.0
 """Seconds for a viewer to open, and to receive the last data."""
-_STALL_TIMEOUT = 5.0
-"""Seconds without growth after which a file is given up."""
 _PROBE_SIZE = 2**20
 """Bytes written to test the disk; Rerun's first write is 30 kB."""
 
@@ -54,14 +51,6 @@ def check_target(target: str) -> str:
         raise InputError(
             f"`--rerun` must be `spawn` (a window), `serve` (a browser) or a file ending with `.rrd`, got {target!r}"
         )
-    if "://" in target:
-        raise InputError(
-            f"`--rerun` is `{target}`, an address; give a file, or `serve`, which prints the address for a viewer"
-        )
-    if Path(target).is_dir():
-        raise InputError(f"`--rerun` is `{target}`, which is a folder; give a new file ending with `.rrd`")
-    if whole_path(Path(target)).is_symlink():  # Rerun's own error comes later and does not name the option
-        raise InputError(f"`--rerun` is `{target}`, a broken link; give a new file ending with `.rrd`")
     if Path(target).is_file() and not _is_recording(Path(target)):
         raise InputError(f"`--rerun` is `{target}`, which exists and is not a recording; give the name of a new file")
     return target
@@ -106,7 +95,7 @@ def flush(stream: Any, file: Path | None = None) -> str:
         file: of the stream, if any.
 
     """
-    reason = _send_error(stream, _TIMEOUT) if file is None else _write_error(stream, file)
+    reason = _send_error(stream, _TIMEOUT)
     if not reason or file is None:
         return reason and f"the Rerun viewer did not receive all of the recording ({reason})"
     return f"the recording `{file}` is incomplete: {reason}; free disk space, or give another file"
@@ -120,7 +109,7 @@ def has_screen() -> bool:
 
 
 def _save(stream: Any, path: Path) -> Path:
-    """Record to a file, after a test that the disk is writable: else Rerun may never return, see `_write_error`."""
+    """Record to a file, after a test that the disk is writable: else Rerun may never return, on a full disk."""
     make_parent(path)
     try:
         reason = _disk_error(path.parent)
@@ -139,29 +128,6 @@ def _send_error(stream: Any, seconds: float) -> str:
     except RuntimeError as error:
         return str(error).splitlines()[0]
     return ""
-
-
-def _write_error(stream: Any, file: Path) -> str:
-    """Return why the file is incomplete; empty if it is complete.
-
-    Rerun's writing thread ends at the first error. A flush sent before is then never answered (rerun-sdk 0.41), and
-    closing the stream waits for it. So the stream is abandoned once the file no longer grows.
-    """
-    size = -1
-    while reason := _send_error(stream, _STALL_TIMEOUT):
-        before, size = size, file.stat().st_size if file.is_file() else 0
-        if size <= before:
-            _abandon(stream)
-            return _disk_error(file.parent) or reason
-    return ""
-
-
-def _abandon(stream: Any) -> None:
-    """Keep a reference to the stream for ever: deleting it, or Rerun's exit handler, would wait for ever."""
-    import rerun as rr
-
-    rr.unregister_shutdown()
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
 
 
 def _disk_error(folder: Path) -> str:

@@ -27,7 +27,6 @@ from scenes import Scene
 from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.arrow import ArrowVector
 
-from vggtgeo.bundle.analysis import observability as module
 from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.analysis.directions import MOTIONS, common_directions, direction_names
 from vggtgeo.bundle.analysis.observability import observability
@@ -40,12 +39,8 @@ from vggtgeo.bundle.analysis.observability_report import (
     weak_directions,
 )
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
-from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.figures.plot import plot
-from vggtgeo.io.errors import InputError
-from vggtgeo.simulation.loop import simulate_loop
 
 KINDS = ("points", "lines", "depth", "intrinsics_prior")
 Observe = Callable[[Problem, State], Observability]
@@ -80,15 +75,6 @@ def test_the_weak_direction_by_name(observed: Observe, scene: Scene, options: di
     assert all(direction.alignment > 0.999 for direction in weak)
     values = np.asarray(found.whole.values[0])
     assert values[len(expected)] > 10 * WEAK, values
-
-
-def test_nothing_at_all(observed: Observe) -> None:
-    # Proves that zero weights everywhere leave every free direction open, and that the report says so.
-    found = observed(*packed(without(WELL, "point", "line", "depth"), at_truth=True, **NO_PRIOR))
-    assert len(weak_directions(found)) == 6 * (KEYFRAMES - 1) + 4
-    assert "everything (16 directions undetermined)" in found.report()
-    assert undetermined_landmarks(found) == (0, 0)
-    assert not any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves(found))
 
 
 def test_no_parallax(observed: Observe) -> None:
@@ -262,98 +248,9 @@ def test_it_traces_under_vmap() -> None:
 
 LOOP = 60
 FIRST, NONE, MOST = (np.arange(LOOP) < count for count in (1, 0, LOOP - 5))
-OPEN = {  # terms without weight, keyframes held, whether intrinsics are, and what is undetermined then
-    "nothing": ((), FIRST, True, []),
-    "intrinsics": ((), FIRST, False, []),
-    "gauge": ((), NONE, True, sorted(MOTIONS)),
-    "gauge and all that is metric": (("depth", "surfaces"), NONE, True, sorted(["scale", *MOTIONS])),
-    "five keyframes": ((), MOST, False, []),  # too few coordinates for an iteration
-}
-
-
-@pytest.fixture(scope="module")
-def loop() -> tuple[Problem, State]:
-    """A loop with points, depth and pairs of keyframes, one of them far apart, at its truth."""
-    window, surfaces = simulate_loop(LOOP, points=6, reach=2)
-    surfaces = eqx.tree_at(lambda s: s.second, surfaces, surfaces.second.at[0].set(LOOP // 2))
-    problem = window.pack(terms=(surfaces,))[0].without_term("lines").without_term("intrinsics_prior")
-    return problem, window.truth()
 
 
 def lacking(problem: Problem, kinds: tuple[str, ...]) -> Problem:
     for kind in kinds:
         problem = eqx.tree_at(lambda p, kind=kind: getattr(p, kind).weight, problem, replace_fn=jnp.zeros_like)
     return problem
-
-
-@pytest.fixture
-def sparse(monkeypatch: pytest.MonkeyPatch) -> Observe:
-    """`observability` by the way of large maps."""
-
-    def observe(problem: Problem, state: State) -> Observability:
-        with monkeypatch.context() as patch:
-            patch.setattr(module, "DENSE_KEYFRAMES", 2)
-            return observability(problem, state)
-
-    return observe
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("missing", OPEN)
-def test_a_large_map_is_seen_as_a_small_one(
-    observed: Observe, sparse: Observe, loop: tuple[Problem, State], missing: str
-) -> None:
-    # Proves that the sparse way finds the smallest eigenvalues, the information along every name and the weak
-    # directions with and without each kind, undetermined ones included. Oracle: the dense way, and the construction.
-    kinds, held, intrinsics_held, names = OPEN[missing]
-    fixed = jnp.asarray(held), jnp.full(4, intrinsics_held)
-    problem = eqx.tree_at(lambda p: (p.fixed_pose, p.fixed_intrinsics), lacking(loop[0], kinds), fixed)
-    found, expected = sparse(problem, loop[1]), observed(problem, loop[1])
-    for got, whole in ((found.whole, expected.whole), (found.alone, expected.alone), (found.without, expected.without)):
-        kept = got.values.shape[1]
-        assert kept == module.KEPT
-        np.testing.assert_allclose(got.values, whole.values[:, :kept], rtol=1e-6, atol=1e-13)
-        np.testing.assert_allclose(got.along, whole.along, rtol=1e-9, atol=1e-9 * float(whole.along.max()))
-    for kind in (None, "depth", "surfaces"):
-        weak, other = weak_directions(found, kind), weak_directions(expected, kind)
-        assert [(own.name, own.determined) for own in weak] == [(own.name, own.determined) for own in other], kind
-        np.testing.assert_allclose([own.alignment for own in weak], [own.alignment for own in other], atol=1e-6)
-    assert sorted(own.name for own in weak_directions(found) if not own.determined) == names
-    assert undetermined_landmarks(found) == undetermined_landmarks(expected)
-    shares, others = found.to_dict()["lost_without"], expected.to_dict()["lost_without"]
-    assert shares.keys() == others.keys()
-    # Of no information nobody has a share: what is found along an undetermined direction is rounding.
-    told = expected.whole.along[0] > 1e-9 * expected.whole.along.max()
-    for name in np.array(found.direction_names())[np.asarray(told)]:
-        assert name not in shares or shares[name] == pytest.approx(others[name], abs=1e-6)
-
-
-@pytest.mark.long
-def test_the_report_of_a_large_map(sparse: Observe, loop: tuple[Problem, State]) -> None:
-    # Proves that the text says where more may be weak than was computed, leaves out the table of single keyframes,
-    # and that numbers and picture hold what was computed.
-    found = sparse(lacking(loop[0], ("points", "depth")), loop[1])
-    weak = eqx.tree_at(lambda f: f.whole.values, found, jnp.full_like(found.whole.values, 1e-8))
-    assert f"perhaps others: only the {module.KEPT} weakest were computed" in weak.report()
-    text = found.report()
-    assert f"weak directions: at least {module.KEPT} directions undetermined" in text
-    assert "\nroll" in text
-    assert "\nkeyframe 2: roll" not in text
-    assert f"and {module.KEPT - 3} more" in repr(found)
-    assert len(found.to_dict()["eigenvalues"]) == module.KEPT
-    assert len(plot(found).axes[0].lines[0].get_xdata()) == module.KEPT
-
-
-def test_what_the_sparse_way_refuses(sparse: Observe, loop: tuple[Problem, State]) -> None:
-    # Proves the sentences for a large map that is traced, in single precision, dense or NaN. Oracle: their text.
-    problem, state = packed(WELL, at_truth=True)
-    with raises(3, "`jit`", error=ValueError):
-        jax.eval_shape(sparse, problem, state)
-    with raises("`marginal`", "couples all", error=ValueError):
-        sparse(problem.with_term(empty_prior(KEYFRAMES)), state)
-    with raises("`state`", "float32", "float64", error=ValueError):
-        sparse(*packed(WELL, at_truth=True, dtype=np.float32))
-    with pytest.raises(InputError, match=r"`problem`.*`points`"):
-        sparse(eqx.tree_at(lambda p: p.pixels, loop[0], jnp.full_like(loop[0].pixels, jnp.nan)), loop[1])
-    with raises("`state.intrinsics`", "finite", error=ValueError):
-        sparse(loop[0], eqx.tree_at(lambda s: s.intrinsics, loop[1], jnp.full(4, jnp.nan)))

@@ -238,12 +238,3 @@ def test_intrinsics_hold_for_the_image_not_for_the_network(tmp_path: Path) -> No
     found = role.estimate(np.zeros((120, 160, 3), np.uint8), intrinsics=(140.0, 140.0, 79.5, 59.5))
     expected = cv2.resize(depth.astype(np.float32), (160, 120))
     np.testing.assert_allclose(found.depth[4:-4, 4:-4], expected[4:-4, 4:-4], rtol=3e-3)
-
-
-def test_a_mask_that_is_empty_gives_no_depth(tmp_path: Path) -> None:
-    # Proves that an image without any valid pixel is an answer, not an error. Oracle: NaN everywhere.
-    size = (28, 42)
-    outputs = {"points": np.ones((1, *size, 3)), "mask": np.zeros((1, *size)), "metric_scale": np.ones(1)}
-    path = tiny.constant(tmp_path / "moge2.onnx", "moge2", {"image": (1, 3, *size)}, outputs)
-    found = MogeDepth(open_session(path, contracts.MOGE2)).estimate(np.zeros((*size, 3), np.uint8))
-    assert np.isnan(found.depth).all()

@@ -1,15 +1,13 @@
 """MASt3R, ALIKE, XFeat and DINOv3 behind ONNX, and the cache of what networks answer."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import plane_views as views
 import pytest
 import tiny_networks as tiny
-from reported import raises, warns
+from reported import raises
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.bounds import BoundedPoints
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
@@ -18,7 +16,7 @@ from vggtgeo.models.onnx.dinov3 import DescriptorGrid, DinoFeatures, saliency
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher, confidence_of, corners, nearest, reciprocal
-from vggtgeo.models.onnx.session import NetworkValueError, Session, open_session
+from vggtgeo.models.onnx.session import Session, open_session
 from vggtgeo.models.roles import DenseConfidence, PointMatcher
 
 MOTION = views.pose((1.0, -2.0, 3.0), (0.1, -0.05, 0.05))
@@ -139,18 +137,6 @@ def test_an_image_is_encoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert len(runs) == expected, (first, second)
 
 
-def test_encoder_and_decoder_must_be_of_one_size(tmp_path: Path) -> None:
-    # Proves that halves of two different exports are refused before any image. Oracle: their sizes and channels.
-    decoder = open_session(tiny.mast3r_decoder(tmp_path / "decoder.onnx", SIZE), contracts.MAST3R_DECODER)
-    small = open_session(tiny.mast3r_encoder(tmp_path / "small.onnx", (48, 64)), contracts.MAST3R_ENCODER)
-    with raises("small.onnx", "[48, 64]", "decoder.onnx", "[240, 320", error=NetworkFileError):
-        Mast3rMatcher(small, decoder)
-    features = {"features": np.zeros((1, 300, 9))}
-    other = tiny.constant(tmp_path / "other.onnx", "mast3r_encoder", {"image": (1, 3, *SIZE)}, features)
-    with raises(9, 768, error=NetworkFileError):
-        Mast3rMatcher(open_session(other, contracts.MAST3R_ENCODER), decoder)
-
-
 def test_the_strongest_corner_of_each_cell_is_taken() -> None:
     # Proves that corners cover the image and blank cells have none. Oracle: an image with one known corner in a cell.
     image = np.zeros((64, 96, 3), np.uint8)
@@ -201,25 +187,6 @@ def test_certainty_becomes_a_confidence() -> None:
 
 
 # --- DINOv3 ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("attention", [-0.5, 0.0])
-def test_attention_that_is_no_share_is_refused(
-    attention: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    # Proves that negative attention, which would be a confidence of 1 everywhere, and none at all, which would be one
-    # of 0, are errors that the bounds count. Oracle: the sentence; with the answer of the file there is none.
-    role = DinoFeatures(open_session(tiny.dinov3(tmp_path / "dinov3.onnx", (96, 128)), contracts.DINOV3))
-    image, whole = np.zeros((96, 128, 3), np.uint8), Session.run
-    assert np.isfinite(role.confidence(image)).all()
-
-    def changed(session: Session, *arguments: Any) -> dict[str, np.ndarray]:
-        found = whole(session, *arguments)
-        return {**found, "attention": np.full_like(found["attention"], attention)}
-
-    monkeypatch.setattr(Session, "run", changed)
-    with raises("dinov3.onnx", "attention", f"{attention:.3g}", error=NetworkValueError):
-        replace(role, cache=MemoryCache()).confidence(image)
 
 
 def test_saliency_is_attention_relative_to_the_mean() -> None:
@@ -312,53 +279,6 @@ def test_another_file_is_another_network(tmp_path: Path, session: Session) -> No
     for network, count in ((session, 1), (other, 2), (again, 2)):
         cache.get((network,), (), (), compute)
         assert len(calls) == count
-
-
-def test_a_broken_file_of_the_cache_is_computed_again(tmp_path: Path, session: Session) -> None:
-    # Proves that damage costs a computation, never the run, and that nothing temporary stays. Oracle: cut files, and
-    # one whose first bit of the flags says that it is encrypted.
-    cache = FolderCache(tmp_path / "cache")
-    compute, calls = _counted({"a": np.arange(5.0)})
-    cache.get((session,), (), (), compute)
-    (path,) = (tmp_path / "cache").rglob("*.npz")
-    whole = path.read_bytes()
-    encrypted, flags = bytearray(whole), whole.index(b"PK\x01\x02") + 8
-    encrypted[flags] |= 1
-    for count, content in enumerate((b"", whole[: len(whole) // 2], b"PK" + bytes(30), encrypted), start=2):
-        path.write_bytes(content)
-        np.testing.assert_array_equal(cache.get((session,), (), (), compute)["a"], np.arange(5.0))
-        assert len(calls) == count
-        assert path.read_bytes() == whole
-    assert [file.name for file in (tmp_path / "cache").rglob("*") if file.is_file()] == [path.name]
-
-
-def test_a_full_disk_costs_the_answer_s_place_only(
-    tmp_path: Path, session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Proves that a run whose answers cannot be kept goes on, is told of it once, and leaves no part of a file. Oracle:
-    # the answer, and the folder.
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("vggtgeo.io.files.os.fsync", full)
-    cache = FolderCache(tmp_path / "cache")
-    compute, calls = _counted({"a": np.arange(5.0)})
-    ask = lambda: cache.get((session,), (), (), compute)["a"]
-    with warns(tmp_path / "cache", "No space left on device", warning=UserWarning):
-        np.testing.assert_array_equal(ask(), np.arange(5.0))
-    np.testing.assert_array_equal(ask(), np.arange(5.0))  # of which no other warning tells: that would be an error
-    assert len(calls) == 2
-    assert not [file for file in (tmp_path / "cache").rglob("*") if file.is_file()]
-
-
-def test_a_failed_computation_leaves_nothing(tmp_path: Path, session: Session) -> None:
-    # Proves that an interrupted run leaves no half answer. Oracle: the folder after an interruption.
-    def interrupted() -> Outputs:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        FolderCache(tmp_path / "cache").get((session,), (), (), interrupted)
-    assert not (tmp_path / "cache").exists()
 
 
 def test_the_key_separates_shape_from_content() -> None:

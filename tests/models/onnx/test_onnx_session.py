@@ -1,21 +1,15 @@
 """The session of all networks: what it refuses, what it computes, where it leaves results."""
 
-import os
-import signal
-import sys
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-import onnx
 import pytest
 import tiny_networks as tiny
-from onnx import TensorProto, helper
+from onnx import helper
 from reported import raises
-from vggtgeo.models.onnx import contracts, providers
+from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.file_checks import NetworkFileError, external_files, recognise
 from vggtgeo.models.onnx.providers import choose_provider
 from vggtgeo.models.onnx.session import NetworkRunError, digest_of, open_session, read_signature
@@ -60,38 +54,6 @@ def test_each_network_is_recognised_by_its_signature(files: dict[str, Path], nam
     inputs, outputs, metadata = read_signature(files[name])
     assert recognise(inputs, outputs) == [name]
     assert metadata == {"vggtgeo.network": name, "vggtgeo.weights": "random"}
-
-
-@pytest.mark.parametrize(
-    ("operator", "domain", "imported", "named"),
-    [
-        ("Evil", "evil.corp", False, "evil.corp:Evil"),
-        ("Evil", "evil.corp", True, "evil.corp:Evil"),
-        ("Evil", "", True, "Evil"),
-    ],
-)
-def test_an_operator_that_is_not_known_is_named(
-    operator: str, domain: str, imported: bool, named: str, tmp_path: Path
-) -> None:
-    """Not as a file that is cut off, which fetching it again would mend. Oracle: the operator's name."""
-    value = lambda name: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3])
-    node = helper.make_node(operator, ["image"], ["y"], domain=domain)
-    opsets = [helper.make_opsetid("", 17), *([helper.make_opsetid(domain, 1)] if domain and imported else [])]
-    graph = helper.make_graph([node], "tiny", [value("image")], [value("y")])
-    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=9), tmp_path / "net.onnx")
-    with raises("net.onnx", *named.split(":"), error=NetworkFileError):
-        read_signature(tmp_path / "net.onnx")
-
-
-@pytest.mark.parametrize(("opset", "layout", "named"), [(99, 9, 99), (17, 99, 99)])
-def test_a_newer_file_is_no_damaged_one(opset: int, layout: int, named: int, tmp_path: Path) -> None:
-    """What is newer is named, with the newest that is known, as fetching it again would mend nothing."""
-    value = lambda name: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3])
-    graph = helper.make_graph([helper.make_node("Relu", ["image"], ["y"])], "tiny", [value("image")], [value("y")])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=layout)
-    onnx.save(model, tmp_path / "net.onnx")
-    with raises("net.onnx", named, error=NetworkFileError):
-        read_signature(tmp_path / "net.onnx")
 
 
 def _truncated(path: Path) -> None:
@@ -210,30 +172,6 @@ def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
             attempt()
 
 
-def test_a_wrong_input_is_an_error_of_the_network(files: dict[str, Path]) -> None:
-    # Proves that what onnxruntime raises at run time names the file. Oracle: an image of a wrong size.
-    session = open_session(files["letr"], contracts.LETR)
-    with raises("letr.onnx", "cpu", error=NetworkRunError):
-        session.run({"image": np.zeros((1, 3, 28, 43))})
-
-
-def test_ctrl_c_ends_a_network_while_it_computes(tmp_path: Path) -> None:
-    # Proves that Ctrl-C does not wait for an answer, and that others go on answering. Oracle: a file whose loop has no
-    # end.
-    session = open_session(tiny.endless(tmp_path / "endless.onnx"), contracts.LETR)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs behind a shell ignores it
-    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
-    began = time.monotonic()
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            session.run({"image": np.zeros((1, 3, 28, 42))})
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert time.monotonic() - began < 10.0
-    other = open_session(tiny.letr(tmp_path / "letr.onnx"), contracts.LETR)
-    assert other.run({"image": np.zeros((1, 3, 48, 64))})["pred_lines"].shape == (1, 3, 4)
-
-
 def test_an_answer_of_other_sizes_is_an_error_of_the_network(tmp_path: Path) -> None:
     # Proves that sizes that a file leaves open are those of the contract when it runs: as many views as were given, of
     # their size. Oracle: a constant for two views, asked with three.
@@ -297,42 +235,3 @@ def test_cuda_is_refused_where_there_is_none(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(available, lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     assert choose_provider("auto") == "cuda"
     assert choose_provider("cpu") == "cpu"
-
-
-@pytest.fixture
-def covered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The package for CUDA is installed, and the files of the other lie over its own."""
-    monkeypatch.setattr(providers.onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
-    monkeypatch.setattr(providers.metadata, "version", {"onnxruntime-gpu": "1.31.1"}.__getitem__)
-    providers.warn_once.cache_clear()
-
-
-@pytest.mark.usefixtures("covered")
-def test_a_package_for_cuda_below_the_other_is_told() -> None:
-    # Proves that nobody runs on the CPU unawares after `pip install onnxruntime onnxruntime-gpu`, which leaves the
-    # files of the first (tried in a new environment). Oracle: what onnxruntime offers then.
-    put_back = "pip install --force-reinstall --no-deps onnxruntime-gpu==1.31.1"
-    with pytest.raises(NetworkFileError, match=put_back):
-        choose_provider("cuda")
-    with pytest.warns(UserWarning, match=put_back):
-        assert choose_provider("auto") == "cpu"
-    assert choose_provider("cpu") == "cpu"  # without a word
-
-
-@pytest.mark.filterwarnings("ignore:Specified provider")
-def test_cuda_that_does_not_start_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that the library that is missing is named, and that `auto` says where it falls back. Oracle: a package
-    # for CUDA on a machine without: it prints what it does not find, and opens the network on the CPU.
-    monkeypatch.setattr(
-        providers.onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"]
-    )
-    said = "Failed to load libcublas.so.13: no such file"
-    monkeypatch.setattr(providers.onnxruntime, "preload_dlls", lambda: sys.stdout.write(said), raising=False)
-    for memory in (providers.warn_once, providers.load_cuda_libraries):
-        memory.cache_clear()
-    path = tiny.mlsd(tmp_path / "mlsd.onnx")
-    with pytest.raises(NetworkFileError, match=said):
-        open_session(path, contracts.CONTRACTS["mlsd"], provider="cuda")
-    with pytest.warns(UserWarning, match=f"networks run on the CPU.*{said}"):
-        assert open_session(path, contracts.CONTRACTS["mlsd"]).provider == "cpu"
-    providers.load_cuda_libraries.cache_clear()

@@ -67,11 +67,10 @@ def found_in(window: vg.data.SimulatedWindow, focal: float) -> FoundLens:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(2))
-def test_a_lens_is_found(seed: int) -> None:
+def test_a_lens_is_found() -> None:
     # Proves that distortion that nobody told is found beside a focal length that begins 10 % off, and how far it moves
     # pixels. Oracle: the lens that the pixels were bent with.
-    window = vg.simulate_window(seed=seed, **WINDOW)
+    window = vg.simulate_window(seed=0, **WINDOW)
     found = found_in(bent(window, -0.15, 0.05), 1.1)
     f, _, cx, cy = found.camera.intrinsics
     assert f == pytest.approx(window.intrinsics[0], rel=0.01)

@@ -26,7 +26,7 @@ from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, UnplacedFrame
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
 SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    window=WindowSettings(size=4, point_slots=96, line_slots=48),
     refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))

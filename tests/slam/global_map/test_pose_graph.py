@@ -77,11 +77,11 @@ def _errors(poses: np.ndarray, true: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("false", "bias", "alike"),
-    [(0.0, 0.8, False), (0.1, 0.8, False), (0.3, 0.8, False), (0.3, 0.0, False), (0.3, 0.5, True)],
-    ids=["drift", "10 % false", "30 % false", "30 % false, little drift", "30 % alike"],
+    [(0.0, 0.8, False), (0.3, 0.8, False), (0.3, 0.5, True)],
+    ids=["drift", "30 % false", "30 % alike"],
 )
 def test_large_drift_comes_back_and_false_loops_do_no_harm(seed: int, false: float, bias: float, alike: bool) -> None:
     """Metres and tens of degrees of drift become decimetres, with loops among which many are wrong by metres.

@@ -14,10 +14,8 @@ from vggtgeo.models.classical import OrbMatcher, SiftMatcher
 from vggtgeo.models.roles import Segments
 
 import vggtgeo as vg
-from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.reconstruction import StaticOverlaySearch
 from vggtgeo.results.source import open_source
-from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.perception.static_overlay import StaticOverlay, find_static_overlay
 from vggtgeo.slam.pipeline import begin
@@ -277,27 +275,3 @@ def test_which_frames_are_looked_at(tmp_path: Path) -> None:
     assert open_source(folder, None, vg.SlamSettings()).repeatable((0, None, 1))
     assert not open_source(vg.simulate("room", 9, size=(64, 48)), None, vg.SlamSettings()).repeatable((0, 9, 1))
     assert not open_source(iter(moving(9)), CAMERA, vg.SlamSettings()).repeatable((0, 9, 1))
-
-
-@pytest.mark.long  # two runs of 24 frames
-def test_a_run_with_text_in_the_picture_is_as_good_as_one_without(tmp_path: Path) -> None:
-    """A simulated room with three lines of text in every image: what is told, and the path. Oracle: the truth; where
-    nothing is left out, the path is drawn to the text, and the verdict says so.
-    """
-    for frame in write_tum_folder(vg.simulate("room", 24, size=(WIDTH, HEIGHT)), tmp_path / "room"):
-        file = tmp_path / "room" / "rgb" / f"{frame.timestamp:.6f}.png"
-        image = cv2.imread(str(file))
-        for row in (40, 120, 200):
-            cv2.putText(image, "REC 12:03 CAM 3", (10, row), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255,) * 3, 2)
-        cv2.imwrite(str(file), image)
-    with pytest.warns(InputWarning, match="% of the image is a static overlay"):
-        result = vg.reconstruct(tmp_path / "room", dense="none")
-    assert 0.1 < result.summary["static_overlay"] < 0.35
-    off = vg.SlamSettings(camera=vg.settings.CameraSettings(static_overlay=False))
-    without = vg.reconstruct(tmp_path / "room", settings=off, dense="none")
-    assert "static_overlay" not in without.summary
-    errors = [run.summary["truth"]["ate_se3_m"]["rmse"] for run in (result, without)]
-    assert errors[0] < 0.002
-    assert 5 * errors[0] < errors[1]
-    assert result.verdict.level == "good"
-    assert without.verdict.level != "good"

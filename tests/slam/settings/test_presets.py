@@ -3,7 +3,6 @@
 import importlib
 import json
 import os
-import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -76,16 +75,15 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("preset", ["paper", "light"])
 def test_a_run_asks_every_network_and_from_a_cache_none(
-    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int], preset: str
+    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
 ) -> None:
     # Proves that a whole run goes through every network of the preset and no other, that its result is finite, and
     # that a second run with the same cache asks none and gives the same. Oracle: a count, and the first trajectory.
     settings = SlamSettings(refinement=GlobalMapSettings(global_adjustment=False))
     poses = []
-    for expected in (set(NEEDED[preset]), set()):
-        found = perception(preset, Roles(), files, tmp_path / "cache")
+    for expected in (set(NEEDED["paper"]), set()):
+        found = perception("paper", Roles(), files, tmp_path / "cache")
         counted.clear()
         *_, slam = run(walk, found.roles, settings)
         assert set(counted) == expected
@@ -99,41 +97,6 @@ def test_a_run_asks_every_network_and_from_a_cache_none(
         poses.append(frame_trajectory(slam).poses)
     assert np.isfinite(poses[0]).all()
     np.testing.assert_array_equal(poses[0], poses[1])
-
-
-@pytest.mark.long
-def test_depth_that_knows_nothing_leaves_every_other_network_its_part(
-    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
-) -> None:
-    # Proves that a run whose depth network finds no depth at all still asks every network, VGGT among them, for each
-    # frame, and gives finite poses and a scale that is called free if there is a map. Oracle: a count.
-    folder = tmp_path / "models"
-    shutil.copytree(files, folder)
-    tiny.moge2(folder / "moge2.onnx", SIZE, mask=0.1)
-    found = perception("paper", Roles(), folder)
-    *_, slam = run(walk, found.roles, SlamSettings(refinement=GlobalMapSettings(global_adjustment=False)), end=4)
-    assert set(counted) == set(NEEDED["paper"])
-    assert counted["vggt"] >= 3
-    assert np.isfinite(frame_trajectory(slam).poses).all()
-    assert slam.tracker.waiting or not slam.metric
-
-
-@pytest.mark.long
-def test_an_interrupted_run_goes_on(
-    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
-) -> None:
-    # Proves that the answers of an interrupted run serve the next one. Oracle: the number of answers of a whole run.
-    def decoded(cache: Path, frames: int) -> int:
-        counted.clear()
-        roles = perception("paper", Roles(), files, cache).roles
-        for _ in run(walk, roles, SlamSettings(refinement=GlobalMapSettings(global_adjustment=False)), end=frames):
-            pass
-        return counted.get("mast3r_decoder", 0)
-
-    whole = decoded(tmp_path / "one", 5)
-    first = decoded(tmp_path / "two", 3)
-    assert first > 0
-    assert first + decoded(tmp_path / "two", 5) == whole
 
 
 @pytest.fixture
@@ -199,46 +162,6 @@ def test_trained_weights_are_not_called_random(files: Path) -> None:
     }
     assert replace(found, networks=trained).random == []
     assert "meaningless" not in replace(found, networks=trained).facts()
-
-
-def test_missing_and_wrong_files_end_the_run_before_any_frame(
-    files: Path, tmp_path: Path, called: dict[str, object]
-) -> None:
-    # Proves that every file is checked before a run begins and before its folder is made. Oracle: the stand-in of the
-    # run, which must not be called.
-    folder = tmp_path / "models"
-    shutil.copytree(files, folder)
-    shutil.copy(folder / "dinov3.onnx", folder / "letr.onnx")
-    for name in ("vggt", "moge2"):
-        (folder / f"{name}.onnx").rename(tmp_path / f"{name}.onnx")
-    result = _run(tmp_path, "--preset", "paper", "--models", folder)
-    assert result.exit_code == 2
-    assert "what was chosen needs vggt.onnx, moge2.onnx in" in result.output
-    for name in ("vggt", "moge2"):
-        (tmp_path / f"{name}.onnx").rename(folder / f"{name}.onnx")
-    result = _run(tmp_path, "--preset", "paper", "--models", folder)
-    assert result.exit_code == 2
-    assert "letr.onnx` is not a file of `letr`: expected outputs `pred_logits" in result.output
-    assert "it looks like a file of `dinov3`" in result.output
-    shutil.copy(files / "letr.onnx", folder / "letr.onnx")
-    tiny.vggt(folder / "vggt.onnx", views=1)
-    result = _run(tmp_path, "--preset", "paper", "--models", folder)
-    assert result.exit_code == 2
-    assert "vggt.onnx` takes 1 image at a time, expected at least 2" in result.output
-    (folder / "mast3r_decoder.onnx").write_bytes(b"version https://git-lfs.github.com/spec/v1")
-    result = _run(tmp_path, "--preset", "paper", "--models", folder, "--memory-limit-gb", "0")
-    assert "`--memory-limit-gb` must be positive, got 0" in result.output
-    result = _run(tmp_path, "--preset", "paper", "--models", folder)
-    assert result.exit_code == 2
-    assert "mast3r_decoder.onnx` is no ONNX file but a Git LFS pointer" in result.output
-    assert called == {}
-    assert not (tmp_path / "run").exists()
-
-
-def test_an_unknown_preset_is_refused() -> None:
-    # Proves that the name is checked where it is used.
-    with pytest.raises(InputError, match="`preset` is 'large'; it must be one of classical, light, paper"):
-        perception("large", Roles())
 
 
 def _whole_run(folder: Path, models: Path, size: tuple[int, int]) -> dict:

@@ -27,10 +27,9 @@ from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import step
-from vggtgeo.slam.run import finish, frame_trajectory, run_frames
+from vggtgeo.slam.run import frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.state import Slam
@@ -41,7 +40,7 @@ from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingI
 SIZE = (320, 240)
 # The window of test_pipeline.py, so that the solver is compiled once.
 SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48, window_iterations=8),
+    window=WindowSettings(size=4, point_slots=96, line_slots=48),
     refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
@@ -404,28 +403,6 @@ def test_a_place_that_drift_has_moved_is_used_again(
         expected = true[played[record.frame - len(frames)]] @ rigid.invert(true[reference])
         off = np.linalg.norm(rigid.centre(record.relative) - rigid.centre(expected))
         assert off < 0.03, f"frame {record.frame} is {100 * off:.1f} cm off"
-
-
-@pytest.mark.long
-def test_submaps_join_where_they_meet(room: Room) -> None:
-    """Two parts of a room, the second begun without knowing the first, become one map when the camera comes back.
-
-    Oracle: the renderer's poses, over both parts together.
-    """
-    sequence = simulate("room", 240, 0, SIZE, rate=10.0)
-    truth = sequence.ground_truth()
-    assert truth is not None
-    turned = [rigid.angle_between(rigid.invert(truth.poses[0]), rigid.invert(pose)) for pose in truth.poses]
-    away = next(i for i in range(20, 220) if turned[i] > np.deg2rad(80.0))
-    numbers = [*range(8), *range(away, 4, -2)]
-    frames = [replace(sequence.frame(i), index=k, timestamp=k / 10) for k, i in enumerate(numbers)]
-    slam = _run(frames, sequence.camera)
-    assert any("a new submap" in note for note in slam.notes), slam.notes
-    assert any("is joined to the one before" in note for note in slam.notes), slam.notes
-    assert len(slam.map.roots) == 1
-    slam = finish(slam, ROLES, updated(SETTINGS, {"refinement": {"global_adjustment": True, "global_iterations": 10}}))
-    times = np.arange(len(numbers)) / 10
-    assert _error(slam, Trajectory(times, truth.poses[numbers])) < 0.04
 
 
 @pytest.fixture(scope="module")

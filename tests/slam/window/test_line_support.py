@@ -54,7 +54,7 @@ def test_the_depth_prior_follows_the_chosen_confidence() -> None:
     for name, values in expected.items():
         settings = SlamSettings(depth_terms=DepthSettings(depth_trust=name))
         np.testing.assert_array_equal(_prior_trust(own, saliency, settings), values)
-        without = replace(settings, weights=WeightSettings(use_confidence=False))
+        without = replace(settings, weights=WeightSettings(confidence="none"))
         np.testing.assert_array_equal(_prior_trust(own, saliency, without), 1.0)
     with pytest.raises(InputError, match="depth_trust` is 'omega'"):
         DepthSettings(depth_trust="omega")

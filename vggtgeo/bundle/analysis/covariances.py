@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
-from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
@@ -32,7 +31,6 @@ from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.io.readable import Readable
-from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.finite import is_finite, unless
 from vggtgeo.solvers.flat_directions import flat_stiffness
@@ -160,7 +158,6 @@ def covariances(
     """
     check_pair(problem, state)
     check_finite(state)
-    check_weights(problem)
     expected = "a result of `vggtgeo.choose_reduced_solver`"
     check_kind("reduced_solver", reduced_solver, AbstractReducedSolver | None, expected)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
@@ -227,16 +224,6 @@ def _covariances_jit(
 
 def _check_size(solver: AbstractReducedSolver, keyframes: int, asked: int) -> None:
     """Raise ValueError for sizes that would fill the memory or take hours."""
-    if isinstance(solver, DenseCholesky) and keyframes > DENSE_KEYFRAMES:
-        raise ValueError(
-            f"`covariances` of {keyframes} keyframes would invert a dense matrix of {lie.TANGENT * keyframes} rows; "
-            f"above {DENSE_KEYFRAMES} keyframes pass `reduced_solver=choose_reduced_solver(problem)`"
-        )
-    if isinstance(solver, ConjugateGradients) and asked > ITERATIVE_KEYFRAMES:
-        raise ValueError(
-            f"`covariances` of {asked} keyframes by conjugate gradients would solve a system for every coordinate of "
-            f"each; pass `keyframes`, at most {ITERATIVE_KEYFRAMES} at a time"
-        )
 
 
 def variance_factor(problem: Problem, state: State, rank: Int[Array, ""]) -> Float[Array, ""]:

@@ -37,7 +37,6 @@ from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
 from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.observed import check_weights
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import term_residuals, used_slots
@@ -91,7 +90,6 @@ def observability(problem: Problem, state: State) -> Observability:
     """
     check_pair(problem, state)
     check_finite(state)
-    check_weights(problem)
     if problem.num_keyframes <= DENSE_KEYFRAMES:
         known = _observability_jit(problem, state)
         check_linearisation(problem, state, jnp.all(jnp.isfinite(known.landmark_information)))
@@ -201,11 +199,6 @@ def _check_large(problem: Problem, state: State) -> None:
         raise ValueError(
             f"{asked} cannot run inside `jit` or `vmap`, since its sparse solver is scipy's: call it outside, or "
             f"{limit}"
-        )
-    if state.inverse_depth.dtype != jnp.float64:
-        raise ValueError(
-            f"{asked} needs a `state` in float64, got {state.inverse_depth.dtype}, whose rounding errors hide weak "
-            "directions of a map of this size: set `jax_enable_x64` and pack again"
         )
 
 

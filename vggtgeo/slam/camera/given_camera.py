@@ -5,8 +5,8 @@ a whole map shows. So, once, in the last adjustment:
 
 1. Estimate the intrinsics and their covariance from pairs of keyframes with depth, with free lens distortion
    (`pairwise_intrinsics.py`). The adjustment itself has no distortion; there the focal length would absorb it.
-2. Average that estimate and the prior (`PRIOR`, `CENTRE`) by information, in the directions in which the pairs are more
-   certain than the prior (`SHARE`); `f_x / f_y` and all other directions stay.
+2. Average that estimate and the prior (`FOCAL_SIGMA`, `CENTRE`) by information, in the directions in which the pairs
+   are more certain than the prior (`SHARE`); `f_x / f_y` and all other directions stay.
 3. If the result differs significantly from the given camera, hold out a share of the matches, adjust the map to the
    others with either camera fixed, and predict the held-out matches. Accept the new camera if their robust energy
    decreases significantly (Student's t over keyframes, level `CHANCE`; at least the standard error over matches).
@@ -36,7 +36,7 @@ from vggtgeo.slam.camera.rolling_shutter import pair_to_global_shutter
 from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.map import Map
 
-PRIOR = 0.01
+FOCAL_SIGMA = 0.01
 """Standard deviation of a given focal length, relative to it: that of manufacturers and calibration tools."""
 CENTRE = 0.002
 """The same of the principal point, in focal lengths. It is smaller because a shift is nearly a rotation, which the
@@ -151,9 +151,9 @@ def keyframe_pairs(
 def _averaged(estimate: PairwiseIntrinsics, given: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the mean of prior and pairs, float64 [4], and whether it differs significantly from the given camera.
 
-    In units of the prior, `y = (log factor / PRIOR, (dx, dy) / (CENTRE fx))`: its covariance is the unit matrix.
+    In units of the prior, `y = (log factor / FOCAL_SIGMA, (dx, dy) / (CENTRE fx))`: its covariance is the unit matrix.
     """
-    units = 1.0 / np.array([PRIOR, CENTRE * given[0], CENTRE * given[0]])
+    units = 1.0 / np.array([FOCAL_SIGMA, CENTRE * given[0], CENTRE * given[0]])
     shares, directions = np.linalg.eigh(estimate.covariance[:3, :3] * np.outer(units, units))
     kept = shares <= SHARE
     along = directions.T @ (units * estimate.value[:3])

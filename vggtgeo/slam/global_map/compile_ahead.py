@@ -92,5 +92,5 @@ def compile_global(shape: GlobalShape, settings: SlamSettings, shared_focal: boo
     problem, initial = smallest_problem(shape.size, settings, terms, shared_focal)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)
-        solve_jit(problem, initial, global_solver(problem, settings)).energy.block_until_ready()
+        solve_jit(problem, initial, global_solver(problem)).energy.block_until_ready()
         sigma.result()

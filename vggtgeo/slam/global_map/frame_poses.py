@@ -16,6 +16,7 @@ from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.evidence import tangent
@@ -28,8 +29,8 @@ WIDTH, MAX_WIDTH = 1.0, 8.0
 """Width of the Geman-McClure kernel, pixels: final and initial, halved in each step. A redescending kernel, because
 matches may be off by as much as the gate of tracking, some pixels (`benchmarks/between_keyframes.py`)."""
 STEPS, CONVERGED = 15, 1e-5
-MIN_DEPTH, MAX_DEPTH = 0.1, 1e6
-"""Range of the depths that are used, in map units."""
+MAX_DEPTH = 1e6
+"""Largest depth that is used, in map units; the smallest is that of depth sensors."""
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
@@ -55,24 +56,6 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     found = poses.copy()
     found[rows] = np.array(map_in_threads(placed, rows))
     return times, found
-
-
-def off_landmarks(slam: Slam, poses: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the reprojection errors of the final map in frames tracked by points alone, pixels [m], by row of the
-    frames.
-
-    Infinite for a landmark behind the camera. Frames with few matches are left out; empty before the last adjustment.
-    poses: of `frame_poses`.
-    """
-    if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
-        return {}
-    found, motions = {}, _motions(slam)
-    for row in _placed_by_points(slam):
-        points, pixels = _sight(slam, row, poses[row], motions)
-        if len(points) >= MIN_POINTS:
-            off = np.linalg.norm(rigid.project(points, poses[row], slam.intrinsics) - pixels, axis=1)
-            found[row] = np.where(points @ poses[row][2, :3] + poses[row][2, 3] > MIN_DEPTH, off, np.inf)
-    return found
 
 
 def _placed_by_points(slam: Slam) -> list[int]:

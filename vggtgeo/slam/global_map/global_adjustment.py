@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vggtgeo.bundle.problem import State
+from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
@@ -50,7 +50,7 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
         is_first = number == 0
         adjustment, notes = shared.adjustment(slam, settings, finds_camera=is_first and not slam.camera.calibrated)
         slam = replace(slam, notes=(*slam.notes, *notes)) if is_first else slam
-        solution = solve_jit(adjustment.problem, adjustment.initial, global_solver(adjustment.problem, settings))
+        solution = solve_jit(adjustment.problem, adjustment.initial, global_solver(adjustment.problem))
         if not np.isfinite(float(solution.energy)):
             return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
         slam, solved = _apply_solution(slam, adjustment, solution.state), (adjustment.problem, solution.state)
@@ -144,9 +144,9 @@ class _SharedByRounds:
         return slam, replace(self, edges=_edges(slam), surfaces=_surfaces(slam), camera=camera)
 
 
-def _solves(settings: SlamSettings) -> Solve:
-    """Return a function that adjusts any problem of the shape of a global adjustment."""
-    return lambda problem, state: solve_jit(problem, state, global_solver(problem, settings)).state
+def _solved(problem: Problem, state: State) -> State:
+    """Adjust any problem of the shape of a global adjustment."""
+    return solve_jit(problem, state, global_solver(problem)).state
 
 
 def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:
@@ -168,7 +168,7 @@ def _try_rolling_shutter(
         return slam, adjustment, state
     motions = camera_motions(slam, adjustment.problem.num_keyframes)
     size, longest = slam.keyframes[0].size, frame_interval(slam)
-    found = find_readout(adjustment.problem, state, motions, size, longest, _solves(settings))
+    found = find_readout(adjustment.problem, state, motions, size, longest, _solved)
     if found is None or not found.pays:
         return slam, adjustment, state
     adjustment = replace(adjustment, problem=found.problem)
@@ -180,14 +180,13 @@ def _try_camera(
     slam: Slam, adjustment: Adjustment, state: State, edges: list[Directed], settings: SlamSettings
 ) -> Slam:
     """Return the state after trying to refine a given camera, or to undistort a guessed one."""
-    again = _solves(settings)
     if slam.camera.calibrated:
-        found = refine_given_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, again)
+        found = refine_given_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, _solved)
         return _apply_refined_camera(slam, adjustment, found, settings)
-    slam, adjustment, state = _try_pixel_aspect(slam, adjustment, state, again)
+    slam, adjustment, state = _try_pixel_aspect(slam, adjustment, state, _solved)
     if slam.camera.lens is not None or not can_undistort(slam.keyframes):
         return slam
-    return _apply_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, again))
+    return _apply_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, _solved))
 
 
 def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:

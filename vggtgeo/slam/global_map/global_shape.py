@@ -32,6 +32,8 @@ EDGE_SHARES = (0.5, 0.75, 1.0)
 MAX_DENSE = 128
 """Keyframes up to which the reduced system is factorised as a dense matrix: at 64 as fast as conjugate gradients, with
 16 s to compile instead of 24 s."""
+MAX_ITERATIONS = 40
+"""Iterations of an adjustment of the whole map, which mostly converges after fewer."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +94,11 @@ def padded_edges(edges: int, keyframes: int) -> int:
     return next(int(share * most) for share in EDGE_SHARES if edges <= share * most)
 
 
-def global_solver(problem: Problem, settings: SlamSettings) -> SchurLevenbergMarquardt:
+def global_solver(problem: Problem) -> SchurLevenbergMarquardt:
     """Return the solver for the adjustment of a whole map, given as its problem."""
     small = problem.num_keyframes <= MAX_DENSE
     return SchurLevenbergMarquardt(
-        max_iterations=settings.refinement.global_iterations,
+        max_iterations=MAX_ITERATIONS,
         rtol=1e-5,
         reduced_solver=DenseCholesky() if small else choose_reduced_solver(problem),
     )

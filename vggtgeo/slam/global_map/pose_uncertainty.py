@@ -22,6 +22,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.io.kept_program import KeptProgram
+from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
@@ -36,9 +37,6 @@ ground truth (`benchmarks/honest.py`)."""
 MOMENT = 0.01
 """Standard deviation of the moment of an image, seconds: rolling shutters of phones and depth cameras last up to 1/30 s
 (uniform: 0.0096 s), and published image times are off by as much. A run cannot observe it: the poses absorb it."""
-CALIBRATION = 0.01
-"""Relative standard deviation of the focal length, and so of each rotation since the first pose: that of manufacturers
-and calibration tools (`slam/camera/given_camera.py`)."""
 CENTRE = 0.014
 """Standard deviation of an unmeasured principal point, in image widths and heights: root mean square of published ones.
 A principal point at the exact middle was not measured; its error rotates all cameras by one unknown angle."""
@@ -97,7 +95,7 @@ def frame_uncertainty(slam: Slam, submap: int = 0) -> PoseUncertainty | None:
     moved = np.sqrt(moved**2 + MOMENT**2 * (speed**2 + sheared**2))
     angles = _angles(poses)
     # A rotation by `a` turned by a small `q` differs from itself by `2 q sin(a / 2)`.
-    shared = np.hypot(CALIBRATION * angles, turn * 2 * np.sin(angles / 2))
+    shared = np.hypot(FOCAL_SIGMA * angles, turn * 2 * np.sin(angles / 2))
     turned = np.sqrt(turned**2 + MOMENT**2 * rate**2 + shared**2)
     return PoseUncertainty(times, moved, turned)
 

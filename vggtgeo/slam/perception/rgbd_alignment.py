@@ -32,7 +32,7 @@ from vggtgeo.slam.precision import in_double_precision
 MAX_DISTANCE = 0.15
 """Largest distance of a point from its surface, metres."""
 MIN_DEPTH = 0.1
-"""Smallest depth, metres: where depth sensors begin."""
+"""Smallest depth that is projected, metres: where depth sensors begin."""
 MIN_COSINE = 0.7
 MIN_SAMPLES = 60
 CONVERGED = 1e-4

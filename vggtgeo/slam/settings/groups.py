@@ -97,24 +97,26 @@ class DepthSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class WeightSettings(CheckedSettings):
-    """Weight of a match: `gain * confidence + floor`.
+    """Weight of a match by its confidence Omega.
 
     Fields:
-        use_confidence: Weight matches by their confidence; without it each has weight 1.
-        confidence_gain: Factor on the confidence.
-        confidence_floor: Added to it, so that every match has a weight.
+        confidence: "measured": Omega + 0.1, so that every match has a weight; "paper": 4 Omega + 0.5; "none": 1 for
+            each match.
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.settings.WeightSettings(use_confidence=False).confidence_floor
-        0.1
+        >>> vg.settings.WeightSettings(confidence="none").weight(0.3)
+        1.0
 
     """
 
     group: ClassVar[str] = "weights"
-    use_confidence: bool = switch(True)
-    confidence_gain: float = not_negative(1.0)
-    confidence_floor: float = not_negative(0.1)
+    confidence: str = one_of("measured", "paper", "none")
+
+    def weight(self, confidence: Any) -> Any:
+        """Return the weight of matches of this confidence."""
+        gain, floor = {"measured": (1.0, 0.1), "paper": (4.0, 0.5), "none": (0.0, 1.0)}[self.confidence]
+        return gain * confidence + floor
 
 
 @dataclass(frozen=True)
@@ -162,14 +164,10 @@ class WindowSettings(CheckedSettings):
     """The keyframes that are adjusted together while the run goes on.
 
     Fields:
-        size: Number of keyframes adjusted together. Memory grows with its square: each may see the points of each,
-            30 GB at the most.
+        size: Number of keyframes adjusted together. Memory grows with its square: each may see the points of each.
         point_slots: Points of a keyframe, at most.
         line_slots: Line samples of a keyframe, at most.
         kernel: Robust kernel of points and lines, in the last adjustment too; widths in pixels.
-        window_iterations: Iterations of an adjustment of the window, at most.
-        record_iterations: Keep what each iteration of the window's solver did in `Slam.window.iterations`, for a
-            viewer; changes no result.
 
     Example:
         >>> import vggtgeo as vg
@@ -179,14 +177,12 @@ class WindowSettings(CheckedSettings):
     """
 
     group: ClassVar[str] = "window"
-    size: int = whole(10, at_least=3, at_most=1000)
-    point_slots: int = whole(320, at_least=1, at_most=100_000)
-    line_slots: int = whole(192, at_least=1, at_most=100_000)
+    size: int = whole(10, at_least=3)
+    point_slots: int = whole(320, at_least=1)
+    line_slots: int = whole(192, at_least=1)
     kernel: AbstractKernel = field(
         default_factory=lambda: Cauchy(jnp.asarray(2.0)), metadata={"expected": Expected(_KERNEL, is_kernel)}
     )
-    window_iterations: int = whole(12, at_least=1, at_most=10_000)
-    record_iterations: bool = switch(False)
 
 
 @dataclass(frozen=True)
@@ -195,7 +191,6 @@ class GlobalMapSettings(CheckedSettings):
 
     Fields:
         global_adjustment: Adjust all keyframes together; without it, the sliding window alone.
-        global_iterations: Iterations of an adjustment of the whole map, at most.
         global_rounds: Adjustments, each after relinearising the dense depth between keyframes.
         rolling_shutter: Estimate the readout time of a rolling shutter, and correct the map for it.
         loop_candidates: Pairs that each keyframe proposes for loop closure, at most; 0 disables it.
@@ -209,7 +204,6 @@ class GlobalMapSettings(CheckedSettings):
 
     group: ClassVar[str] = "refinement"
     global_adjustment: bool = switch(True)
-    global_iterations: int = whole(40, at_least=1, at_most=10_000)
     global_rounds: int = whole(3, at_least=1)
     rolling_shutter: bool = switch(True)
     loop_candidates: int = whole(3, at_least=0)

@@ -9,14 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Self
 
 import cv2
 import numpy as np
-
-from vggtgeo.datasets.image_files import decoded
-from vggtgeo.io.errors import InputError
 
 JPEG = (".jpg", (cv2.IMWRITE_JPEG_QUALITY, 95))
 PNG = (".png", (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP))
@@ -36,9 +32,7 @@ class CompressedImage:
         """Encode uint8 [H, W, 3] as JPEG, else uint8 or float16 [H, W] as PNG, bit by bit."""
         kind, options = JPEG if image.ndim == 3 else PNG
         bits = image.view(np.uint16) if image.dtype == np.float16 else image
-        encoded, data = cv2.imencode(kind, np.ascontiguousarray(bits), options)
-        if not encoded:
-            raise ValueError(f"an image of {image.shape} {image.dtype} cannot be compressed")
+        _, data = cv2.imencode(kind, np.ascontiguousarray(bits), options)
         return cls(data.tobytes(), image.shape, image.dtype)
 
     def array(self) -> np.ndarray:
@@ -46,15 +40,6 @@ class CompressedImage:
         # Colours are as they were given: encoded and decoded without a change of their order.
         image = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_UNCHANGED)
         return image.view(self.dtype).reshape(self.shape)
-
-    def check(self, name: str) -> None:
-        """Raise ValueError if data from a file are not such an image. name: used in the message."""
-        try:
-            image = decoded(self.data, Path(name), cv2.IMREAD_UNCHANGED)
-        except InputError as error:
-            raise ValueError(str(error).replace("`", "")) from None
-        if image.shape != self.shape or image.dtype.itemsize != self.dtype.itemsize:
-            raise ValueError(f"{name} is an image of {image.dtype} {image.shape}, expected {self.dtype} {self.shape}")
 
 
 @dataclass(frozen=True, eq=False)

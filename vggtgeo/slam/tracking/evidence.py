@@ -26,8 +26,8 @@ NAN = float("nan")
 MIN_INLIERS = 12
 STRONG_INLIERS = 30
 MIN_SHARE, STRONG_SHARE = 0.4, 0.5
+"""Share of the matches, of points or of lines, that are inliers."""
 MIN_LINES, STRONG_LINES = 8, 12
-MIN_LINE_SHARE, STRONG_LINE_SHARE = 0.4, 0.5
 MIN_CORRELATION, STRONG_CORRELATION = 0.4, 0.6
 CONTRADICTION = 0.1
 MIN_SURFACE = 0.85
@@ -113,12 +113,12 @@ class Evidence:
 
     @property
     def lines_fair(self) -> bool:
-        return self.lines >= MIN_LINES and self.line_share >= MIN_LINE_SHARE
+        return self.lines >= MIN_LINES and self.line_share >= MIN_SHARE
 
     @property
     def lines_strong(self) -> bool:
         """Whether lines alone suffice; `accepted` also requires that all directions are constrained."""
-        return self.lines >= STRONG_LINES and self.line_share >= STRONG_LINE_SHARE
+        return self.lines >= STRONG_LINES and self.line_share >= STRONG_SHARE
 
     @property
     def dense_fair(self) -> bool:
@@ -131,11 +131,6 @@ class Evidence:
         """Whether image, or image and surface together, suffice alone."""
         surfaces = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP
         return self.dense_fair and (self.correlation >= STRONG_CORRELATION or surfaces)
-
-    @property
-    def placed_by_surface(self) -> bool:
-        """Whether image and surface alone constrain the pose in all directions."""
-        return self.dense_strong and self.sigma_translation < BARE_SIGMA
 
     @property
     def bare_surface(self) -> bool:

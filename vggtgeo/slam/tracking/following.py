@@ -19,7 +19,8 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.tracker import SeenPoints
 
 MAX_POINTS = 300
-"""Largest number of key points to follow, the best of each part of the image; more do not improve a pose."""
+"""Largest number of key points of a keyframe that are used, spread over its image: more cost time, share the keyframe's
+error and do not improve a pose."""
 TRUSTED, MIN_TRUST = 0.5, 0.1
 """Confidence of a key point's depth: points below the first are used only if there are no others. The second is the
 smallest weight, so that maps without measured depth can be tracked."""

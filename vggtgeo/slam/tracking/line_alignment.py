@@ -27,6 +27,7 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
+from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import tangent, worst_sigma
 
@@ -34,8 +35,6 @@ END_SIGMA = 0.7
 """Standard deviation of a segment's end across it, pixels."""
 MIN_LINES = 3
 """Three lines in general position determine a pose."""
-MIN_DEPTH = 0.1
-"""Smallest depth that is projected, metres."""
 ITERATIONS, ROUNDS = 8, 3
 """Steps after each matching, and matchings: each starts from the better pose."""
 SMALL = 2e-3

@@ -21,10 +21,9 @@ from vggtgeo.models.classical import can_search, search_around, search_near, sea
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.following import MAX_POINTS
 
 MAX_KEYFRAMES = 4
-MAX_POINTS = 300
-"""Points of a keyframe, spread over its image: more cost time and share the keyframe's error."""
 MAX_TURN = np.deg2rad(45.0)
 """Largest angle between a keyframe and a frame: descriptors of key points change too much beyond."""
 MIN_POINTS = 8

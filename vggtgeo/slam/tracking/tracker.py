@@ -14,7 +14,8 @@ from vggtgeo.slam.sparse_map.units import longer, scaled_information
 from vggtgeo.slam.tracking.evidence import Evidence
 
 MAX_UNPLACED = 90
-"""Each takes half a megabyte at 480 x 270, its image and descriptors."""
+"""Frames without a pose that are kept, to be tracked once there is a map or at the end. Each takes half a megabyte at
+480 x 270, its image and descriptors."""
 
 
 @dataclass(frozen=True, eq=False)

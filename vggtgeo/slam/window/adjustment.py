@@ -202,7 +202,7 @@ def _point_rows(
         landmarks.append(landmark[chosen])
         targets.append(edge.pixels[chosen])
         omega = keyframes[host].points.confidence[edge.slots[chosen]]
-        weights.append(_weight(edge.confidence[chosen] * omega, settings))
+        weights.append(settings.weights.weight(edge.confidence[chosen] * omega))
     return {
         "point_edge": np.concatenate(edge_ids),
         "point_landmark": np.concatenate(landmarks),
@@ -245,7 +245,7 @@ def _line_rows(
         edge_ids.append(np.full(len(chosen), number))
         landmarks.append(offset + lines.table[host][chosen])
         coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
-        weight = _weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen], settings)
+        weight = settings.weights.weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen])
         if settings.line.two_ends_lines:
             weight = weight * sample_shares(keyframes[host].sample_segment, SEGMENT_SAMPLES)[chosen]
         weights.append(np.where(near, weight * settings.line.line_weight, 0.0))
@@ -258,15 +258,9 @@ def _line_rows(
 
 
 def _prior_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
-    if not settings.weights.use_confidence:
+    if settings.weights.confidence == "none":
         return np.ones_like(own)
     return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth_terms.depth_trust]
-
-
-def _weight(confidence: np.ndarray, settings: SlamSettings) -> np.ndarray:
-    if not settings.weights.use_confidence:
-        return np.ones_like(confidence)
-    return settings.weights.confidence_gain * confidence + settings.weights.confidence_floor
 
 
 def _initial_depths(

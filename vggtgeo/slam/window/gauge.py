@@ -21,8 +21,9 @@ from vggtgeo.bundle.terms.node import PairTerm
 from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.geometry import lie, rigid
 
-DEGREES_OF_FREEDOM = 6
-"""Equations that connect two components: as many as a relative pose has unknowns."""
+TINY = float(np.finfo(np.float64).tiny)
+STILL = 1e-6
+"""Largest share of a unit direction by which it changes a pose that counts as known."""
 NULL = 1e-10
 """Share of the largest eigenvalue of a balanced information matrix below which a direction is unconstrained. The
 rounding errors that marginalisation cuts off are 1e-12 of it."""
@@ -114,7 +115,7 @@ def _labels(problem: Problem, keyframes: int, known: _PriorKnowledge) -> np.ndar
         between = label[ends]
         total = coo_array((equations, tuple(between.T)), (keyframes, keyframes)).tocsr()
         total = total + total.T
-        tied = (total >= DEGREES_OF_FREEDOM).astype(int) + coo_array(_permuted(known.tied, label)).tocsr()
+        tied = (total >= lie.TANGENT).astype(int) + coo_array(_permuted(known.tied, label)).tocsr()
         _, joined = connected_components(tied, directed=False)
         merged = joined[label]
         if len(np.unique(merged)) == len(np.unique(label)):
@@ -166,7 +167,7 @@ def _rank(pair: PairTerm) -> np.ndarray:
     if root is None:
         return np.ones(len(np.asarray(pair.weight)))
     # Columns of unit length, for the same reason as in `_PriorKnowledge.of`.
-    scaled = np.asarray(root) / np.maximum(np.linalg.norm(root, axis=1, keepdims=True), 1e-30)
+    scaled = np.asarray(root) / np.maximum(np.linalg.norm(root, axis=1, keepdims=True), TINY)
     return np.asarray(np.linalg.matrix_rank(scaled, tol=NULL**0.5))
 
 
@@ -194,16 +195,16 @@ class _PriorKnowledge:
         safe = np.where(scale > 0, scale, 1.0)
         # Balanced by the diagonal: metres and radians would otherwise decide what counts as zero.
         values, vectors = np.linalg.eigh((information / np.outer(safe, safe))[np.ix_(about, about)])
-        null = np.zeros((len(scale), np.count_nonzero(values < NULL * values.max(initial=1e-300))))
+        null = np.zeros((len(scale), np.count_nonzero(values < NULL * values.max(initial=TINY))))
         null[about] = vectors[:, : null.shape[1]] / safe[about, None]
-        null /= np.maximum(np.linalg.norm(null, axis=0), 1e-300)
+        null /= np.maximum(np.linalg.norm(null, axis=0), TINY)
         moved = null.reshape(keyframes, lie.TANGENT, -1)
         world = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64)[:keyframes])
         # Left tangents in world coordinates, where a common rigid motion is the same for all.
         common = np.stack([rigid.adjoint(rigid.invert(pose)) @ own for pose, own in zip(world, moved, strict=True)])
         apart = np.linalg.norm(common[:, None] - common[None], axis=2).max(2, initial=0.0)
-        still: np.ndarray = np.linalg.norm(moved, axis=1).max(1, initial=0.0) < 1e-6
-        tied = (apart < 1e-6) & spoken[:, None] & spoken[None]
+        still: np.ndarray = np.linalg.norm(moved, axis=1).max(1, initial=0.0) < STILL
+        tied = (apart < STILL) & spoken[:, None] & spoken[None]
         return cls(tied & ~np.eye(keyframes, dtype=bool), still & spoken)
 
 

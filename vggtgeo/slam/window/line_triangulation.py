@@ -62,8 +62,8 @@ def _triangulated(
         first[edge.line_slots] += weight * value
         second[edge.line_slots] += weight * value**2
         views[edge.line_slots] += weight > 0
-    mean = first / np.maximum(total, 1e-18)
-    sigma = 1.0 / np.sqrt(np.maximum(total, 1e-18))
+    total = np.maximum(total, 1e-18)
+    mean, sigma = first / total, 1.0 / np.sqrt(total)
     # Weighted sum of squared residuals about the mean: chi-square with `views - 1` degrees of freedom.
     spread = second - total * mean**2
     agree = spread < chi_square.ppf(CHANCE, np.maximum(views - 1, 1))
@@ -86,7 +86,8 @@ def _intersected(
     safe = np.where(np.abs(lever) > 1e-9, lever, np.inf)[:, None]
     value = -(turned * normal[:, None]).sum(2) / safe
     z = turned[..., 2] + value * relative[2, 3]
-    weight = np.where((z > 0.05) & (value > 0), (lever[:, None] / np.where(z > 0.05, z, 1.0) / PIXELS) ** 2, 0.0)
+    ahead = z > 0.05
+    weight = np.where(ahead & (value > 0), (lever[:, None] / np.where(ahead, z, 1.0) / PIXELS) ** 2, 0.0)
     return value, weight
 
 

@@ -46,8 +46,7 @@ class Selection:
         """Select at most `point_slots` key points of each keyframe."""
         counts = [np.zeros(len(keyframe.features)) for keyframe in keyframes]
         for edge in edges:
-            # Number of observations first; confidence decides between equal numbers (fewer than ten views).
-            counts[local[edge.host]][edge.slots] += 1 + 0.1 * edge.confidence
+            counts[local[edge.host]][edge.slots] += _rank(edge.confidence)
         chosen = []
         for count in counts:
             order = np.argsort(-count, kind="stable")[: settings.window.point_slots]
@@ -62,7 +61,7 @@ class Selection:
         """Select at most `line_slots` samples of each keyframe, of whole segments."""
         counts = [np.zeros(len(keyframe.lines)) for keyframe in keyframes]
         for edge in edges:
-            counts[local[edge.host]][edge.line_slots] += 1 + 0.1 * edge.line_confidence
+            counts[local[edge.host]][edge.line_slots] += _rank(edge.line_confidence)
         chosen = []
         for keyframe, count in zip(keyframes, counts, strict=True):
             known = np.isfinite(keyframe.samples.inverse_depth)
@@ -78,3 +77,8 @@ class Selection:
             order = order[np.cumsum(length[order]) <= settings.window.line_slots]
             chosen.append(np.nonzero(np.isin(keyframe.sample_segment, order) & known & taken)[0])
         return cls.of(chosen, [len(keyframe.sample_segment) for keyframe in keyframes])
+
+
+def _rank(confidence: np.ndarray) -> np.ndarray:
+    """Return what an observation adds to the rank of its landmark: confidence decides between equal numbers of them."""
+    return 1 + 0.1 * confidence

@@ -33,6 +33,9 @@ from vggtgeo.slam.window.line_triangulation import with_segment_depths
 from vggtgeo.slam.window.window import Window, WindowPrior
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
+MAX_ITERATIONS = 12
+"""Iterations of an adjustment of the window: the window of the next keyframe goes on from its result."""
+
 
 def _solve(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:
     return solve(problem, initial, solver=solver, diagnosis=False)
@@ -60,14 +63,14 @@ def warm_up(settings: SlamSettings, metric: bool = True) -> tuple[Problem, State
     problem, initial = _smallest_window(settings, metric)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         marginalising = pool.submit(_compile_marginalisation, problem, initial)
-        _compile_solver(problem, initial, settings)
+        _compile_solver(problem, initial)
         marginalising.result()
     return problem, initial
 
 
 @in_double_precision
-def _compile_solver(problem: Problem, initial: State, settings: SlamSettings) -> None:
-    solve_jit(problem, initial, window_solver(settings)).energy.block_until_ready()
+def _compile_solver(problem: Problem, initial: State) -> None:
+    solve_jit(problem, initial, window_solver()).energy.block_until_ready()
 
 
 @in_double_precision
@@ -104,11 +107,9 @@ def smallest_problem(
     return problem, initial
 
 
-def window_solver(settings: SlamSettings) -> SchurLevenbergMarquardt:
+def window_solver() -> SchurLevenbergMarquardt:
     """Return the solver of all windows. A loose tolerance suffices: the next window continues from the result."""
-    return SchurLevenbergMarquardt(
-        max_iterations=settings.window.window_iterations, rtol=1e-5, record_iterations=settings.window.record_iterations
-    )
+    return SchurLevenbergMarquardt(max_iterations=MAX_ITERATIONS, rtol=1e-5, record_iterations=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +177,7 @@ def adjust(
     members = [known.keyframes[number] for number in window.members]
     adjustment, gauge = window_problem(known, window, intrinsics, camera, settings)
     notes = gauge_notes(gauge, adjustment.keyframes, "window")
-    solution = solve_jit(adjustment.problem, adjustment.initial, window_solver(settings))
+    solution = solve_jit(adjustment.problem, adjustment.initial, window_solver())
     # The keyframes before the solve are still valid: go on with them, and report.
     if not np.isfinite(float(solution.energy)):
         failure = f"window at keyframe {members[-1].number}: {solution.message}"

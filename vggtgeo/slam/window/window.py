@@ -42,7 +42,7 @@ class Window:
         held: Numbers of keyframes whose poses are fixed, besides roots of submaps.
         solved: The last problem of the window and its solution.
         energies: `1/2 sum rho` of that problem at the start and after each iteration.
-        iterations: Record of the solver's iterations, with the setting `window.record_iterations`.
+        iterations: Record of the solver's iterations.
 
     """
 
