@@ -21,7 +21,6 @@ from vggtgeo.io.locks import locked
         (("quick", "--data", "/no/such/place"), "`data` is `/no/such/place`, which is not a folder"),
         (("quick", "--timeout-minutes", "0"), "`timeout_minutes` is 0.0; it must be positive"),
         (("quick", "--memory-gb", "-1"), "`memory_gb` is -1.0; it must be positive"),
-        (("quick", "--first-seed", "9999999999"), "`seeds` go to 9999999999"),
         (("quick", "-o", "/proc/nowhere"), "`/proc/nowhere` cannot be written"),
     ],
 )

@@ -29,7 +29,6 @@ from vggtgeo.slam.verdict.thresholds import (
     MAX_PLACE_ERROR,
     MAX_PLACE_ERROR_SHARE,
     MAX_REASONS,
-    MAX_SECOND_MOTION_SHARE,
     MAX_TURN_ERROR,
     SIGMAS,
 )
@@ -83,7 +82,7 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
     stated: standard deviation of the places that the run itself states, as a share of their extent.
     """
     cause = None
-    if one.rival > MAX_SECOND_MOTION_SHARE * (one.rival + one.share):
+    if one.rival > 0:
         cause = "second motion"
     elif one.tracks.with_depth and one.best.noise.depth > MAX_DEPTH_NOISE:
         cause = "depth"

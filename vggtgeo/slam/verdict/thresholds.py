@@ -12,16 +12,15 @@ SIGMAS = 2.0
 """A difference from the run counts if it exceeds this many of its standard deviations (`consequence.confirmed`). At 2,
 four fifths of the squared mean of both halves is common to them."""
 MAX_PLACE_ERROR = 0.05
-"""Largest difference of places from the run that does not matter, metres, RMS over a window."""
+"""Largest error of places that does not matter, metres, RMS: the difference of a window from the run, and the error by
+frames that were lost or repeat a picture."""
 MAX_PLACE_ERROR_SHARE = 0.06
 """The same as a share of the path's extent, for a map that is not metric."""
 MAX_TURN_ERROR = np.deg2rad(0.45)
 """Largest difference of turns from frame to frame that does not matter, radians, RMS over a window."""
-MIN_SECOND_MOTION_SHARE = 0.15
+MIN_SECOND_MOTION_SHARE = 0.2
 """Minimum share of the observations that contradict the first motion, to look for a second one, and that the second one
-explains, to accept it."""
-MAX_SECOND_MOTION_SHARE = 0.2
-"""Maximum share of the explained corners that follow a second motion; above, it is uncertain which is the camera's."""
+explains, to accept it. Then it is uncertain which of both is the camera's."""
 MIN_INLIER_WEIGHT = 0.5
 """Minimum robust weight of an inlier; for a track, the mean of its observations."""
 MAX_UNPREDICTED = 0.5
@@ -35,8 +34,6 @@ MAX_UNKNOWN = 0.55
 determined."""
 ACCELERATION = 1.0
 """Standard deviation of a hand-held camera's acceleration, m/s^2."""
-MAX_BRIDGED = 0.04
-"""Maximum error by frames that were lost or repeat a picture, metres, RMS over all frames."""
 MAX_LOST = 0.10
 """Maximum share of lost frames in a good run."""
 MIN_TRACKED = 0.5
@@ -48,8 +45,6 @@ MAX_REASONS = 3
 """Maximum number of reasons that corners give."""
 MIN_VIEWS = 3
 """Minimum number of frames of a window that see a track; two of them determine its point."""
-MIN_FRAMES = 4
-"""Minimum number of frames of a window; in fewer, free poses explain nearly all."""
 MIN_COMMON = 10
 """Minimum number of corners that link a frame to the next: twenty numbers for six unknowns."""
 MIN_PIXEL_NOISE, MIN_RELATIVE_DEPTH_NOISE = 0.05, 0.003

@@ -18,8 +18,8 @@ from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.finding import Finding, Level, spans
 from vggtgeo.slam.verdict.thresholds import (
     ACCELERATION,
-    MAX_BRIDGED,
     MAX_LOST,
+    MAX_PLACE_ERROR,
     MAX_PLACE_ERROR_SHARE,
     MAX_UNMOVED,
     MIN_COMMON,
@@ -55,7 +55,7 @@ def _lost(claim: Claim) -> list[Finding]:
     named = [(int(claim.frames[first]), int(claim.frames[last])) for first, last in stretches]
     found = [Finding("lost", "degraded", f"frames {a} to {b} were lost", a, b, local=True) for a, b in named]
     count = len(claim) - np.count_nonzero(claim.tracked)
-    if count > MAX_LOST * len(claim) or bridging_error(claim) > MAX_BRIDGED:
+    if count > MAX_LOST * len(claim) or bridging_error(claim) > MAX_PLACE_ERROR:
         start, end = max(named, key=lambda ends: ends[1] - ends[0])
         times = "once" if len(named) == 1 else f"{len(named)} times, longest"
         text = f"{count} of {len(claim)} frames were lost and have no pose, {times} from frame {start} to {end}"
@@ -79,7 +79,7 @@ def check_frozen(claim: Claim, corners: Sequence[FrameEvidence]) -> list[Finding
     )
     squares = [(last - first + 1) * (claim.times[last] - claim.times[first - 1]) ** 2 / 3 for first, last in stretches]
     off = float(np.median(speeds[~repeated[1:]]) * np.sqrt(sum(squares) / len(claim)))
-    if off <= (MAX_BRIDGED if claim.metric else MAX_PLACE_ERROR_SHARE * extent(claim.poses[claim.tracked])):
+    if off <= (MAX_PLACE_ERROR if claim.metric else MAX_PLACE_ERROR_SHARE * extent(claim.poses[claim.tracked])):
         return []
     first, last = max(stretches, key=lambda ends: ends[1] - ends[0])
     start, end = int(claim.frames[first]), int(claim.frames[last])

@@ -10,7 +10,7 @@ import numpy as np
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.corner_adjustment import Tracks
 from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
-from vggtgeo.slam.verdict.thresholds import MIN_COMMON, MIN_FRAMES, MIN_VIEWS
+from vggtgeo.slam.verdict.thresholds import MIN_COMMON, MIN_VIEWS
 
 WINDOW = 24
 """Frames that are adjusted together."""
@@ -61,12 +61,10 @@ def windows(rows: np.ndarray) -> list[np.ndarray]:
 def tracks_of(
     claim: Claim, evidence: Sequence[FrameEvidence], rows: np.ndarray, size: tuple[int, int]
 ) -> Tracks | None:
-    """Return the tracks that at least `MIN_VIEWS` of these frames see; None without any, or for few frames.
+    """Return the tracks that at least `MIN_VIEWS` of these frames see; None without any.
 
     rows: int [f], increasing, of tracked frames.
     """
-    if len(rows) < MIN_FRAMES:
-        return None
     seen = [evidence[row] for row in rows]
     ids, pixels, depth = (np.concatenate([getattr(one, name) for one in seen]) for name in ("ids", "pixels", "depth"))
     frame = np.repeat(np.arange(len(rows)), [len(one.ids) for one in seen])
