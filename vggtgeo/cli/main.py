@@ -61,6 +61,12 @@ COMMANDS = (
         ("vggtgeo demo -o runs/demo --frames 60",),
     ),
     CommandEntry(
+        "warm-up",
+        "vggtgeo.cli.warm_up",
+        "Compile what runs with default settings need, into the cache; takes some minutes once.",
+        ("vggtgeo warm-up --size 1280x720",),
+    ),
+    CommandEntry(
         "evaluate",
         "vggtgeo.cli.evaluate",
         "Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT, and constant offsets between the two.",

@@ -1,27 +1,33 @@
-"""Compilation of the global adjustment during the run, so that it does not delay the end."""
+"""Compilation of the global adjustment during the run, so that it does not delay the end; or of all before any run."""
 
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.global_map.global_adjustment import shares_focal
 from vggtgeo.slam.global_map.global_shape import (
+    EDGE_SHARES,
     MAX_DENSE,
     MAX_NEIGHBOURS,
+    SMALL,
     GlobalShape,
     global_solver,
+    padded_count,
     shape_for,
 )
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
+from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.sparse_map.factors import factor_terms, surface_term
+from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, factor_terms, surface_term
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit
+from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit, warm_up
 
 CHECKED = (0.3, 0.6, 0.85)
 """Shares of the frames at which the number of keyframes is predicted: early for time, and again for accuracy."""
@@ -78,19 +84,38 @@ def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | 
 
 
 @in_double_precision
-def compile_global(shape: GlobalShape, settings: SlamSettings, shared_focal: bool = False) -> None:
+def compile_global(
+    shape: GlobalShape, settings: SlamSettings, shared_focal: bool = False, *, metric: bool = True
+) -> None:
     """Compile the adjustment of maps of a shape and their uncertainties on a problem with one observation.
 
-    Both programs are compiled at once, on two cores.
+    Both programs are compiled at once, on two cores. metric: with surfaces, of measured depth.
     """
-    nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
-    surfaces = surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing)
-    terms = (
-        *factor_terms((), {}, shape.room, metric=True),
-        *([surfaces] if settings.depth_terms.surface_points > 0 else []),
-    )
+    terms = factor_terms((), {}, shape.room, metric=metric)
+    if metric and settings.depth_terms.surface_points > 0:
+        nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
+        terms = (*terms, surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing))
     problem, initial = smallest_problem(shape.size, settings, terms, shared_focal)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)
         solve_jit(problem, initial, global_solver(problem)).energy.block_until_ready()
         sigma.result()
+
+
+def compile_before_runs(settings: SlamSettings, width: int, height: int) -> None:
+    """Compile for maps of at most 64 keyframes, with depth and without, of a known camera; images of this size."""
+    compile_alignment(Camera.guess(width, height))
+    for metric in (True, False):
+        warm_up(settings, metric)
+        for shape in usual_shapes(settings, metric):
+            compile_global(shape, settings, metric=metric)
+
+
+def usual_shapes(settings: SlamSettings, metric: bool) -> list[GlobalShape]:
+    """Return the shapes of maps of at most 64 keyframes in one submap, without recorded poses."""
+    edges = [(SMALL[0], 0), *((SMALL[1], int(share * MAX_NEIGHBOURS * SMALL[1])) for share in EDGE_SHARES)]
+    shapes = [shape_for(*own, settings) for own in edges]
+    if metric:
+        return shapes
+    # The scale's anchor is the first factor of a map without depth.
+    return [replace(shape, factors=((MeasuredBaseline, padded_count(1)), *shape.factors)) for shape in shapes]

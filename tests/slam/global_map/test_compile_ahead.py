@@ -1,0 +1,72 @@
+"""What `vggtgeo warm-up` compiles is what the end of a run calls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from invoked import invoke
+from recorded_run import SETTINGS, recorded_run
+
+import vggtgeo as vg
+from vggtgeo.slam.global_map import compile_ahead, global_adjustment
+from vggtgeo.slam.global_map.compile_ahead import compile_before_runs
+from vggtgeo.slam.sparse_map.factors import MeasuredBaseline
+
+
+class _Ready(np.ndarray):
+    """An energy that is computed."""
+
+    def block_until_ready(self) -> None:
+        """Return at once."""
+
+
+class _Called(Exception):
+    """Ends an adjustment where it would solve."""
+
+
+def _program(*args: Any) -> tuple[Any, ...]:
+    """Structure and shapes: those of which a program is compiled."""
+    leaves, structure = jax.tree.flatten(args)
+    return structure, tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_programs_of_the_end_are_compiled_before(monkeypatch: pytest.MonkeyPatch, metric: bool) -> None:
+    # Proves that the last adjustment of a map with depth and of one without asks for a program that was compiled.
+    # Oracle: structure and shapes of what the adjustment of a recorded run solves.
+    compiled: list[tuple[Any, ...]] = []
+
+    def solve(*args: Any) -> Any:
+        compiled.append(_program(*args))
+        return SimpleNamespace(energy=np.zeros(1).view(_Ready))
+
+    for name in ("warm_up", "compile_alignment", "keyframe_sigma"):
+        monkeypatch.setattr(compile_ahead, name, lambda *_: None)
+    monkeypatch.setattr(compile_ahead, "solve_jit", solve)
+    compile_before_runs(SETTINGS, 320, 240)
+    slam = recorded_run().states[-1]
+    factors = (() if metric else (MeasuredBaseline(0, 1, 1.0, 1e-3),)) + slam.map.factors
+    slam = replace(slam, map=replace(slam.map, metric=metric, factors=factors))
+
+    def called(*args: Any) -> Any:
+        assert _program(*args) in compiled
+        raise _Called
+
+    monkeypatch.setattr(global_adjustment, "solve_jit", called)
+    with pytest.raises(_Called):
+        global_adjustment.adjust_all(slam, SETTINGS)
+
+
+def test_the_command_takes_the_size_of_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that `vggtgeo warm-up` compiles for the default settings and the size that was asked for.
+    asked: list[Any] = []
+    monkeypatch.setattr(compile_ahead, "compile_before_runs", lambda *given: asked.append(given))
+    assert invoke("warm-up", "--size", "320x240").exit_code == 0
+    assert asked[0][1:] == (320, 240)
+    assert asked[0][0].window.size == vg.SlamSettings().window.size
+    assert invoke("warm-up", "--size", "large").exit_code == 2
