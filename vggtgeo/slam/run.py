@@ -138,7 +138,12 @@ def run_frames(
 
 @in_double_precision
 def finish(
-    slam: Slam, roles: Roles | None = None, settings: SlamSettings | None = None, clock: Clock | None = None
+    slam: Slam,
+    roles: Roles | None = None,
+    settings: SlamSettings | None = None,
+    clock: Clock | None = None,
+    *,
+    uncertainty: bool = True,
 ) -> Slam:
     """Join what was seen twice, and adjust the whole map once more.
 
@@ -147,6 +152,7 @@ def finish(
         roles: those of the run, by default the default ones.
         settings: those of the run, by default the default ones.
         clock: adds up seconds by stage.
+        uncertainty: whether to compute the uncertainty of the poses.
 
     Example:
         >>> import vggtgeo as vg
@@ -167,7 +173,7 @@ def finish(
         slam = with_recorded_ties(join_at_end(slam, roles), roles)
         slam = close_loops(slam, roles, settings)
     with clock.measure("global adjustment"):
-        return adjust_all(slam, settings)
+        return adjust_all(slam, settings, uncertainty=uncertainty)
 
 
 def frame_trajectory(slam: Slam, submap: int = 0) -> Trajectory:

@@ -60,7 +60,7 @@ def self_calibrate(
         progress(passes, None)
         # Later rounds do not change the camera.
         once = replace(settings, refinement=replace(settings.refinement, global_rounds=1))
-        found = finish(last, roles, once)
+        found = finish(last, roles, once, uncertainty=False)
         if not _is_plausible(found, camera):
             return None
         before = begin(camera, roles)

@@ -148,7 +148,8 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
         guess, camera=replace(guess.camera, intrinsics=done.intrinsics, given=done.intrinsics, self_calibrated=True)
     )
     assert not shares_focal(again)
-    adjust_all(again, SETTINGS)
+    assert adjust_all(again, SETTINGS, uncertainty=False).map.pose_sigma is None
+    assert done.map.pose_sigma is not None
     assert len(tried) == 1
 
 

@@ -37,11 +37,11 @@ DISTORTION_SIGMAS, MAX_WARP = 5.0, 3.0
 """Standard deviations, and pixels in the corners of the image, above which a distortion is reported."""
 
 
-def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
+def adjust_all(slam: Slam, settings: SlamSettings, *, uncertainty: bool = True) -> Slam:
     """Bundle-adjust every keyframe, with surfaces if there is metric depth, in a few rounds.
 
     The first round also estimates the readout time of a rolling shutter, and corrections of the camera; later rounds
-    keep both.
+    keep both. uncertainty: whether to compute that of the poses.
     """
     if len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA or not slam.map.pairs:
         return slam
@@ -58,6 +58,8 @@ def adjust_all(slam: Slam, settings: SlamSettings) -> Slam:
             slam, adjustment, state = _try_rolling_shutter(slam, adjustment, solution.state, settings)
             slam, shared = shared.try_camera(slam, adjustment, state, settings)
             solved = adjustment.problem, state
+    if not uncertainty:
+        return slam
     sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
     slam = replace(slam, map=replace(slam.map, pose_sigma=sigma))
     return replace(slam, notes=(*slam.notes, *_uncertainty_notes(slam)))
