@@ -70,17 +70,23 @@ def test_a_keyframe_that_begins_a_submap_keeps_its_pose_and_begins_its_own_share
     assert np.allclose(poses[:4], _straight(1.0)[:4], atol=1e-12)
 
 
-@pytest.mark.parametrize(("sigma", "metric", "length"), [(0.5, True, 1.5), (0.05, True, 1.0), (0.05, False, 1.5)])
+@pytest.mark.parametrize(
+    ("sigma", "metric", "by_rays", "length"),
+    [(0.5, True, False, 1.5), (0.05, True, False, 1.0), (0.05, False, False, 1.5), (0.5, False, True, 1.0)],
+)
 def test_a_keyframe_that_was_tracked_wrongly_leaves_the_frames_before_it_where_they_are(
-    sigma: float, metric: bool, length: float
+    sigma: float, metric: bool, by_rays: bool, length: float
 ) -> None:
     """2.3 m between a keyframe as tracked and as adjusted are drift where its tracking left them open, and an error of
-    that frame alone where it did not; without depth they are another unit. Oracle: the straight paths.
+    that frame alone where it did not; without depth they are another unit, or a length that was a guess. Oracle: the
+    straight paths.
     """
     slam = replace(_walked(begins=(0,)), map=replace(_walked(begins=(0,)).map, metric=metric))
     known = np.diag(np.repeat([sigma, 0.1], 3) ** -2.0)
     arrivals = [record for record in slam.frames if record.arrival is not None]
-    ties = tuple(MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known) for r in arrivals if r.arrival)
+    ties = tuple(
+        MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known, by_rays) for r in arrivals if r.arrival
+    )
     _, poses = carried_poses(replace(slam, map=replace(slam.map, factors=ties)))
     for first in (0, 4):
         step = _straight(length) @ rigid.invert(_straight(length)[0])

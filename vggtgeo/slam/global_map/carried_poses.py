@@ -22,7 +22,7 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
 
     A frame is stored relative to its reference keyframe. The correction of the next keyframe relative to that reference
     is distributed over the frames between them in proportion to time, so that the path has no steps, unless the tracked
-    pose of that keyframe was an outlier (`GROSS`). Motions from a second keyframe are averaged in
+    pose of that keyframe was an outlier (`GROSS`) or by rays. Motions from a second keyframe are averaged in
     (`frame_refinement.py`). The frame of a keyframe has the keyframe's pose, whether it was tracked (`arrival`) or
     started a submap.
     """
@@ -39,7 +39,9 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             change = poses[row] @ rigid.invert(arrived)
             tie = ties.get((reference, record.reference))
             gross = tie is not None and _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
-            between = [] if gross else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
+            # Without depth the length of its motion was a guess, which frames tracked by points do not share.
+            apart = gross or (tie is not None and tie.by_rays)
+            between = [] if apart else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
             span = max(times[row] - times[last], 1e-9)
             for k in between:
                 # Along the screw motion of the change, in proportion to time.
