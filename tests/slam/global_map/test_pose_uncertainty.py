@@ -97,7 +97,7 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     numbers.
     """
     monkeypatch.setattr(pose_uncertainty, "DEPTH_SCALE", 0.0)  # the renderer's depth has no factor of its own,
-    monkeypatch.setattr(pose_uncertainty, "CALIBRATION", 0.0)  # its camera is the one that is given,
+    monkeypatch.setattr(pose_uncertainty, "FOCAL_SIGMA", 0.0)  # its camera is the one that is given,
     monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.0)  # with its middle in that of the images,
     monkeypatch.setattr(pose_uncertainty, "MOMENT", 0.0)  # and its images are of one moment
     result = vg.reconstruct(vg.simulate("room", 40, size=(320, 240), rate=6.0))
@@ -125,12 +125,12 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     assert np.all(moving.translation > stated.translation)
     monkeypatch.setattr(pose_uncertainty, "MOMENT", 0.0)
     # What a focal length leaves open grows with the angle to the first pose.
-    monkeypatch.setattr(pose_uncertainty, "CALIBRATION", 0.01)
+    monkeypatch.setattr(pose_uncertainty, "FOCAL_SIGMA", 0.01)
     calibrated = result.uncertainty
     assert calibrated is not None
     angles = Rotation.from_matrix(true[:, :3, :3]).magnitude()
     np.testing.assert_allclose(np.sqrt(calibrated.rotation**2 - stated.rotation**2), 0.01 * angles, atol=1e-4)
-    monkeypatch.setattr(pose_uncertainty, "CALIBRATION", 0.0)
+    monkeypatch.setattr(pose_uncertainty, "FOCAL_SIGMA", 0.0)
     # A principal point that nobody has measured turns all cameras alike, and with the first one the whole path.
     monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.01)
     nominal, focal = result.uncertainty, result.record.slam.intrinsics[0]
