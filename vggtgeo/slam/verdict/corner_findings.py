@@ -94,7 +94,8 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
         values = np.array([found.places, found.turn])
         sigmas = np.array([np.hypot(found.places_sigma, stated * around), found.turn_sigma])
         size = float(np.max(values / limits, where=values > SIGMAS * sigmas, initial=0.0))
-        size *= preferred(one.best)
+        if size >= 1.0 and not preferred(one.best):
+            size = 0.0
     if cause is None and size < 1.0 and not one.added:
         return None
     named = one.added.alternative.name if one.added else "poses"
