@@ -39,7 +39,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for path in options.clips:
         sequence = open_sequence(path)
-        record = vg.reconstruct(without_depth(sequence), end=options.frames, dense="none").record
+        record = vg.reconstruct(without_depth(sequence), options=vg.RunOptions(end=options.frames, dense="none")).record
         assert record is not None
         slam = record.slam
         cells = [f"{value:.2f}" for poses in (carried_poses, frame_poses) for value in errors(slam, sequence, poses)]

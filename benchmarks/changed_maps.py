@@ -45,7 +45,7 @@ def main() -> int:
     rng, ends = random.Random(given.seed), Counter[str]()
     with tempfile.TemporaryDirectory() as folder:
         whole, changed = Path(folder) / "whole.map", Path(folder) / "changed.map"
-        vg.reconstruct(walk, settings=SMALL, end=MAPPED, dense="none").save_map(whole)
+        vg.reconstruct(walk, settings=SMALL, options=vg.RunOptions(end=MAPPED, dense="none")).save_map(whole)
         header, data = _read(whole)
         for _ in range(given.count):
             what = _write_changed(changed, header, data, rng)
@@ -62,7 +62,9 @@ def _tried(file: Path, walk: vg.Sequence) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            result = vg.reconstruct(walk, settings=SMALL, start=MAPPED, dense="none", known_map=vg.load_map(file))
+            result = vg.reconstruct(
+                walk, settings=SMALL, known_map=vg.load_map(file), options=vg.RunOptions(start=MAPPED, dense="none")
+            )
     except InputError:
         return "refused"
     except Exception as error:  # noqa: BLE001 - whatever it is, it is a finding

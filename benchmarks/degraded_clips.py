@@ -42,7 +42,7 @@ def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> t
     """The result, and its ATE: metres, after SE(3) with depth, after Sim(3) without; NaN where nothing was tracked."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        result = vg.reconstruct(sequence, settings=settings, dense="none")
+        result = vg.reconstruct(sequence, settings=settings, options=vg.RunOptions(dense="none"))
     truth = result.summary.get("truth")
     alignment = "ate_se3_m" if sequence.has_depth else "ate_sim3_m"
     return result, truth[alignment]["rmse"] if truth else float("nan")

@@ -39,7 +39,9 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, nargs="+", default=[64, 192, 384])
     given = parser.parse_args()
     clip = vg.read(given.clip)
-    result = vg.reconstruct(SequenceView(clip, clip.camera, clip.has_depth and not given.rgb_only), dense="none")
+    result = vg.reconstruct(
+        SequenceView(clip, clip.camera, clip.has_depth and not given.rgb_only), options=vg.RunOptions(dense="none")
+    )
     assert result.record is not None
     print(
         "| keyframes | memory before, MB | at most, MB | depth and cloud, s | mesh, s | points | faces |\n"

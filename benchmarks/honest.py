@@ -79,7 +79,7 @@ def main() -> None:
         print(WHOLE)
         for path in options.clips:
             source = without_depth(_source(path)) if options.rgb_only else _source(path)
-            result = vg.reconstruct(source, start=options.start, end=options.end, dense="none")
+            result = vg.reconstruct(source, options=vg.RunOptions(start=options.start, end=options.end, dense="none"))
             assert result.record is not None
             truth = vg.Trajectory.load_tum(options.truth) if options.truth else result.record.truth
             assert truth is not None, f"{path} has no truth"
@@ -159,7 +159,9 @@ def _drawn_row(name: str, source: Sequence, runs: int) -> str:
     assert truth is not None, f"{name} has no truth"
     recording, squares, within = Recording(list(source.frames()), source.camera, truth), [], []
     for seed in range(runs):
-        result = vg.reconstruct(DegradedWalk(name, _with_unseen_errors(recording, seed)), dense="none")
+        result = vg.reconstruct(
+            DegradedWalk(name, _with_unseen_errors(recording, seed)), options=vg.RunOptions(dense="none")
+        )
         assert result.record is not None
         stated, true = result.uncertainty, result.record.truth
         assert stated is not None

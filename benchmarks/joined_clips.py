@@ -31,7 +31,7 @@ def main() -> None:
     recording = joined(options.clips)
     name = " + ".join(path.name for path in options.clips)
     whole = SequenceView(DegradedWalk(name, recording), recording.camera, True)
-    result = vg.reconstruct(without_depth(whole) if options.rgb_only else whole, dense="none")
+    result = vg.reconstruct(without_depth(whole) if options.rgb_only else whole, options=vg.RunOptions(dense="none"))
     summary = result.summary
     errors = (f"{100 * summary['truth'][key]['rmse']:.2f}" for key in ("ate_se3_m", "ate_sim3_m"))
     tracked = f"{summary['frames_tracked']}/{summary['frames']}"

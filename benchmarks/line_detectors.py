@@ -29,6 +29,7 @@ from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.run_options import RunOptions
 from vggtgeo.slam.settings.groups import LineSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 
@@ -58,7 +59,7 @@ def line(name: str, detector: LineDetector | None, data: Path, folder: Path, end
     """One run, as a line of the table."""
     roles = Roles() if detector is None else replace(Roles(), lines=detector)
     settings = SlamSettings(line=LineSettings(use_lines=detector is not None))
-    result = reconstruct(data, roles, settings, end=end)
+    result = reconstruct(data, roles, settings, options=RunOptions(end=end))
     result.save(folder, settings={"lines": name})
     slam, truth = result.record.slam, result.summary["truth"]
     reference = data / "reference-colmap.txt"

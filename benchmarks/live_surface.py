@@ -38,7 +38,7 @@ def main() -> None:
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     surfaces = [Surface(0.5), Surface(0.0)]
-    slam = vg.reconstruct(given.path, end=given.end, callbacks=surfaces).record.slam
+    slam = vg.reconstruct(given.path, callbacks=surfaces, options=vg.RunOptions(end=given.end)).record.slam
     for surface in surfaces:
         mean, most = np.mean(surface.costs, axis=0), np.max(surface.costs, axis=0)
         print(

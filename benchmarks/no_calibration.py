@@ -46,7 +46,9 @@ def main() -> None:
             clip = ReducedSequence(clip, clip.camera.resized(*size))
         camera = Camera.guess(clip.camera.width, clip.camera.height)
         has_depth = options.depth and clip.has_depth
-        result = vg.reconstruct(SequenceView(clip, camera, has_depth), end=options.end, dense="none")
+        result = vg.reconstruct(
+            SequenceView(clip, camera, has_depth), options=vg.RunOptions(end=options.end, dense="none")
+        )
         summary = result.summary
         lens = summary.get("lens")
         coefficients = f"{lens['k1']:.4f}, {lens['k2']:.4f}" if lens else "none"

@@ -43,7 +43,8 @@ def main() -> None:
         sequence = open_sequence(path)
         there = list(islice(sequence.frames(options.start, None, options.stride), options.frames))
         first, second = (
-            vg.reconstruct(frames, camera=sequence.camera, dense="none") for frames in (there, backwards(there))
+            vg.reconstruct(frames, camera=sequence.camera, options=vg.RunOptions(dense="none"))
+            for frames in (there, backwards(there))
         )
         print(f"| {path.name} | {len(there)} | {compared(first, second, there[-1].timestamp)} |", flush=True)
 

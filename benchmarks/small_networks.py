@@ -71,7 +71,7 @@ def run(clip: Path, mixed: Mapping[str, str], models: Path, frames: int | None, 
     perceived = perception("classical", default_roles(sequence.has_depth), models, mixed=mixed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        result = vg.reconstruct(sequence, perceived, end=frames, seed=seed, dense="none")
+        result = vg.reconstruct(sequence, perceived, options=vg.RunOptions(end=frames, seed=seed, dense="none"))
     summary, truth = result.summary, sequence.ground_truth()
     report = None if truth is None or len(result.trajectory) < 3 else evaluate_trajectory(result.trajectory, truth)
     errors = np.array([np.nan]) if report is None else (report.se3 if sequence.has_depth else report.sim3).errors

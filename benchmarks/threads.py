@@ -72,7 +72,7 @@ def child(threads: int, frames: int, rgb_only: bool, file: Path) -> None:
 
     sequence = vg.simulate("room", frames, 0, (320, 240), rate=10.0)
     began = time.perf_counter()
-    result = vg.reconstruct(without_depth(sequence) if rgb_only else sequence, dense="none")
+    result = vg.reconstruct(without_depth(sequence) if rgb_only else sequence, options=vg.RunOptions(dense="none"))
     trajectory = result.trajectory
     np.savez(
         file,

@@ -79,7 +79,7 @@ def _parts(frames: int) -> Iterator[tuple[str, Callable[[], Numbers]]]:
 
 
 def _run(sequence: vg.datasets.Sequence, frames: int) -> Numbers:
-    result = vg.reconstruct(sequence, end=frames, dense="none")
+    result = vg.reconstruct(sequence, options=vg.RunOptions(end=frames, dense="none"))
     return {
         "frames": result.trajectory.timestamps,
         "poses": result.trajectory.poses,
@@ -94,8 +94,14 @@ def _resumed() -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         kept = Path(folder) / "kept.npz"
         with contextlib.suppress(_Stop):
-            vg.reconstruct(sequence, dense="none", checkpoints=vg.Checkpoints(kept, every=0), callbacks=[_StopAt(12)])
-        whole = vg.reconstruct(sequence, dense="none", checkpoints=vg.Checkpoints(kept, resume=True))
+            vg.reconstruct(
+                sequence,
+                callbacks=[_StopAt(12)],
+                options=vg.RunOptions(dense="none", checkpoints=vg.settings.Checkpoints(kept, every=0)),
+            )
+        whole = vg.reconstruct(
+            sequence, options=vg.RunOptions(dense="none", checkpoints=vg.settings.Checkpoints(kept, resume=True))
+        )
     return {"poses": whole.trajectory.poses, "points": whole.cloud.points}
 
 
@@ -115,7 +121,7 @@ class _StopAt(vg.Callback):
 def _exported() -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        vg.reconstruct(vg.simulate("room", 12, size=(160, 120)), dense="none").save(run)
+        vg.reconstruct(vg.simulate("room", 12, size=(160, 120)), options=vg.RunOptions(dense="none")).save(run)
         export(run, "colmap", Path(folder) / "colmap")
         files = sorted((Path(folder) / "colmap").rglob("*.bin"))
         return {file.name: np.frombuffer(file.read_bytes(), np.uint8) for file in files}

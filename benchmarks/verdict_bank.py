@@ -208,7 +208,7 @@ def run(case: Case, render: Callable[[Walk], Recording], out: Path) -> str:
     with warnings.catch_warnings(), mock.patch.object(reconstruction, "judge_or_report", noting):
         warnings.simplefilter("ignore")
         try:
-            result = vg.reconstruct(sequence, dense="none")
+            result = vg.reconstruct(sequence, options=vg.RunOptions(dense="none"))
             slam, evidence, of_input = judged_by[0]
             for name, value in (("slam", slam), ("evidence", list(evidence)), ("input", of_input)):
                 (part / f"{name}.pkl").write_bytes(pickle.dumps(value))

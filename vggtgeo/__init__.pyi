@@ -35,11 +35,11 @@ from .figures.plot import plot as plot
 from .geometry.camera import Camera as Camera
 from .geometry.trajectory import Trajectory as Trajectory
 from .io.errors import InputError as InputError
-from .results.checkpoints import Checkpoints as Checkpoints
 from .results.reading import evaluate as evaluate
 from .results.reading import read as read
 from .results.reconstruction import reconstruct as reconstruct
 from .results.result import Result as Result
+from .results.run_options import RunOptions as RunOptions
 from .results.show import show as show
 from .simulation import simulate as simulate
 from .simulation import simulate_window as simulate_window

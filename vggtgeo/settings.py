@@ -1,5 +1,6 @@
-"""The groups of `vggtgeo.SlamSettings`, one a stage of the pipeline."""
+"""The groups of `vggtgeo.SlamSettings`, one a stage of the pipeline; and the checkpoints of a run."""
 
+from vggtgeo.results.checkpoints import Checkpoints as Checkpoints
 from vggtgeo.slam.settings.groups import CameraSettings as CameraSettings
 from vggtgeo.slam.settings.groups import DepthSettings as DepthSettings
 from vggtgeo.slam.settings.groups import GlobalMapSettings as GlobalMapSettings

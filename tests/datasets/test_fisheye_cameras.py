@@ -107,6 +107,6 @@ def test_a_video_of_a_calibrated_fisheye() -> None:
     source = vg.simulate("office", 40, size=(320, 240), rate=10.0)
     lens = Camera(source.camera.intrinsics, 320, 240, COEFFICIENTS, fisheye=True)
     frames = Bent(source, lens)
-    result = vg.reconstruct(SequenceView(frames, lens, has_depth=False), dense="none")
+    result = vg.reconstruct(SequenceView(frames, lens, has_depth=False), options=vg.RunOptions(dense="none"))
     assert result.summary["truth"]["ate_sim3_m"]["rmse"] < 0.02
     assert result.verdict.level == "good", result.verdict

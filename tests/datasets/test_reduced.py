@@ -70,7 +70,7 @@ def test_a_run_of_large_images_says_so_and_is_right() -> None:
     truth = sequence.ground_truth()
     assert truth is not None
     for frames, camera in ((sequence, None), (list(sequence.frames()), sequence.camera)):
-        result = vg.reconstruct(frames, settings=settings, camera=camera, dense="none")
+        result = vg.reconstruct(frames, settings=settings, camera=camera, options=vg.RunOptions(dense="none"))
         assert result.summary["frames_tracked"] == 6
         told = result.summary["images_reduced"]
         assert (told["from"], told["to"]) == ("320 x 240", "160 x 120")

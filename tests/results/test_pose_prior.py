@@ -10,6 +10,7 @@ import pytest
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.results.pose_prior import with_pose_prior
 from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.run_options import RunOptions
 from vggtgeo.results.source import Source, open_source
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.settings.groups import WindowSettings
@@ -49,10 +50,10 @@ def test_poses_of_a_file_leave_the_truth(source: Source, tmp_path: Path) -> None
 def test_a_run_says_what_became_of_the_prior() -> None:
     """Two frames compare no motion: the prior is not used, and the summary and a note say so; there is no truth."""
     sequence = simulate("room", 2, size=(160, 120))
-    summary = reconstruct(sequence, settings=SETTINGS, pose_prior="recorded", dense="none").summary
+    summary = reconstruct(sequence, settings=SETTINGS, pose_prior="recorded", options=RunOptions(dense="none")).summary
     assert summary["pose_prior"] == {"used": False, "unit": None, "compared": 0, "evidence": 0.0}
     assert "truth" not in summary
     other = Trajectory(np.array([100.0, 101.0]), np.tile(np.eye(4), (2, 1, 1)))
-    summary = reconstruct(sequence, settings=SETTINGS, pose_prior=other, dense="none").summary
+    summary = reconstruct(sequence, settings=SETTINGS, pose_prior=other, options=RunOptions(dense="none")).summary
     assert not summary["pose_prior"]["used"]
     assert "truth" in summary or summary["frames"] < 3

@@ -123,7 +123,7 @@ def test_the_notebook_and_the_command_line_write_the_same_folder(folder: Path, t
 @pytest.mark.long
 def test_a_saved_result_is_read_again(folder: Path, tmp_path: Path) -> None:
     """Load and save bring back poses, map, verdict and summary; oracle: the result in memory, and what it wrote."""
-    result = vg.reconstruct(folder, end=2)
+    result = vg.reconstruct(folder, options=vg.RunOptions(end=2))
     summary = result.save(tmp_path / "one")
     assert summary["seconds_by_stage"]["all"] > result.summary["seconds_by_stage"]["all"]
     assert {**summary, "seconds_by_stage": {}} == {
@@ -150,7 +150,9 @@ def test_any_iterable_of_frames_will_do() -> None:
     sequence = vg.simulate("room", 3, 0, (160, 120))
     pairs = [(frame.image, frame.depth) for frame in sequence.frames()]
     log = _Log()
-    found = vg.reconstruct(iter(pairs), settings=SETTINGS, camera=sequence.camera, callbacks=[log], title="a list")
+    found = vg.reconstruct(
+        iter(pairs), settings=SETTINGS, camera=sequence.camera, callbacks=[log], options=vg.RunOptions(title="a list")
+    )
     expected = vg.reconstruct(sequence, settings=SETTINGS)
     np.testing.assert_array_equal(found.trajectory.poses, expected.trajectory.poses)
     assert log.calls == ["begin frames None", "frame 0", "frame 1", "frame 2", "adjust", "finish"]
@@ -160,6 +162,25 @@ def test_any_iterable_of_frames_will_do() -> None:
     assert expected.summary.keys() <= RESERVED_KEYS  # what no fact of a caller may be called
     with raises("`frames`"):
         vg.reconstruct([])
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("start", {"start": -1}),
+        ("end", {"start": 3, "end": 3}),
+        ("stride", {"stride": 0}),
+        ("seed", {"seed": -1}),
+        ("dense", {"dense": "stereo"}),
+        ("facts", {"facts": {"frames": 3}}),
+        ("facts", {"facts": {"error": np.nan}}),
+        ("warned", {"warned": "one text"}),
+    ],
+)
+def test_invalid_options_are_refused_when_they_are_made(name: str, given: dict[str, object]) -> None:
+    """Each invalid option is an `InputError` that names it, before a frame is read; oracle: the name."""
+    with raises(f"`{name}`"):
+        vg.RunOptions(**given)
 
 
 def test_a_clock_that_stands_costs_the_frame_and_not_the_run() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -24,6 +25,7 @@ from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, Notice, RunSoFa
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import open_run_folder
+from vggtgeo.results.run_options import RunOptions
 from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.callback import Callback
@@ -49,7 +51,12 @@ def sequence(seed: int = 0) -> SyntheticSequence:
     return simulate("room", FRAMES, seed, (320, 240), rate=10.0)
 
 
-def run(monkeypatch: pytest.MonkeyPatch, checkpoints: Checkpoints | None = None, **options: Any) -> Run:
+def run(
+    monkeypatch: pytest.MonkeyPatch,
+    checkpoints: Checkpoints | None = None,
+    options: Mapping[str, Any] | None = None,
+    **given: Any,
+) -> Run:
     seen: list[FrameEvidence] = []
 
     def judged(slam: Slam, evidence: Any, *rest: Any) -> Any:
@@ -57,14 +64,15 @@ def run(monkeypatch: pytest.MonkeyPatch, checkpoints: Checkpoints | None = None,
         return judge(slam, evidence, *rest)
 
     monkeypatch.setattr(reconstruction, "judge_or_report", judged)
-    given = {"frames": sequence(), "roles": ROLES, "settings": SETTINGS, "dense": "none", **options}
-    return Run(reconstruct(**given, checkpoints=checkpoints), tuple(seen))
+    given = {"frames": sequence(), "roles": ROLES, "settings": SETTINGS, **given}
+    selected = RunOptions(dense="none", checkpoints=checkpoints, **(options or {}))
+    return Run(reconstruct(**given, options=selected), tuple(seen))
 
 
-def killed(monkeypatch: pytest.MonkeyPatch, path: Path, frame: int, **options: Any) -> Checkpoints:
+def killed(monkeypatch: pytest.MonkeyPatch, path: Path, frame: int) -> Checkpoints:
     """What a run that was killed at a frame kept; how to go on."""
     with pytest.raises(Killed):
-        run(monkeypatch, Checkpoints(path, every=0), callbacks=[KilledAfter(frame)], **options)
+        run(monkeypatch, Checkpoints(path, every=0), callbacks=[KilledAfter(frame)])
     return Checkpoints(path, resume=True, every=0)
 
 
@@ -97,16 +105,16 @@ def test_only_the_same_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     before = killed(monkeypatch, tmp_path / "kept", 2)
     content = before.path.read_bytes()
     window = replace(SETTINGS, window=replace(SETTINGS.window, point_slots=97))
-    for options, sentence in (
+    for given, sentence in (
         ({"settings": window}, "`window.point_slots` is 97.* 96"),
         ({"roles": replace(ROLES, flow=None)}, "`flow` .*PatchFlow"),
-        ({"seed": 1}, "`seed` is 1.* 0"),
-        ({"end": 4}, r"`start, end, stride` is \(0, 4, 1\).*\(0, None, 1\)"),
+        ({"options": {"seed": 1}}, "`seed` is 1.* 0"),
+        ({"options": {"end": 4}}, r"`start, end, stride` is \(0, 4, 1\).*\(0, None, 1\)"),
         ({"frames": sequence(1)}, "`name` is 'synthetic room, seed 1'.*'synthetic room, seed 0'"),
         ({"frames": iter(sequence().frames())}, "`frames` .*cannot be resumed"),
     ):
         with pytest.raises(InputError, match=sentence):
-            run(monkeypatch, before, **options)
+            run(monkeypatch, before, **given)
     monkeypatch.setattr("vggtgeo.results.checkpoints.digest_of", lambda frame: "of another image")
     with raises("frame 1"):
         run(monkeypatch, before)

@@ -83,7 +83,7 @@ def test_a_map_of_another_matcher_is_refused_at_once(known: Slam, points: Any) -
     with raises("known_map"):
         next(vg.run(sequence(), roles, SETTINGS, start=HALF, known_map=known))
     with pytest.raises(vg.InputError, match="use it with the points"):
-        vg.reconstruct(sequence(), roles, SETTINGS, start=HALF, known_map=known)
+        vg.reconstruct(sequence(), roles, SETTINGS, known_map=known, options=vg.RunOptions(start=HALF))
 
 
 def test_a_map_comes_back_to_the_bit(known: Slam) -> None:
@@ -143,14 +143,15 @@ def test_a_whole_run_in_a_map(known: Slam, tmp_path: Path) -> None:
     """`vg.reconstruct` in a map writes its folder, its map holds both halves, and a third run finds itself in both;
     oracle: the truth, the files, the numbers.
     """
-    given = {"roles": ROLES, "settings": SETTINGS, "dense": "none"}
-    result = vg.reconstruct(sequence(), **given, start=HALF, known_map=known)
+    given, later = {"roles": ROLES, "settings": SETTINGS}, vg.RunOptions(start=HALF, dense="none")
+    result = vg.reconstruct(sequence(), **given, known_map=known, options=later)
     result.save(tmp_path / "out")
     result.save_map(tmp_path / "both.map")
     assert len(result.trajectory) == FRAMES - HALF
     assert Result.load(tmp_path / "out").summary["frames"] == FRAMES - HALF
     assert len(list((tmp_path / "out/images").iterdir())) == len(result.keyframes)
-    again = vg.reconstruct(sequence(), **given, known_map=vg.load_map(tmp_path / "both.map"))
+    both = vg.load_map(tmp_path / "both.map")
+    again = vg.reconstruct(sequence(), **given, known_map=both, options=vg.RunOptions(dense="none"))
     assert len(again.keyframes) == len(result.keyframes)
     assert worst_error(again.record.slam) < 0.02
 

@@ -28,6 +28,7 @@ from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.window_steps import camera_prior
 
 GUESS = Camera.guess(320, 240)
+FEW = vg.RunOptions(end=3, dense="none")
 LENS = Camera((280.0, 280.0, 158.0, 121.0), 320, 240, (-0.1, 0.01, 0.0, 0.0), known=False)
 
 
@@ -182,12 +183,12 @@ def settings(frames: int = 150) -> vg.SlamSettings:
     return replace(SETTINGS, camera=replace(base.camera, calibration_frames=frames), refinement=base.refinement)
 
 
-def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **options: Any) -> vg.Result:
+def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **given: Any) -> vg.Result:
     """A run without a last adjustment, whose self-calibration is `passes`."""
     monkeypatch.setattr(reconstruction, "self_calibrate", passes)
     monkeypatch.setattr(reconstruction, "finish", lambda slam, *_: slam)
     monkeypatch.setattr(reconstruction, "CompileAhead", lambda _: vg.Callback())
-    given = {"roles": ROLES, "settings": settings(), "dense": "none", **options}
+    given = {"roles": ROLES, "settings": settings(), "options": vg.RunOptions(dense="none"), **given}
     return vg.reconstruct(SequenceView(walk(), GUESS, has_depth=True) if frames is None else frames, **given)
 
 
@@ -199,17 +200,17 @@ def test_a_guessed_camera_is_sought_first(monkeypatch: pytest.MonkeyPatch) -> No
     result = run(monkeypatch, passes)
     assert result.intrinsics == pytest.approx(np.array(LENS.intrinsics), abs=0.1)
     assert "self-calibration" in result.summary["seconds_by_stage"]
-    run(monkeypatch, passes, settings=settings(2), start=1, stride=3)
+    run(monkeypatch, passes, settings=settings(2), options=vg.RunOptions(start=1, stride=3, dense="none"))
     assert passes.counts == [FRAMES, 2]
-    assert run(monkeypatch, _Passes(None), end=3).record.slam.camera.given.tolist() == list(GUESS.intrinsics)
+    assert run(monkeypatch, _Passes(None), options=FEW).record.slam.camera.given.tolist() == list(GUESS.intrinsics)
 
 
 def test_no_self_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that a known camera, frames that come once, and the setting 0 need none.
     passes = _Passes()
-    run(monkeypatch, passes, walk(), end=3)
+    run(monkeypatch, passes, walk(), options=FEW)
     run(monkeypatch, passes, iter(recorded_run().frames[:3]))
-    run(monkeypatch, passes, settings=settings(0), end=3)
+    run(monkeypatch, passes, settings=settings(0), options=FEW)
     assert passes.counts == []
 
 
@@ -229,7 +230,7 @@ def test_warnings_of_calibration_frames_count_once(monkeypatch: pytest.MonkeyPat
 
     roles = Perception(ROLES, {}, {"depth": counts})
     with pytest.warns(InputWarning, match="odd") as told:
-        result = run(monkeypatch, Refused(), Warns(walk(), GUESS, has_depth=True), roles=roles, end=3)
+        result = run(monkeypatch, Refused(), Warns(walk(), GUESS, has_depth=True), roles=roles, options=FEW)
     assert [str(warning.message) for warning in told].count("frame 1 is odd") == 1
     assert result.record.warnings.count("frame 1 is odd") == 1
     assert counts == Refusals(asked=1)

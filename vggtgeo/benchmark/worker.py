@@ -25,6 +25,7 @@ from vggtgeo.io.files import write_json
 from vggtgeo.io.peak_memory import peak_memory_gb
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import Result
+from vggtgeo.results.run_options import RunOptions
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import updated
@@ -84,14 +85,16 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
             given.sequence,
             given.perception,
             updated(SlamSettings(), spec["set"]),
-            start=spec["start"],
-            end=spec["end"],
-            stride=spec["stride"],
-            seed=seed,
-            title=f"{folder.name}{' (simulated)' if given.simulated else ''}",
             callbacks=callbacks,
-            facts={"simulated": True} if given.simulated else None,
-            warned=warned,
+            options=RunOptions(
+                start=spec["start"],
+                end=spec["end"],
+                stride=spec["stride"],
+                seed=seed,
+                title=f"{folder.name}{' (simulated)' if given.simulated else ''}",
+                facts={"simulated": True} if given.simulated else {},
+                warned=warned,
+            ),
         )
         if result.summary["interrupted"]:  # by a signal from outside: a part of the frames is not a result
             signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -39,7 +39,8 @@ def demo(
 ) -> None:
     """Run in a synthetic office with exact truth, rendered on the spot."""
     from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.cli.run_sequence import Output, RunArguments, run_and_write
+    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.results.run_options import RunOptions
     from vggtgeo.simulation import simulate
     from vggtgeo.slam.settings.slam_settings import Roles
     from vggtgeo.slam.window.sliding_window import warm_up
@@ -64,5 +65,5 @@ def demo(
             as_json=report.as_json,
             resume=resume,
         ),
-        RunArguments(title=f"simulated {world.scene}", facts={"simulated": True}),
+        RunOptions(title=f"simulated {world.scene}", facts={"simulated": True}),
     )

@@ -17,7 +17,7 @@ from vggtgeo.cli.run_options import (
     OutputOption,
     PerceptionOptions,
     Provider,
-    RunOptions,
+    ResultOptions,
     SequenceArgument,
     SwitchOptions,
 )
@@ -46,7 +46,7 @@ def run(
     given: InputOptions,
     switches: SwitchOptions,
     perception: PerceptionOptions,
-    options: RunOptions,
+    options: ResultOptions,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
     from vggtgeo.datasets.frame import check_selection
@@ -73,7 +73,8 @@ def run(
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
         warnings.warn(text, InputWarning, stacklevel=2)
     from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.cli.run_sequence import Output, RunArguments, run_and_write
+    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.results.run_options import RunOptions
     from vggtgeo.slam.known_map import load_map
     from vggtgeo.slam.run import default_roles
 
@@ -93,18 +94,13 @@ def run(
             resume=options.resume,
             checkpoint_every=options.checkpoint_every,
         ),
-        RunArguments(
-            (given.start, given.end, given.stride),
-            seed=options.seed,
-            dense=options.dense,
-            warned=warned,
-            known_map=None if options.map_file is None else load_map(options.map_file),
-            pose_prior=options.pose_prior,
-        ),
+        RunOptions(given.start, given.end, given.stride, options.seed, options.dense, warned=warned),
+        known_map=None if options.map_file is None else load_map(options.map_file),
+        pose_prior=options.pose_prior,
     )
 
 
-def tables_of_switches(switches: SwitchOptions, options: RunOptions) -> dict[str, Tables]:
+def tables_of_switches(switches: SwitchOptions, options: ResultOptions) -> dict[str, Tables]:
     """Return the settings of each switch, by the name of its parameter."""
     from vggtgeo.slam.settings.groups import DepthSettings
 

@@ -134,7 +134,7 @@ class PerceptionOptions:
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class ResultOptions:
     """Results of the run, maps that it reads and writes, and its report."""
 
     dense: Annotated[

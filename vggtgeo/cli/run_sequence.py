@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
+from vggtgeo.results.run_options import RunOptions
 from vggtgeo.results.unfinished import EXPORTS, SUMMARY
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.presets import Perception
@@ -62,24 +63,19 @@ class Output:
     checkpoint_every: float = EVERY
 
 
-@dataclass(frozen=True)
-class RunArguments:
-    """Further arguments of `vggtgeo.reconstruct`. selection: start, end, stride."""
-
-    selection: tuple[int, int | None, int] = (0, None, 1)
-    seed: int = 0
-    dense: str = "auto"
-    title: str | None = None
-    facts: Mapping[str, Any] | None = None
-    warned: Iterable[Warning | str] = ()
-    known_map: Slam | None = None
-    pose_prior: str | None = None
-
-
 def run_and_write(
-    sequence: Sequence, roles: Roles | Perception, settings: SlamSettings, output: Output, arguments: RunArguments
+    sequence: Sequence,
+    roles: Roles | Perception,
+    settings: SlamSettings,
+    output: Output,
+    options: RunOptions,
+    *,
+    known_map: Slam | None = None,
+    pose_prior: str | None = None,
 ) -> None:
     """Run a sequence with a progress bar, write its folder, print the report, and exit with the code of the verdict.
+
+    options: those of `vggtgeo.reconstruct`, its title and checkpoints completed here.
 
     Raises:
         typer.Exit: the verdict is "failed", or the run was interrupted.
@@ -87,9 +83,8 @@ def run_and_write(
 
     """
     silent = output.quiet or output.as_json
-    title = (arguments.title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
+    title = (options.title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
     console = Console(stderr=False, quiet=silent)
-    start, end, stride = arguments.selection
     # From the first frame to the last file, a signal ends the run early; the results so far are written completely.
     with interruption() as stop, open_run_folder(output.folder, output.source, RESERVE, output.resume) as folder:
         replaces = (output.folder / SUMMARY).is_file()
@@ -104,18 +99,10 @@ def run_and_write(
                 sequence,
                 roles,
                 settings,
-                start=start,
-                end=end,
-                stride=stride,
-                seed=arguments.seed,
-                dense=arguments.dense,
-                title=title,
+                known_map=known_map,
+                pose_prior=pose_prior,
                 callbacks=(bar, _EarlyFiles(folder.stage, {**output.flags, **changed(settings)}), *viewed),
-                facts=arguments.facts,
-                warned=arguments.warned,
-                checkpoints=checkpoints,
-                known_map=arguments.known_map,
-                pose_prior=arguments.pose_prior,
+                options=replace(options, title=title, checkpoints=checkpoints),
             )
             bar.on_stage("writing")
             frames = _reopen(sequence, roles, settings) if output.save_depth == "every" else None

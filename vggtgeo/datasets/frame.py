@@ -82,14 +82,19 @@ class Sequence(Protocol):
 
 def check_selection(name: str, count: int, start: int, end: int | None, stride: int) -> None:
     """Raise InputError unless `start`, `end`, `stride` select at least one of `count` frames of sequence `name`."""
+    check_range(start, end, stride)
+    if start >= count:
+        raise InputError(f"`start` is {start}; `{name}` has {count} frames: give at most {count - 1}")
+
+
+def check_range(start: int, end: int | None, stride: int) -> None:
+    """Raise InputError unless `start`, `end`, `stride` select frames of a long enough sequence."""
     for argument, given in (("start", start), ("stride", stride), ("end", 0 if end is None else end)):
         check_kind(argument, given, numbers.Integral, "a whole number")
     if stride < 1:
         raise InputError(f"`stride` is {stride}; it must be at least 1")
     if start < 0 or (end is not None and end <= start):
         raise InputError(f"`start` is {start} and `end` {end}; they must be 0 <= start < end")
-    if start >= count:
-        raise InputError(f"`start` is {start}; `{name}` has {count} frames: give at most {count - 1}")
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:

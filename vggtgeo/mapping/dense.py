@@ -61,10 +61,15 @@ class DenseMap:
         return found if len(found.faces) else None
 
 
-def check_dense(mode: str, measured: bool, source: MetricDepth | None = None) -> None:
-    """Raise InputError for an unknown `mode`, or one whose depth is missing. source: the depth role, if known."""
+def check_mode(mode: str) -> None:
+    """Raise InputError for an unknown `mode`."""
     if mode not in get_args(DenseMode):
         raise InputError(f"`dense` must be one of {', '.join(get_args(DenseMode))}, got {mode!r}")
+
+
+def check_dense(mode: str, measured: bool, source: MetricDepth | None = None) -> None:
+    """Raise InputError for an unknown `mode`, or one whose depth is missing. source: the depth role, if known."""
+    check_mode(mode)
     if mode == "network" and isinstance(source, SensorDepth | NoDepth):
         raise InputError(
             "`dense` is 'network', but the depth role is not a network; choose one (`--depth moge2-small`, or a "

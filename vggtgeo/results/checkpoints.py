@@ -52,7 +52,7 @@ class Checkpoints:
     Example:
         >>> from pathlib import Path
         >>> import vggtgeo as vg
-        >>> kept = vg.Checkpoints(Path("night.npz"), resume=True)  # give it to `vg.reconstruct(..., checkpoints=kept)`
+        >>> kept = vg.settings.Checkpoints(Path("night.npz"), resume=True)  # for `vg.RunOptions(checkpoints=kept)`
         >>> kept.every  # seconds
         10.0
 

@@ -16,16 +16,17 @@ from vggtgeo.datasets import Sequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning, collected_warnings
-from vggtgeo.io.given import check_kind, check_plain, check_whole
+from vggtgeo.io.given import check_kind
 from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, load_checkpoint, run_identity
+from vggtgeo.results.checkpoints import digest_of_map, load_checkpoint, run_identity
 from vggtgeo.results.pose_prior import PosePrior, with_pose_prior
 from vggtgeo.results.result import Result, RunRecord
+from vggtgeo.results.run_options import RunOptions
 from vggtgeo.results.source import Source, open_source, reduction_summary
-from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
+from vggtgeo.results.summary import compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import RunCallbacks, Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
@@ -67,18 +68,10 @@ def reconstruct(
     settings: SlamSettings | None = None,
     *,
     camera: Camera | None = None,
-    start: int = 0,
-    end: int | None = None,
-    stride: int = 1,
-    seed: int = 0,
-    dense: str = "auto",
-    title: str | None = None,
-    callbacks: Iterable[Callback] = (),
-    facts: Mapping[str, Any] | None = None,
-    warned: Iterable[Warning | str] = (),
-    checkpoints: Checkpoints | None = None,
     known_map: Slam | None = None,
     pose_prior: PosePrior = None,
+    callbacks: Iterable[Callback] = (),
+    options: RunOptions | None = None,
 ) -> Result:
     """Track all frames, map them, adjust the whole map, and judge the result.
 
@@ -97,21 +90,13 @@ def reconstruct(
             the frames have none.
         settings: of the pipeline.
         camera: of the frames; overrides the calibration of the folder. By default a guess for an iterable.
-        start: first frame.
-        end: frame to stop before.
-        stride: take every n-th frame.
-        seed: of the random samples of robust estimators; equal seeds give equal results.
-        dense: source of the dense depth: auto, mvs, sensor, network or none (`vggtgeo/mapping/dense.py`).
-        title: of the report; by default the name of the sequence.
-        callbacks: called with every frame.
-        facts: more entries of the summary.
-        warned: earlier warnings about the input, for the verdict and the report.
-        checkpoints: where to write checkpoints, and whether to resume from an existing one.
         known_map: map of `vggtgeo.load_map` to localise in and extend; with the setting `keyframes.localise_only` it
             is not changed.
         pose_prior: poses that came with the frames, camera -> world at their times, as a prior of the motion:
             "recorded" for those that the reader knows (they are then no ground truth), a file of poses, or a
             `Trajectory`. Of another recording, they are noticed and not used.
+        callbacks: called with every frame.
+        options: which frames, the dense map, the report, and checkpoints.
 
     Raises:
         InputError: an argument is invalid, no frame is usable, or the checkpoint belongs to another run.
@@ -126,26 +111,24 @@ def reconstruct(
     clock, began = Clock(), time.perf_counter()
     check_run_arguments(roles.roles if isinstance(roles, Perception) else roles, settings, camera, known_map)
     check_kind("callbacks", callbacks, Iterable, "a list of `vggtgeo.Callback`")
-    check_kind("checkpoints", checkpoints, Checkpoints | None, "`vggtgeo.Checkpoints`, or None")
-    _check_report(title, facts, warned)
-    check_whole("seed", seed)
-    settings = settings or SlamSettings()
+    check_kind("options", options, RunOptions | None, "`vggtgeo.RunOptions`, or None")
+    settings, options = settings or SlamSettings(), options or RunOptions()
+    selection = options.selection
     with program_settings(), interruption() as stop, collected_warnings() as collected:
         with stop.at_once():  # a live camera may not deliver any frame
             source, recorded = with_pose_prior(open_source(frames, camera, settings), pose_prior)
-        source.check(start, end, stride)
-        perception = _perception(roles, source.has_depth, seed, recorded)
-        check_dense(dense, perception.roles.metric, perception.roles.depth)
-        selection = (start, end, stride)
+        source.check(*selection)
+        perception = _perception(roles, source.has_depth, options.seed, recorded)
+        check_dense(options.dense, perception.roles.metric, perception.roles.depth)
         first = _first_state(known_map, source, settings, perception.roles)
         identity = run_identity(
             *(settings, perception.roles, source.identity(selection)),
             {name: session.digest for name, session in perception.networks.items()},
-            dense=dense,
-            seed=seed,
+            dense=options.dense,
+            seed=options.seed,
             known_map=None if first is None else digest_of_map(first),
         )
-        before = load_checkpoint(source.resumable(checkpoints), identity)
+        before = load_checkpoint(source.resumable(options.checkpoints), identity)
         # Corners for the verdict are undistorted by the known map's camera, or later by the one of this run.
         evidence_camera = source.camera if first is None or first.camera.lens is None else source.camera.pinhole
         windows, evidence, overlay = WindowRecorder(), EvidenceRecorder(evidence_camera), StaticOverlaySearch()
@@ -158,12 +141,12 @@ def reconstruct(
         if first is None and before is None:
             first = _calibrate(source, selection, perception, settings, hooks, stop)
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
-        with loop.checkpoint_writer(checkpoints, identity) as writer:
+        with loop.checkpoint_writer(options.checkpoints, identity) as writer:
             tracked = loop.track(writer)
             slam, interrupted = _finish_unless_interrupted(tracked, perception.roles, settings, hooks, stop)
         summary_facts = {
             **perception.facts(),
-            **(facts or {}),
+            **options.facts,
             "frames_per_second": round(tracked.frames_per_second, 2),
             "interrupted": interrupted,
             **reduction_summary(source, slam),
@@ -173,29 +156,15 @@ def reconstruct(
         finished = _FinishedRun(
             slam=slam,
             source=source,
-            warned=(*warned, *(collected if before is None else before.merge_warnings(collected))),
+            warned=(*options.warned, *(collected if before is None else before.merge_warnings(collected))),
             refusals=perception.refusals,
-            title=title or source.name,
+            title=options.title or source.name,
             facts=summary_facts,
             clock=clock,
             began=began - (0.0 if before is None else before.whole),
-            dense=dense,
+            dense=options.dense,
         )
         return _conclude(finished, settings, hooks, windows.records, overlay, evidence)
-
-
-def _check_report(title: Any, facts: Any, warned: Any) -> None:
-    """Validate before the first frame what is used after the last one."""
-    check_kind("title", title, str | None, "a text")
-    check_plain("facts", {} if facts is None else facts)
-    invalid = [key for key in facts or {} if not isinstance(key, str) or key in RESERVED_KEYS]
-    if invalid:
-        raise InputError(
-            f"`facts` has the key {invalid[0]!r:.60}; keys must be texts other than the summary's own: "
-            f"{', '.join(sorted(RESERVED_KEYS))}"
-        )
-    if isinstance(warned, str) or not isinstance(warned, Iterable):
-        check_kind("warned", warned, (), "a list of warnings or texts")
 
 
 @dataclass(frozen=True, eq=False)

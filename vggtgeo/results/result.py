@@ -138,7 +138,7 @@ class Result:
         """Return the result of a state of `vggtgeo.run` or `vggtgeo.finish`.
 
         evidence: frame data of an `EvidenceRecorder`; without it the verdict uses the state alone. truth: ground truth,
-        camera -> world. dense: source of the dense depth, as in `vggtgeo.reconstruct`.
+        camera -> world. dense: source of the dense depth, as in `vggtgeo.RunOptions`.
         """
         check_kind("slam", slam, Slam, "a state of `vggtgeo.run`")
         slam = merge_pending_window(slam)

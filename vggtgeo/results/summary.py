@@ -51,7 +51,7 @@ RESERVED_KEYS = frozenset(
         *("static_overlay", "truth", "frames_per_second_whole_run", "pose_prior"),
     }
 )
-"""Keys of every summary, which `facts` of `vggtgeo.reconstruct` must not use."""
+"""Keys of every summary, which `facts` of `vggtgeo.RunOptions` must not use."""
 
 
 def summarise(

@@ -235,7 +235,7 @@ def test_a_phone_without_calibration_from_end_to_end(tmp_path: Path) -> None:
     # that drew them.
     office = vg.simulate("office", 60, size=(320, 240), rate=10.0)
     frames = Bent(office, replace(office.camera, distortion=(-0.08, -0.02, 0.0, 0.0)))
-    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), dense="none")
+    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), options=vg.RunOptions(dense="none"))
     lens = result.summary["lens"]
     assert lens["fx"] == pytest.approx(frames.lens.intrinsics[0], rel=0.03)
     assert result.intrinsics[0] == pytest.approx(lens["fx"], rel=0.01)

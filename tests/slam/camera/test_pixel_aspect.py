@@ -178,7 +178,7 @@ def test_a_squeezed_video_without_calibration(tmp_path: Path) -> None:
     # Proves that images alone, resized out of shape, give both focal lengths to 3 %, a word on it, and the path.
     # Oracle: the camera that drew them, resized.
     frames = Squeezed(vg.simulate("office", 60, size=(320, 240), rate=10.0))
-    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), dense="none")
+    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), options=vg.RunOptions(dense="none"))
     expected = frames.source.camera.resized(*frames.size).intrinsics
     np.testing.assert_allclose(result.intrinsics[:2], expected[:2], rtol=0.03)
     assert any("not square" in note for note in result.summary["notes"])

@@ -275,7 +275,7 @@ def test_a_run_finds_the_shutter_of_its_camera() -> None:
     errors = []
     for search in (False, True):
         settings = vg.SlamSettings(refinement=vg.settings.GlobalMapSettings(rolling_shutter=search))
-        result = vg.reconstruct(sequence, settings=settings, dense="none")
+        result = vg.reconstruct(sequence, settings=settings, options=vg.RunOptions(dense="none"))
         errors.append(result.summary["truth"]["ate_se3_m"]["rmse"])
         assert ("rolling_shutter" in result.summary) == search
     assert result.summary["rolling_shutter"]["seconds"] == pytest.approx(0.03, rel=0.1)
