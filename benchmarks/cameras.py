@@ -67,16 +67,14 @@ def timed_solve(window: vg.data.SimulatedWindow, count: int) -> Callable[[], flo
     """Seconds an iteration of a compiled solve with so many cameras, which took the keyframes in turns."""
     focal, _, x, y = window.intrinsics
     guess = np.tile([1.01 * focal, x, y, 0.0, 0.0, 0.0, 0.0], (max(count, 1), 1))
-    options = {"fixed_intrinsics": np.tile(~FREE, (max(count, 1), 1))}
-    options["intrinsics_sigma"] = np.broadcast_to([10.0, 5.0, 5.0, SIGMA, SIGMA, SIGMA, SIGMA], guess.shape)
+    options = {"fixed": ~FREE, "prior_sigma": np.array([10.0, 5.0, 5.0, SIGMA, SIGMA, SIGMA, SIGMA])}
     if count:
         options["camera_of"] = np.arange(len(window.start)) % count
     else:
-        guess, options = guess[0], {name: value[0] for name, value in options.items()}
+        guess = guess[0]
     seen = window.observations
-    problem, initial, _ = vg.pack(
-        seen, window.start, guess, seen.depth_mean, camera=vg.cameras.RadialTangential, shared_focal=True, **options
-    )
+    cameras = vg.cameras.Intrinsics(guess, vg.cameras.RadialTangential, shared_focal=True, **options)
+    problem, initial, _ = vg.pack(seen, window.start, cameras, seen.depth_mean)
     solver = vg.SchurLevenbergMarquardt(rtol=0.0, max_iterations=ITERATIONS)
     solve = jax.jit(lambda problem, initial: vg.solve(problem, initial, solver=solver))
     jax.block_until_ready(solve(problem, initial).state)
@@ -98,9 +96,9 @@ def each_model(keyframes: int, points: int) -> None:
     for model in MODELS:
         coefficients = len(model.names) - len(vg.cameras.Pinhole.names)
         sigma = np.array([10.0, 5.0, 5.0, *[SIGMA] * coefficients])
-        guess = window.start, np.array([focal, x, y, *[0.0] * coefficients]), window.observations.depth_mean
-        options = {"camera": model, "shared_focal": True, "intrinsics_sigma": sigma}
-        problem, initial, _ = vg.pack(window.observations, *guess, **options)
+        values = np.array([focal, x, y, *[0.0] * coefficients])
+        cameras = vg.cameras.Intrinsics(values, model, shared_focal=True, prior_sigma=sigma)
+        problem, initial, _ = vg.pack(window.observations, window.start, cameras, window.observations.depth_mean)
         seconds = []
         for _ in range(2):
             began = time.perf_counter()

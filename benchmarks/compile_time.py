@@ -62,7 +62,9 @@ def _window(name: str) -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
     """A function of the matches' weights of the README's window, and the weights."""
     window = vg.simulate_window()
     seen = window.observations
-    problem, initial, _ = vg.pack(seen, window.start, window.intrinsics, seen.depth_mean, fixed_intrinsics=True)
+    problem, initial, _ = vg.pack(
+        seen, window.start, vg.cameras.Intrinsics(window.intrinsics, fixed=True), seen.depth_mean
+    )
 
     def loss(weight: jax.Array) -> jax.Array:
         state = vg.solve(problem.with_term(problem.points.reweighted(weight)), initial).state
@@ -80,12 +82,12 @@ def _window(name: str) -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
 def _chain() -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
     """The gradient through windows as large as the README's, the oldest keyframe marginalised after each."""
     long = vg.simulate_window(KEYFRAMES + WINDOWS - 1)
-    parts = []
+    parts, camera = [], vg.cameras.Intrinsics(long.intrinsics, fixed=True)
     for first in range(WINDOWS):
         inside = range(first, first + KEYFRAMES)
         seen = long.observations.within(inside)
-        parts.append((seen, long.start[list(inside)], long.intrinsics, seen.depth_mean))
-    windows = vg.batches.pack_batch(parts, terms=[vg.empty_prior(KEYFRAMES)], fixed_intrinsics=True)[:2]
+        parts.append((seen, long.start[list(inside)], camera, seen.depth_mean))
+    windows = vg.batches.pack_batch(parts, terms=[vg.empty_prior(KEYFRAMES)])[:2]
     first, start = jax.tree.map(lambda leaf: leaf[0], windows)
     # The last window is slid into the first one again, so that the body is compiled once; nothing looks at that.
     following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, 0), windows)

@@ -131,7 +131,11 @@ def _window() -> Numbers:
     window = vg.simulate_window()
     seen = window.observations
     problem, initial, _ = vg.pack(
-        seen, window.start, window.intrinsics, seen.depth_mean, fixed_intrinsics=True, terms=[vg.empty_prior(4)]
+        seen,
+        window.start,
+        vg.cameras.Intrinsics(window.intrinsics, fixed=True),
+        seen.depth_mean,
+        terms=[vg.empty_prior(4)],
     )
 
     def error(weight: jax.Array) -> jax.Array:

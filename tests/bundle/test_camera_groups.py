@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
@@ -107,13 +107,10 @@ def two_pinholes() -> tuple[Rig, vg.Problem, vg.State, np.ndarray]:
     guess = PINHOLES * np.array([[1.02, 0.98, 1, 1], [0.98, 1.02, 1.01, 0.99]])
     held = np.zeros((2, 4), bool)
     held[0, 3] = True
-    problem, state, index = vg.pack(
-        *(made.seen, poses, guess, depth),
-        intrinsics_sigma=np.array([np.full(4, np.inf), np.full(4, 3.0)]),
-        fixed_intrinsics=held,
-        camera_of=GROUP,
-        kernel=vg.kernels.Square(),
+    cameras = vg.cameras.Intrinsics(
+        guess, camera_of=GROUP, prior_sigma=np.array([np.full(4, np.inf), np.full(4, 3.0)]), fixed=held
     )
+    problem, state, index = vg.pack(replace(made.seen, kernel=vg.kernels.Square()), poses, cameras, depth)
     return made, problem, state, index, guess
 
 
@@ -194,9 +191,8 @@ def test_second_derivatives_with_several_cameras() -> None:
     place = Seen(
         keyframe=[1, 2], place=jnp.array([[0.1, 0.2, 2.0]] * 2), pixel=jnp.full((2, 2), 150.0), weight=[0.3, 1]
     )
-    problem, state, _ = vg.pack(
-        *(made.seen, poses, made.cameras, depth), camera=vg.cameras.RadialTangential, camera_of=GROUP, terms=[place]
-    )
+    cameras = vg.cameras.Intrinsics(made.cameras, vg.cameras.RadialTangential, camera_of=GROUP)
+    problem, state, _ = vg.pack(made.seen, poses, cameras, depth, terms=[place])
     flat, unflat = ravel_pytree(BundleAdjustment(problem).zero_step(state))
 
     @jax.jit
@@ -220,10 +216,8 @@ def test_an_edge_sees_two_cameras_however_many_there_are() -> None:
     # of each end's camera, beside the gradient, the landmark's own two rows, and three edges a host.
     made = rig(tuple(map(tuple, PINHOLES)), noise=0.5)
     for count in (2, 4, 400):
-        intrinsics = np.tile(PINHOLES[0], (count, 1))
-        problem, state, _ = vg.pack(
-            made.seen, made.poses, intrinsics, made.inverse_depth, camera_of=np.arange(4) % count
-        )
+        cameras = vg.cameras.Intrinsics(np.tile(PINHOLES[0], (count, 1)), camera_of=np.arange(4) % count)
+        problem, state, _ = vg.pack(made.seen, made.poses, cameras, made.inverse_depth)
         system = jax.eval_shape(lambda p, s: BundleAdjustment(p).linearise(s), problem, state)
         assert system.gram.shape == (12, 6 + 4 + 4 + 1, 6 + 4 + 4 + 1)
         assert system.cross.shape[1] == 3 * 6 + 3 * 4 + 4 + 2
@@ -270,12 +264,12 @@ def test_a_term_on_all_cameras() -> None:
     ],
 )
 def test_a_distortion_is_found(model: type[vg.cameras.AbstractCamera], truth: np.ndarray) -> None:
-    # Proves `pack(camera=...)`: from no distortion and a focal length 1 % off, exact matches give the camera that drew
+    # Proves `Intrinsics.model`: from no distortion and a focal length 1 % off, exact matches give the camera that drew
     # them. Oracle: OpenCV drew them.
     made = rig((tuple(truth),), fisheye=model is vg.cameras.KannalaBrandt, points=25)
     poses, _ = start_of(made)
     guess = np.concatenate([truth[:4] * [1.01, 0.99, 1.0, 1.0], np.zeros(4)])
-    problem, state, index = vg.pack(made.seen, poses, guess, made.inverse_depth, camera=model)
+    problem, state, index = vg.pack(made.seen, poses, vg.cameras.Intrinsics(guess, model), made.inverse_depth)
     solution = solve(problem, state)
     error = np.abs(np.asarray(solution.state.intrinsics) - truth) / np.array([300, 300, 300, 300, 1, 1, 1, 1.0])
     assert error.max() < 1e-5, error
@@ -297,7 +291,7 @@ def test_square_pixels_are_an_exact_tie() -> None:
     window = vg.simulate_window(3, points=10, lines=1)
     given = (window.observations, window.start)
     guess, depth = 1.05 * window.intrinsics[1:], window.observations.depth_mean
-    found = solve(*vg.pack(*given, guess, depth, shared_focal=True)[:2]).state.intrinsics
+    found = solve(*vg.pack(*given, vg.cameras.Intrinsics(guess, shared_focal=True), depth)[:2]).state.intrinsics
     tie = EqualFocalLengths(weight=jnp.full(1, 1e8))
     tied = solve(*vg.pack(*given, np.append(guess[0], guess), depth, terms=[tie])[:2]).state.intrinsics
     np.testing.assert_allclose(np.append(found[0], found), tied, rtol=1e-6)

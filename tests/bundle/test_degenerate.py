@@ -27,8 +27,8 @@ from vggtgeo.bundle.bundle_adjustment import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 
-NO_PRIOR = {"intrinsics_sigma": None}
-ALL_HELD = {"fixed_pose": np.ones(KEYFRAMES, bool), "fixed_intrinsics": HELD}
+NO_PRIOR = {"prior_sigma": None}
+ALL_HELD = {"fixed_pose": np.ones(KEYFRAMES, bool), "fixed": HELD}
 NONE_HELD = {"fixed_pose": np.zeros(KEYFRAMES, bool), **NO_PRIOR}
 LOST = without(WELL, "point", "line", "depth")
 # Name: the scene, options of packing, and the energy that is reached at least (the rest of the optimum is not unique).
@@ -37,7 +37,7 @@ CASES: dict[str, tuple[Scene, dict[str, Any], float]] = {
     "unobservable scale": (without(WELL, "depth"), {}, 0.003),
     "no parallax": (pure_rotation(), {}, 0.001),
     "one plane": (one_plane(), {}, 0.002),
-    "parallel lines": (parallel_lines(), {"fixed_intrinsics": HELD}, 1e-6),
+    "parallel lines": (parallel_lines(), {"fixed": HELD}, 1e-6),
     "unmatched keyframe": (without_matches_of(2), {}, 0.006),
     "zero weights": (LOST, NO_PRIOR, 0.0),
     "zero weights, prior": (LOST, {}, 0.0),
@@ -102,7 +102,7 @@ def test_a_wild_start_ends(solved: Solve, seed: int, dtype: type) -> None:
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_undetermined_coordinates_hardly_move(solved: Solve, dtype: type) -> None:
     # Proves that cameras that may slide along parallel lines do not run away on rounding errors. Oracle: their start.
-    problem, start = packed(parallel_lines(), dtype=dtype, fixed_intrinsics=HELD)
+    problem, start = packed(parallel_lines(), dtype=dtype, fixed=HELD)
     solution = solved(problem, start)
     back = lambda state: np.asarray(state.poses.inverse().translation())[:, 0]
     moved = np.abs(back(solution.state) - back(start)).max()

@@ -15,7 +15,7 @@ from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 
 WINDOW = vg.simulate_window(keyframes=3, points=10, lines=1, noise=0.5)
-PROBLEM, START, _ = WINDOW.pack(fixed_intrinsics=True)
+PROBLEM, START, _ = WINDOW.pack()
 CENTRES = np.asarray(WINDOW.centres)
 
 

@@ -56,7 +56,7 @@ LEAVES: dict[str, tuple[Callable[[Both], Any], float]] = {
 
 def make_problem(scene: Scene = SCENE) -> Both:
     """A problem with every kind of leaf; pose 0 and c_y are held."""
-    problem, state, _ = scene.pack(fixed_intrinsics=np.array([False, False, False, True]))
+    problem, state, _ = scene.pack(fixed=np.array([False, False, False, True]))
     pose, information = np.eye(4), np.diag([4e4, 3e4, 5e4, 4e5, 3e5, 5e5])
     pose[:3, 3] = [-0.2, 0.02, 0.01]
     factors = [MeasuredRelativePose(1, 2, pose, information)]

@@ -24,7 +24,8 @@ POINTS, LINES, KEYFRAMES = 6, 2, 3
 def window() -> tuple[Problem, State]:
     """A window with points, two-ends lines, a free camera, and pixel offsets that are not zero."""
     simulated = vg.simulate_window(KEYFRAMES, POINTS, LINES, host_noise=True)
-    problem, state, _ = simulated.pack(fixed_intrinsics=False, intrinsics_sigma=5.0, kernel=vg.kernels.Huber(1.5))
+    intrinsics = vg.cameras.Intrinsics(simulated.intrinsics, prior_sigma=5.0)
+    problem, state, _ = simulated.pack(intrinsics=intrinsics, kernel=vg.kernels.Huber(1.5))
     offset = np.random.default_rng(0).normal(0, 0.3, (KEYFRAMES, POINTS, 2))
     return problem, replace(state, pixel_offset=jnp.asarray(offset))
 

@@ -176,6 +176,17 @@ def test_wrong_lists_are_refused_by_name() -> None:
     for scene, named in cases:
         with raises(*named):
             scene.pack()
+    for options, named in (
+        ({"model": vg.cameras.RadialTangential}, ("`intrinsics`", "(8)", "(4,)")),
+        ({"shared_focal": True}, ("`intrinsics`", "(3)", "(4,)")),
+        ({"camera_of": np.zeros(3, int)}, ("`intrinsics`", "(g, 4)")),
+        ({"prior_mean": SCENE.start_intrinsics[:3]}, ("`prior_mean`", 4)),
+        ({"prior_sigma": 0.0}, ("`prior_sigma`", "positive")),
+        ({"fixed": np.ones(3, bool)}, ("`fixed`", 4)),
+        ({"kernel": vg.kernels.Huber(-1.0)}, ("`kernel`",)),
+    ):
+        with raises(*named):
+            SCENE.pack(**options)
 
 
 def test_lists_and_poses_are_taken_as_they_come() -> None:
@@ -183,7 +194,7 @@ def test_lists_and_poses_are_taken_as_they_come() -> None:
     expected, state, _ = SCENE.pack()
     seen = SCENE.observations
     start = (jaxlie.SE3(jnp.asarray(SCENE.start_poses)), list(SCENE.start_intrinsics), SCENE.start_inverse_depth)
-    problem, same, _ = UNCHECKED(seen, *start, intrinsics_sigma=5.0)
+    problem, same, _ = UNCHECKED(seen, *start)
     assert bool(jnp.all(problem.points.target == expected.points.target))
     assert bool(jnp.all(same.poses.wxyz_xyz == state.poses.wxyz_xyz))
 
@@ -194,9 +205,10 @@ def test_a_problem_in_which_nothing_is_observed_is_refused() -> None:
     seen = SCENE.observations
     zero = {name: 0 * getattr(seen, name) for name in ("point_weight", "line_weight", "depth_weight")}
     start = SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth
-    for options in ({"intrinsics_sigma": 5.0}, {"terms": [vg.empty_prior(3)]}):
+    held = start[0], vg.cameras.Intrinsics(SCENE.start_intrinsics, prior_sigma=5.0), start[2]
+    for given, options in ((held, {}), (start, {"terms": [vg.empty_prior(3)]})):
         with raises("`problem`", "weights"):
-            pack(replace(seen, **zero), *start, **options)
+            pack(replace(seen, **zero), *given, **options)
     problem, state, _ = SCENE.pack()
     nothing = problem.with_terms(tuple(term.reweighted(jnp.zeros_like(term.weight)) for term in problem.terms))
     with raises("`problem`", "weights"):

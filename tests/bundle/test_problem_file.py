@@ -35,7 +35,7 @@ def test_a_shared_focal_length_is_saved(tmp_path: Path, model: type[Pinhole], gi
     # Proves that a camera class made by `shared_focal`, of the package or of a user, is written and found again.
     # Oracle: the packed class and parameters; without the user's class, the error names it.
     scene = replace(SCENE, start_intrinsics=SCENE.start_intrinsics[1:])
-    problem, state, index = scene.pack(camera=model, shared_focal=True)
+    problem, state, index = scene.pack(model=model, shared_focal=True)
     path = tmp_path / "shared.npz"
     save_problem(path, problem, state, index)
     loaded, again, _ = load_problem(path, terms=given)

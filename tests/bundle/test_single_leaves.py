@@ -102,7 +102,7 @@ def test_a_landmark_at_its_bound_is_held() -> None:
     # Proves that a landmark which wants to lie behind infinity rests on its bound, is counted, meets the condition of
     # Karush, Kuhn and Tucker, and gives the others their right derivative. Oracle: finite differences of the solve.
     scene = make_scene(2, 6, 0, noise=0.3, seed=4)
-    problem, state, _ = scene.pack(fixed_intrinsics=True)
+    problem, state, _ = scene.pack(fixed=True)
     problem = eqx.tree_at(lambda p: p.depth.weight, problem, problem.depth.weight.at[0].set(0.0))
     # A match 40 pixels on the far side of infinity: along the epipolar line, against the parallax.
     off = problem.points.target.at[0, 0].add(jnp.asarray([40.0, 0.0]))

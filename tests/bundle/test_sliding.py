@@ -25,16 +25,14 @@ def long_window(**options: Any) -> vg.data.SimulatedWindow:
     return vg.simulate_window(KEYFRAMES + WINDOWS - 1, points=8, lines=1, **{"noise": 0.5, "seed": 3, **options})
 
 
-def stacked(seen: vg.data.SimulatedWindow, windows: Sequence[int] = range(WINDOWS), **options: Any) -> Windows:
+def stacked(seen: vg.data.SimulatedWindow, windows: Sequence[int] = range(WINDOWS)) -> Windows:
     """The windows from keyframe k on, stacked, each with an empty prior."""
-    parts = []
+    parts, intrinsics = [], vg.cameras.Intrinsics(seen.intrinsics, prior_sigma=3.0)
     for first in windows:
         inside = range(first, first + KEYFRAMES)
         own = seen.observations.within(inside)
-        parts.append((own, seen.start[list(inside)], seen.intrinsics, own.depth_mean))
-    problems, initials, _ = vg.batches.pack_batch(
-        parts, terms=[vg.empty_prior(KEYFRAMES)], **{"intrinsics_sigma": 3.0, **options}
-    )
+        parts.append((own, seen.start[list(inside)], intrinsics, own.depth_mean))
+    problems, initials, _ = vg.batches.pack_batch(parts, terms=[vg.empty_prior(KEYFRAMES)])
     return problems, initials
 
 

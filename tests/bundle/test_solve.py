@@ -19,7 +19,7 @@ from vggtgeo.bundle.solution import Solution, solve
 
 EXACT = make_scene()
 NOISY = make_scene(noise=0.5, outliers=0.15, depth_error=0.05, seed=2)
-OPTIONS = {"fixed_intrinsics": np.array([False, False, False, True])}
+OPTIONS = {"fixed": np.array([False, False, False, True])}
 SOLVER = SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
 Solve = Callable[[Problem, State], Solution]
 
@@ -160,7 +160,7 @@ def test_no_weight_at_all(solved: Solve) -> None:
         line_weight=0 * NOISY.observations.line_weight,
         depth_weight=0 * NOISY.observations.depth_weight,
     )
-    problem, start, _ = scene.pack(**{**OPTIONS, "intrinsics_sigma": None})
+    problem, start, _ = scene.pack(**{**OPTIONS, "prior_sigma": None})
     solution = solved(problem, start)
     assert bool(solution.converged), solution.message
     assert float(solution.energy) == 0.0

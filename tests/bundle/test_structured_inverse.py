@@ -21,6 +21,7 @@ from vggtgeo.solvers.minres import minres
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.node_order import longest, narrow_order
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
@@ -29,7 +30,7 @@ from vggtgeo.simulation.loop import simulate_loop
 
 KEYFRAMES = 30
 WINDOW, SURFACES = simulate_loop(KEYFRAMES, points=6, reach=2, drift=0.3)
-PROBLEM, INITIAL, _ = WINDOW.pack(terms=(SURFACES,), fixed_intrinsics=False, intrinsics_sigma=2.0)
+PROBLEM, INITIAL, _ = WINDOW.pack(intrinsics=Intrinsics(WINDOW.intrinsics, prior_sigma=2.0), terms=(SURFACES,))
 ENDS, _ = coupled_pairs(PROBLEM)
 PLACE = narrow_order(KEYFRAMES, ENDS)
 BAND = BandCholesky(longest(PLACE, ENDS), jnp.asarray(PLACE))

@@ -136,9 +136,10 @@ def test_a_batch_of_windows_with_different_terms(packed) -> None:
     some = replace(
         planes, fields={k: v[:5] for k, v in rows.items()}, landmark=planes.landmark[:5], edge=planes.edge[:5]
     )
-    window = (SCENE.observations, SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth)
+    intrinsics = vg.cameras.Intrinsics(SCENE.start_intrinsics, prior_sigma=5.0)
+    window = (SCENE.observations, SCENE.start_poses, intrinsics, SCENE.start_inverse_depth)
     lists = [[fix, wheels, planes], [one, some], []]
-    problems, states, _ = vg.batches.pack_batch([(*window, terms) for terms in lists], intrinsics_sigma=5.0)
+    problems, states, _ = vg.batches.pack_batch([(*window, terms) for terms in lists])
     assert problems.position_fix.weight.shape == (3, 2)
     found, gradients = jax.vmap(energy_and_gradient)(problems, states)
     for number, terms in enumerate(lists):

@@ -132,7 +132,7 @@ def test_without_noise_both_find_the_truth() -> None:
     # Proves that the constraint is right: inverse depth is straight along the image of a line. Oracle: the truth.
     made = make_scene(3, points=POINTS, lines=SEGMENTS, samples=SAMPLES, seed=5)
     made = made.with_observations(segment=scene().observations.segment)
-    problem, state, index = made.pack(intrinsics_sigma=None)
+    problem, state, index = made.pack(prior_sigma=None)
     found = run(problem, state)
     np.testing.assert_allclose(index.gather(found.state.inverse_depth), made.inverse_depth, rtol=1e-5)
 

@@ -22,7 +22,7 @@ from vggtgeo.bundle.linearise import scale_direction
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State
 
-OPTIONS = {"fixed_intrinsics": np.array([False, False, False, True])}
+OPTIONS = {"fixed": np.array([False, False, False, True])}
 KEYFRAMES, CAMERA = lacking.KEYFRAMES, 6 * lacking.KEYFRAMES + 4
 Estimate = Callable[[Problem, State], Covariances]
 
@@ -206,7 +206,7 @@ class Sight(vg.terms.PoseTerm):
 def test_what_speaks_of_held_unknowns_alone_is_no_redundancy() -> None:
     # Proves that rows which never change are left out by what they depend on, whatever their class. Oracle: what is
     # held.
-    problem, state = packed(WELL, fixed_intrinsics=np.array([True, True, False, False]))
+    problem, state = packed(WELL, fixed=np.array([True, True, False, False]))
     one = jnp.ones(3)
     every = [0, 1, 2]
     kept = lambda term, problem: changing(problem, term, state).weight.tolist()

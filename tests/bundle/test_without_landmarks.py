@@ -43,7 +43,12 @@ def poses_alone(dtype: type = np.float64) -> tuple[Problem, State]:
     none, nowhere = np.zeros(0, int), np.zeros((0, 2))
     empty = vg.Observations(np.zeros((0, 2), int), none, nowhere, none, none, nowhere, np.zeros(0))
     problem, initial, _ = vg.pack(
-        empty, window.start, window.intrinsics, np.zeros(0), fixed_intrinsics=True, terms=[term], dtype=dtype
+        empty,
+        window.start,
+        vg.cameras.Intrinsics(window.intrinsics, fixed=True),
+        np.zeros(0),
+        terms=[term],
+        dtype=dtype,
     )
     return problem, initial
 

@@ -100,7 +100,7 @@ class Drawn:
     alpha: float
     fixed_pose: tuple[bool, ...]
     fixed_intrinsics: tuple[bool, ...]
-    intrinsics_sigma: float | None
+    prior_sigma: float | None
     width: float
     """Of the robust kernel, pixels."""
 
@@ -113,8 +113,8 @@ class Drawn:
         return packed(
             scene.with_observations(alpha=self.alpha, **zero),
             fixed_pose=np.array(self.fixed_pose),
-            fixed_intrinsics=np.array(self.fixed_intrinsics),
-            intrinsics_sigma=self.intrinsics_sigma,
+            fixed=np.array(self.fixed_intrinsics),
+            prior_sigma=self.prior_sigma,
             kernel=Huber(jnp.asarray(self.width)),
             **options,
         )
@@ -133,7 +133,7 @@ def finite_problems(numbers: Numbers) -> st.SearchStrategy[Drawn]:
         alpha=st.sampled_from([2.0, 0.0, 1e6]),
         fixed_pose=held(KEYFRAMES),
         fixed_intrinsics=held(4),
-        intrinsics_sigma=st.none() | st.just(5.0) | numbers.sigmas(),
+        prior_sigma=st.none() | st.just(5.0) | numbers.sigmas(),
         width=st.just(1.5) | numbers.positive(),
     )
 

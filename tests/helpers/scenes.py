@@ -1,12 +1,13 @@
 """Small bundle-adjustment problems with exact truth: cameras on an arc before random points and segments."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
@@ -30,24 +31,29 @@ class Scene:
     intrinsics: np.ndarray
 
     def pack(self, **options: Any) -> tuple[Problem, State, SlotIndex]:
-        """The problem, and the guess."""
+        """The problem, and the guess. options: of `pack`, fields of `Intrinsics`, and the observations' kernel."""
         start = (self.start_poses, self.start_intrinsics, self.start_inverse_depth)
-        return _pack(self.observations, *start, **{"intrinsics_sigma": 5.0, **options})
+        return _pack(self.observations, *start, **options)
 
     def at_truth(self, **options: Any) -> tuple[Problem, State, SlotIndex]:
         """The problem with the truth as its start (and as the mean of the intrinsics' prior)."""
         start = (self.poses, self.intrinsics, self.inverse_depth)
-        return _pack(self.observations, *start, **{"intrinsics_sigma": 5.0, **options})
+        return _pack(self.observations, *start, **options)
 
     def with_observations(self, **changes: Any) -> "Scene":
         """The same scene with fields of its observations replaced."""
         return replace(self, observations=replace(self.observations, **changes))
 
 
-def _pack(observations: Observations, *start: np.ndarray, **options: Any) -> tuple[Problem, State, SlotIndex]:
+def _pack(
+    observations: Observations, poses: np.ndarray, values: np.ndarray, inverse_depth: np.ndarray, **options: Any
+) -> tuple[Problem, State, SlotIndex]:
     """`pack`, which refuses a problem that observes nothing: such a one is packed with weights, which are then taken
     away, as a traced computation may do.
     """
+    of_camera = {field.name: options.pop(field.name) for field in fields(Intrinsics) if field.name in options}
+    start = poses, Intrinsics(values, **{"prior_sigma": 5.0, **of_camera}), inverse_depth
+    observations = replace(observations, kernel=options.pop("kernel", None))
     weights = {name: getattr(observations, name) for name in ("point_weight", "line_weight", "depth_weight")}
     if any(np.any(weight != 0) for weight in weights.values()):
         return pack(observations, *start, **options)

@@ -49,7 +49,7 @@ def linearise(problem: Problem, state: State) -> ArrowSystem:
 def linearised(loops: Pairs = ()) -> ArrowSystem:
     """A system with a held pose in the middle and one held intrinsic, besides the first pose."""
     held = np.isin(np.arange(KEYFRAMES), [0, 3])
-    return linearise(*packed(sequence(loops), fixed_pose=held, fixed_intrinsics=np.array([False, True, False, False])))
+    return linearise(*packed(sequence(loops), fixed_pose=held, fixed=np.array([False, True, False, False])))
 
 
 @eqx.filter_jit
@@ -125,7 +125,7 @@ def test_a_free_scale_is_held(name: str) -> None:
     # Proves that without depth priors the step does not change the scale. Oracle: dense Cholesky, and the direction.
     scene = sequence()
     scene = scene.with_observations(depth_weight=np.zeros(len(scene.observations.host)))
-    system = linearise(*packed(scene, fixed_intrinsics=True))
+    system = linearise(*packed(scene, fixed=True))
     assert float(flat_stiffness(system)[0]) > 0
     error, _ = step_error(SOLVERS[name], system, 0.0)
     assert error < 1e-6

@@ -12,6 +12,7 @@ import numpy as np
 import optimistix as optx
 from jax.sharding import PartitionSpec
 
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex
@@ -23,8 +24,8 @@ from vggtgeo.io.given import check_kind, check_whole
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 Window = (
-    tuple[Observations, np.ndarray, np.ndarray, np.ndarray]
-    | tuple[Observations, np.ndarray, np.ndarray, np.ndarray, Sequence[GivenTerm]]
+    tuple[Observations, np.ndarray, np.ndarray | Intrinsics, np.ndarray]
+    | tuple[Observations, np.ndarray, np.ndarray | Intrinsics, np.ndarray, Sequence[GivenTerm]]
 )
 """`(observations, poses [n, 7], intrinsics, inverse_depth [D])`, the first arguments of `pack`; and further terms."""
 
@@ -42,12 +43,14 @@ def pack_batch(
         options: the other keyword arguments of `pack`, the same for all windows.
 
     Raises:
-        InputError: `windows` is empty, or a window is invalid for `pack`; the message has its index.
+        InputError: `windows` is empty, a window is invalid for `pack`, or has another camera model or kind of kernel
+            than the first; the message has its index.
 
     Example:
         >>> seen = [vg.simulate_window(keyframes) for keyframes in (2, 3)]
-        >>> windows = [(w.observations, w.start, w.intrinsics, w.observations.depth_mean) for w in seen]
-        >>> problems, states, indices = vg.batches.pack_batch(windows, fixed_intrinsics=True)
+        >>> known = vg.cameras.Intrinsics(seen[0].intrinsics, fixed=True)
+        >>> windows = [(w.observations, w.start, known, w.observations.depth_mean) for w in seen]
+        >>> problems, states, indices = vg.batches.pack_batch(windows)
         >>> states.intrinsics.shape, len(indices)
         ((2, 4), 2)
 
@@ -64,7 +67,19 @@ def pack_batch(
         with _named(number):
             packed.append(pack(*window[:4], size=size, terms=own, **options))
     problems, states, indices = zip(*packed, strict=True)
+    _check_same_structure(problems)
     return stack(problems), stack(states), list(indices)
+
+
+def _check_same_structure(problems: Sequence[Problem]) -> None:
+    """Check that the problems differ in numbers alone, so that they can be stacked."""
+    structures: list[Any] = [jax.tree.structure(problem) for problem in problems]
+    for number, structure in enumerate(structures):
+        if structure != structures[0]:
+            raise InputError(
+                f"`windows[{number}]` must have the camera model, the kind of kernel and the optional observations "
+                "(`segment`, `pixel_sigma`) of `windows[0]`: one program solves all"
+            )
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import numpy as np
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import real_numbers
+from vggtgeo.solvers.kernels import AbstractKernel
 
 
 @dataclass(frozen=True)
@@ -20,9 +21,9 @@ class Observations:
     """Observations as flat numpy lists: `D` landmarks, `E` edges, `A` points, `B` line samples.
 
     A weight is 1 / variance: a match of standard deviation `s` pixels has weight `1 / s^2`, and weight 1 means a
-    standard deviation of 1 pixel. The width of the kernel is in these standard deviations. A depth of weight 1 has the
-    standard deviation `depth_sigma`. `alpha` scales the information of all depths: energy and covariances use the
-    standard deviation `depth_sigma / sqrt(alpha depth_weight)`.
+    standard deviation of 1 pixel. A depth of weight 1 has the standard deviation `depth_sigma`. `alpha` scales the
+    information of all depths: energy and covariances use the standard deviation
+    `depth_sigma / sqrt(alpha depth_weight)`.
 
     Fields:
         edges: int `[E, 2]`: (host keyframe, target keyframe).
@@ -46,6 +47,9 @@ class Observations:
             `1 / sqrt(point_weight)` of the matches; None: the pixels are exact. Ignored for line samples.
         segment: int `[D]`: segment of each line sample, -1 for points: the inverse depths of a segment's samples
             then lie on a straight line (two unknowns a segment); None: each sample has its own.
+        kernel: Robust kernel of points, lines and depths; None = `Cauchy(1.5)`, the best of
+            `benchmarks/robustness.py`. Its width is in standard deviations, of residuals times the root of their
+            weight: 1.5 pixels for a match of weight 1.
 
     Example:
         >>> import numpy as np, vggtgeo as vg
@@ -79,6 +83,7 @@ class Observations:
     alpha: float = 1.0
     pixel_sigma: np.ndarray | float | None = None
     segment: np.ndarray | None = None
+    kernel: AbstractKernel | None = None
 
     def __repr__(self) -> str:
         rows = {"landmark": self.host, "edge": self.edges, "point": self.point_edge, "line sample": self.line_edge}

@@ -18,15 +18,13 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
+from vggtgeo.bundle.intrinsics import CheckedIntrinsics, Intrinsics, checked_intrinsics
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.packing_checks import (
     as_poses,
-    check_camera,
     check_dtype,
     check_fixed,
-    check_intrinsics,
-    check_intrinsics_prior,
     check_kernel,
     check_observations,
     check_positive,
@@ -53,7 +51,6 @@ from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
 from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
-from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, with_shared_focal
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
@@ -62,41 +59,25 @@ from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 def pack(
     observations: Observations,
     poses: np.ndarray,
-    intrinsics: np.ndarray,
+    intrinsics: np.ndarray | Intrinsics,
     inverse_depth: np.ndarray,
     *,
     size: PaddedSize | None = None,
-    intrinsics_mean: np.ndarray | None = None,
-    intrinsics_sigma: np.ndarray | float | None = None,
     fixed_pose: np.ndarray | None = None,
-    fixed_intrinsics: np.ndarray | bool = False,
-    camera: type[AbstractCamera] = Pinhole,
-    shared_focal: bool = False,
-    camera_of: np.ndarray | None = None,
-    kernel: AbstractKernel | None = None,
     terms: Sequence[GivenTerm] = (),
     dtype: DTypeLike | None = None,
 ) -> tuple[Problem, State, SlotIndex]:
     """Pack flat observations and an initial guess into arrays.
 
     Args:
-        observations: the measurements.
+        observations: the measurements, and the robust kernel of points, lines and depths.
         poses: `[n, 7]` world -> camera, `(qw, qx, qy, qz, tx, ty, tz)`.
-        intrinsics: parameters of the camera, `fx, fy, cx, cy` in pixels; for other models in the order of their
-            `names`; for several cameras `[g, k]`.
-        intrinsics_mean: mean of the intrinsics' prior, same shape; None = `intrinsics`.
+        intrinsics: `fx, fy, cx, cy` in pixels, of one pinhole camera that is estimated; or `vggtgeo.cameras.Intrinsics`
+            for another model, a prior, fixed parameters, or several cameras.
         inverse_depth: `[D]`, 1/m, positive.
         size: padded shape; None: the cheapest that fits. A keyframe that hosts far more landmarks than others then has
             several rows, see `Problem.host`.
-        intrinsics_sigma: standard deviation of the intrinsics' prior in pixels; None = no prior.
         fixed_pose: bool `[n]`; None: only the first pose is fixed.
-        fixed_intrinsics: which intrinsics are fixed: one bool, one for each parameter of a camera, or their full shape.
-        camera: camera model: `Pinhole`, `RadialTangential`, `KannalaBrandt`, or your own class.
-        shared_focal: one focal length, `fx = fy = f`: `intrinsics` are then `f, cx, cy`, and the distortion's.
-        camera_of: int `[n]`: camera of each keyframe, a row of `intrinsics`; None: one camera for all.
-        kernel: robust kernel of points, lines and depths; None = `Cauchy(1.5)`, the best of `benchmarks/robustness.py`.
-            Its width is in standard deviations, of residuals times the root of their weight: 1.5 px for a match of
-            weight 1, 1.5 sigma for weight `1 / sigma^2`.
         terms: further terms: on poses, pairs or the camera, the prior of a marginalisation, and terms on landmarks as
             `FlatTerm`. Each is padded by its kind.
         dtype: float type of all arrays; None = JAX's default, which is double if `jax_enable_x64` is set.
@@ -122,32 +103,27 @@ def pack(
     check_kind("observations", observations, Observations, "`vggtgeo.Observations`")
     check_kind("size", size, PaddedSize | None, "a `vggtgeo.PaddedSize`")
     observations, poses = as_arrays(observations), as_poses(poses)
-    intrinsics, inverse_depth = real_numbers("intrinsics", intrinsics), real_numbers("inverse_depth", inverse_depth)
-    mean = intrinsics if intrinsics_mean is None else real_numbers("intrinsics_mean", intrinsics_mean)
-    camera_of = None if camera_of is None else real_numbers("camera_of", camera_of)
-    check_kernel("kernel", kernel)
+    inverse_depth = real_numbers("inverse_depth", inverse_depth)
+    check_kernel("kernel", observations.kernel)
     check_observations(observations, poses)
     check_positive("inverse_depth", inverse_depth, len(observations.host))
-    check_camera(camera)
-    camera = with_shared_focal(camera) if shared_focal else camera
-    check_intrinsics(camera, intrinsics, camera_of, len(poses))
+    cameras = checked_intrinsics(intrinsics, len(poses))
     terms = check_terms(terms, observations, len(poses))
-    focal = np.atleast_2d(intrinsics)[np.zeros(len(poses), int) if camera_of is None else camera_of, 0]
-    check_resolution(observations, poses, focal, inverse_depth, dtype)
+    check_resolution(observations, poses, cameras.focal(len(poses)), inverse_depth, dtype)
     size, graph, host, index = _layout(observations, len(poses), size)
-    padding = size.keyframes - len(poses)
+    padding, camera_of = size.keyframes - len(poses), cameras.camera_of
     fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
-    prior = _intrinsics_prior(mean, intrinsics_sigma, intrinsics.shape, dtype)
-    seen = _seen(observations, index, size, kernel or Cauchy(jnp.asarray(1.5, dtype)), dtype)
+    kernel = observations.kernel or Cauchy(jnp.asarray(1.5, dtype))
+    seen = _seen(observations, index, size, kernel, dtype)
     problem = Problem(
         pixels=_per_slot(index, observations.pixel, 0.0, dtype),
         edges=graph,
-        terms=(*seen, prior, *(padded(term, index, size, dtype) for term in terms)),
+        terms=(*seen, _intrinsics_prior(cameras, dtype), *(padded(term, index, size, dtype) for term in terms)),
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
-        fixed_intrinsics=jnp.asarray(check_fixed("fixed_intrinsics", fixed_intrinsics, intrinsics.shape)),
+        fixed_intrinsics=jnp.asarray(cameras.fixed),
         camera_of=None if camera_of is None else jnp.asarray(np.pad(camera_of, (0, padding)), jnp.int32),
         host=host,
-        camera=camera,
+        camera=cameras.model,
     )
     problem = _of_type(problem, dtype)
     check_observed(problem)
@@ -160,7 +136,7 @@ def pack(
     # Padding keyframes are fixed and unobserved, but a quaternion of length zero would be NaN when normalised.
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
     start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
-    return problem, State(start, jnp.asarray(intrinsics, dtype), depths, offset), index
+    return problem, State(start, jnp.asarray(cameras.values, dtype), depths, offset), index
 
 
 def _of_type(problem: Problem, dtype: DTypeLike) -> Problem:
@@ -170,7 +146,7 @@ def _of_type(problem: Problem, dtype: DTypeLike) -> Problem:
 
 def as_arrays(observations: Observations) -> Observations:
     """Return the same observations with lists converted to arrays."""
-    names = [field.name for field in fields(observations) if field.name != "alpha"]
+    names = [field.name for field in fields(observations) if field.name not in ("alpha", "kernel")]
     given = {name: getattr(observations, name) for name in names}
     arrays: dict[str, Any] = {name: real_numbers(name, v) for name, v in given.items() if v is not None}
     return replace(observations, **arrays)
@@ -222,9 +198,9 @@ def _seen(
     return (*terms, placed(pixels, index, (0, size.points), dtype))
 
 
-def _intrinsics_prior(mean: np.ndarray, sigma: Any, shape: tuple[int, ...], dtype: DTypeLike) -> IntrinsicsPrior:
-    check_intrinsics_prior(mean, sigma, shape)
-    known = 0.0 if sigma is None else weight_of("intrinsics_sigma", sigma, dtype)
+def _intrinsics_prior(cameras: CheckedIntrinsics, dtype: DTypeLike) -> IntrinsicsPrior:
+    mean, sigma = cameras.prior_mean, cameras.prior_sigma
+    known = 0.0 if sigma is None else weight_of("prior_sigma", sigma, dtype)
     weight = np.broadcast_to(known, mean.shape)
     return IntrinsicsPrior(
         index=jnp.arange(mean.size), mean=jnp.asarray(mean.ravel(), dtype), weight=jnp.asarray(weight.ravel(), dtype)

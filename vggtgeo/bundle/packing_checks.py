@@ -12,7 +12,6 @@ import numpy as np
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.terms.term import check_width
-from vggtgeo.geometry.camera_models import AbstractCamera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_real, real_numbers
 
@@ -188,47 +187,6 @@ def _check_shapes(observations: Observations, poses: np.ndarray) -> None:
     for name, shape in {**expected, "poses": (len(poses), 7)}.items():
         if np.shape(given[name]) != shape:
             raise InputError(f"`{name}` must have shape {shape}, got {np.shape(given[name])}")
-
-
-def check_camera(camera: Any) -> None:
-    """Check that `camera` is a camera class."""
-    if not (isinstance(camera, type) and issubclass(camera, AbstractCamera)):
-        raise InputError(
-            f"`camera` must be a camera class, such as `vggtgeo.cameras.RadialTangential`, got {camera!r:.60}"
-        )
-
-
-def check_intrinsics(
-    camera: type[AbstractCamera], intrinsics: np.ndarray, camera_of: np.ndarray | None, keyframes: int
-) -> None:
-    """Check the number of parameters, positive focal lengths, and the camera of each keyframe."""
-    names, cameras = ", ".join(camera.names), "" if camera_of is None else "g, "
-    if intrinsics.ndim != 1 + (camera_of is not None) or intrinsics.shape[-1] != len(camera.names):
-        raise InputError(
-            f"`intrinsics` must have shape ({cameras}{len(camera.names)}), got {intrinsics.shape}: {names} of a "
-            f"{camera.__name__}{', a row a camera' if cameras else ''}"
-        )
-    focal = [name in ("f", "fx", "fy") for name in camera.names]
-    if not np.all(np.isfinite(intrinsics)) or np.any(intrinsics[..., focal] <= 0):
-        raise InputError(f"`intrinsics` must be finite with positive focal lengths, got {intrinsics}")
-    if camera_of is not None:
-        if camera_of.shape != (keyframes,) or not np.issubdtype(camera_of.dtype, np.integer):
-            raise InputError(f"`camera_of` must be {keyframes} whole numbers, one a keyframe, got {camera_of!r:.60}")
-        if camera_of.size and (camera_of.min() < 0 or camera_of.max() >= len(intrinsics)):
-            raise InputError(
-                f"`camera_of` must be from 0 to {len(intrinsics) - 1}, the rows of `intrinsics`, got {camera_of.min()} "
-                f"to {camera_of.max()}"
-            )
-
-
-def check_intrinsics_prior(mean: np.ndarray, sigma: Any, shape: tuple[int, ...]) -> None:
-    """Check that there is a mean for each parameter, and one standard deviation for all or for each."""
-    if mean.shape != shape or not np.all(np.isfinite(mean)):
-        raise InputError(f"`intrinsics_mean` must be {' x '.join(map(str, shape))} finite numbers, got {mean}")
-    if sigma is None:
-        return
-    if not np.all(real_numbers("intrinsics_sigma", sigma) > 0):
-        raise InputError(f"`intrinsics_sigma` must be positive, or None for no prior, got {sigma}")
 
 
 def _check_poses(poses: np.ndarray) -> None:

@@ -17,6 +17,7 @@ from jax.dtypes import canonicalize_dtype
 from jax.typing import DTypeLike
 
 from vggtgeo.bundle import terms as term_package
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.observed import check_connected
 from vggtgeo.bundle.packing import pack
@@ -109,10 +110,11 @@ def load_problem(
         alpha=float(arrays["alpha"]),
         segment=arrays["var_segment"].astype(int) if "var_segment" in arrays else None,
     )
-    start = arrays["T_init"], arrays["k_init"], arrays["d_init"]
+    intrinsics = Intrinsics(arrays["k_init"], prior_sigma=arrays["k_prior_sigma"])
     try:
         kernel = Huber(jnp.asarray(float(arrays["huber"]), dtype))
-        packed = pack(observations, *start, intrinsics_sigma=arrays["k_prior_sigma"], kernel=kernel, dtype=dtype)
+        seen = dataclasses.replace(observations, kernel=kernel)
+        packed = pack(seen, arrays["T_init"], intrinsics, arrays["d_init"], dtype=dtype)
         check_connected(observations, len(arrays["T_init"]))
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error

@@ -58,10 +58,11 @@ def slide(
         >>> import jax, vggtgeo as vg
         >>> long = vg.simulate_window(keyframes=4, points=8, lines=0)
         >>> parts = [long.observations.within([k, k + 1, k + 2]) for k in (0, 1)]
-        >>> windows = [(seen, long.start[k : k + 3], long.intrinsics, seen.depth_mean) for k, seen in enumerate(parts)]
+        >>> known = vg.cameras.Intrinsics(long.intrinsics, fixed=True)
+        >>> windows = [(seen, long.start[k : k + 3], known, seen.depth_mean) for k, seen in enumerate(parts)]
         >>> (first, second), (start, guess) = (
         ...     [jax.tree.map(lambda leaf: leaf[k], tree) for k in (0, 1)]
-        ...     for tree in vg.batches.pack_batch(windows, terms=[vg.empty_prior(3)], fixed_intrinsics=True)[:2]
+        ...     for tree in vg.batches.pack_batch(windows, terms=[vg.empty_prior(3)])[:2]
         ... )
         >>> problem, initial = vg.slide(first, vg.solve(first, start).state, second, guess)
         >>> bool(vg.solve(problem, initial).converged), problem.fixed_pose.tolist()

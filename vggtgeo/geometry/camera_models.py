@@ -209,7 +209,7 @@ def with_shared_focal(model: type[AbstractCamera]) -> type[SharedFocal]:
     """
     if not has_two_focal_lengths(model):
         raise InputError(
-            f"`shared_focal` needs a `camera` whose first parameters are fx and fy, got `{model.__name__}` with "
+            f"`shared_focal` needs a `model` whose first parameters are fx and fy, got `{model.__name__}` with "
             f"{', '.join(model.names)}"
         )
     # The module of `model`: a program is kept on disk by the names of its classes, if those are the package's.

@@ -10,29 +10,29 @@ from collections.abc import Sequence
 
 import numpy as np
 
-Intrinsics = Sequence[float] | np.ndarray
+IntrinsicsLike = Sequence[float] | np.ndarray
 
 
-def matrix(intrinsics: Intrinsics) -> np.ndarray:
+def matrix(intrinsics: IntrinsicsLike) -> np.ndarray:
     """Return the calibration matrix K, float64 [3, 3]."""
     fx, fy, cx, cy = (float(value) for value in intrinsics)
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def rays(pixels: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
+def rays(pixels: np.ndarray, intrinsics: IntrinsicsLike) -> np.ndarray:
     """Return the viewing rays with z = 1, float [..., 3], of pixels [..., 2]."""
     focal, centre = _split(intrinsics, pixels.dtype)
     flat = (pixels - centre) / focal
     return np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
 
 
-def grid_rays(shape: tuple[int, int], intrinsics: Intrinsics, dtype: type[np.floating] = np.float64) -> np.ndarray:
+def grid_rays(shape: tuple[int, int], intrinsics: IntrinsicsLike, dtype: type[np.floating] = np.float64) -> np.ndarray:
     """Return the viewing rays with z = 1 of all pixels of an image of `shape` (height, width), [h, w, 3]."""
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     return rays(np.stack([columns, rows], axis=-1).astype(dtype), intrinsics)
 
 
-def project(points: np.ndarray, intrinsics: Intrinsics, nearest: float = 1e-3) -> np.ndarray:
+def project(points: np.ndarray, intrinsics: IntrinsicsLike, nearest: float = 1e-3) -> np.ndarray:
     """Return the pixels [..., 2] of points [..., 3] in the camera's frame, NaN where z <= `nearest` (metres)."""
     focal, centre = _split(intrinsics, points.dtype)
     z = np.where(points[..., 2] > nearest, points[..., 2], np.nan)
@@ -43,7 +43,7 @@ def project(points: np.ndarray, intrinsics: Intrinsics, nearest: float = 1e-3) -
 
 
 def epipolar_distance(
-    pixels_i: np.ndarray, pixels_j: np.ndarray, motion: np.ndarray, intrinsics: Intrinsics
+    pixels_i: np.ndarray, pixels_j: np.ndarray, motion: np.ndarray, intrinsics: IntrinsicsLike
 ) -> np.ndarray:
     """Return the distances of `pixels_j` [n, 2] from the epipolar lines of `pixels_i`, float64 [n], pixels.
 
@@ -59,7 +59,7 @@ def epipolar_distance(
 
 
 def visible(
-    points: np.ndarray, intrinsics: Intrinsics, shape: tuple[int, int], nearest: float = 0.1
+    points: np.ndarray, intrinsics: IntrinsicsLike, shape: tuple[int, int], nearest: float = 0.1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which points [n, 3] in the camera's frame are inside an image of `shape` (height, width), bool [n].
 
@@ -71,14 +71,14 @@ def visible(
     return inside, y[inside].astype(int), x[inside].astype(int)
 
 
-def coarser(intrinsics: Intrinsics, factor: int) -> np.ndarray:
+def coarser(intrinsics: IntrinsicsLike, factor: int) -> np.ndarray:
     """Return the intrinsics, float64 [4], of an image whose pixels are blocks of `factor` x `factor` pixels."""
     fx, fy, cx, cy = (float(value) for value in intrinsics)
     middle = 0.5 * (factor - 1)  # the centre of the first block, in pixels of the fine image
     return np.array([fx, fy, cx - middle, cy - middle]) / factor
 
 
-def projection_rows(points: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+def projection_rows(points: np.ndarray, intrinsics: IntrinsicsLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of the pixel's x and y by the left tangent of the pose, [6, n] each, translation first.
 
     points: [n, 3] in the camera's frame, in front of it.
@@ -91,7 +91,7 @@ def projection_rows(points: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndar
     return row_x, row_y
 
 
-def _split(intrinsics: Intrinsics, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+def _split(intrinsics: IntrinsicsLike, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
     """Return focal lengths and principal point, [2] each, in `dtype` (float64 for integer pixels)."""
     values = np.asarray(intrinsics, dtype if np.issubdtype(dtype, np.floating) else np.float64)
     return values[:2], values[2:]

@@ -16,6 +16,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize
 from vggtgeo.bundle.problem import Problem, State
@@ -77,8 +78,8 @@ def stack(windows: Sequence[TrackedWindow], terms: Sequence[Sequence[GivenTerm]]
 def _packed(window: TrackedWindow, size: PaddedSize, terms: Sequence[GivenTerm]) -> Batch:
     seen = window.observations
     assert seen.depth_mean is not None
-    guess = (window.start, window.intrinsics, seen.depth_mean)
-    problem, initial, index = pack(seen, *guess, size=size, fixed_intrinsics=True, terms=terms)
+    guess = (window.start, Intrinsics(window.intrinsics, fixed=True), seen.depth_mean)
+    problem, initial, index = pack(seen, *guess, size=size, terms=terms)
 
     def per_match(values: np.ndarray) -> Array:
         array = np.zeros((*problem.points.weight.shape, *values.shape[1:]), values.dtype)

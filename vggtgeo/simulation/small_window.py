@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
@@ -22,6 +23,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_real, check_whole
+from vggtgeo.solvers.kernels import AbstractKernel
 
 SIZE = (320, 240)
 """Width and height of the images that are not there, pixels."""
@@ -75,17 +77,21 @@ class SimulatedWindow:
         """True camera centres in the world, metres."""
         return centres_of(self.poses)
 
-    def pack(self, **options: Any) -> tuple[Problem, State, SlotIndex]:
-        """Return the problem, the guess (depths at their prior), and where each landmark went; `options` are those of
-        `vggtgeo.pack`. The intrinsics are held unless an option says otherwise.
+    def pack(
+        self, *, intrinsics: Intrinsics | None = None, kernel: AbstractKernel | None = None, **options: Any
+    ) -> tuple[Problem, State, SlotIndex]:
+        """Return the problem, the guess (depths at their prior), and where each landmark went.
+
+        intrinsics: by default the true ones, fixed. kernel: replaces that of the observations. options: those of
+        `vggtgeo.pack`.
         """
         assert self.observations.depth_mean is not None
-        options = {"fixed_intrinsics": True, **options}
-        return pack(self.observations, self.start, self.intrinsics, self.observations.depth_mean, **options)
+        observations = replace(self.observations, kernel=kernel or self.observations.kernel)
+        given = intrinsics or Intrinsics(self.intrinsics, fixed=True)
+        return pack(observations, self.start, given, self.observations.depth_mean, **options)
 
     def truth(self, **options: Any) -> State:
-        """Return the true state, as the problem of `pack(**options)` stores it."""
-        options = {"fixed_intrinsics": True, **options}
+        """Return the true state, as the problem of `pack(**options)` stores it; options: those of `vggtgeo.pack`."""
         _, state, index = pack(self.observations, self.poses, self.intrinsics, self.inverse_depth, **options)
         if state.pixel_offset is None:
             return state

@@ -45,7 +45,7 @@ from vggtgeo.bundle.problem import Problem, State
 KINDS = ("points", "lines", "depth", "intrinsics_prior")
 Observe = Callable[[Problem, State], Observability]
 LOST = [f"keyframe 2: {motion}" for motion in MOTIONS]
-NO_PRIOR = {"intrinsics_sigma": None}
+NO_PRIOR = {"prior_sigma": None}
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def observed() -> Observe:
         (WELL, NO_PRIOR, []),
         (without(WELL, "depth"), {}, ["scale"]),
         (one_plane(), {}, ["scale"]),
-        (parallel_lines(), {"fixed_intrinsics": HELD}, ["translation along x", "keyframe 1: translation along x"]),
+        (parallel_lines(), {"fixed": HELD}, ["translation along x", "keyframe 1: translation along x"]),
         (without_matches_of(2), {}, LOST),
     ],
     ids=["all factors", "no prior", "no depth", "one plane", "parallel lines", "unmatched keyframe"],
@@ -96,7 +96,7 @@ def forward_motion(turn: float) -> Scene:
     return without(scene_of(poses, *random_points(), random_segments()), "line", "depth")
 
 
-CENTRE_HELD = {"fixed_intrinsics": np.array([False, False, True, True])}
+CENTRE_HELD = {"fixed": np.array([False, False, True, True])}
 
 
 def test_forward_motion_with_a_free_camera_by_name(observed: Observe) -> None:

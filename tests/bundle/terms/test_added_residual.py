@@ -90,7 +90,8 @@ def test_one_file_is_all(added: ModuleType, tmp_path: Path) -> None:
     read = vg.load_problem(path)[0]  # a class of the package needs not be given
     assert bool(eqx.tree_equal(read, problem))
 
-    window = (SCENE.observations, SCENE.start_poses, SCENE.start_intrinsics, SCENE.start_inverse_depth)
-    problems, states, _ = vg.batches.pack_batch([(*window, [heights]), window], intrinsics_sigma=5.0)
+    intrinsics = vg.cameras.Intrinsics(SCENE.start_intrinsics, prior_sigma=5.0)
+    window = (SCENE.observations, SCENE.start_poses, intrinsics, SCENE.start_inverse_depth)
+    problems, states, _ = vg.batches.pack_batch([(*window, [heights]), window])
     values = jax.vmap(vg.analysis.energy_terms)(problems, states)["heights"]
     np.testing.assert_allclose(values, [float(energy["heights"]), 0.0], rtol=1e-9)

@@ -126,7 +126,7 @@ def test_columns_with_any_camera_are_what_is_derived(
     parameters = np.array([*SCENE.start_intrinsics, *lens])[int(shared_focal) :]
     cameras = parameters if groups is None else np.stack([parameters, 1.05 * parameters])
     scene = replace(SCENE, start_intrinsics=cameras).with_observations(pixel_sigma=0.5)
-    problem, state, _ = scene.pack(kernel=Cauchy(1.5), camera=camera, shared_focal=shared_focal, camera_of=groups)
+    problem, state, _ = scene.pack(kernel=Cauchy(1.5), model=camera, shared_focal=shared_focal, camera_of=groups)
     state = eqx.tree_at(lambda s: s.pixel_offset, state, state.pixel_offset + 0.3)
 
     @jax.jit
@@ -326,7 +326,7 @@ def test_a_quadratic_becomes_a_measured_pose() -> None:
 def test_a_written_residual_is_solved() -> None:
     # Proves that a term that a user writes brings the map right: places seen in keyframes whose poses start 1 cm and
     # 0.3 degrees off. Oracle: the true poses, from which the places were projected.
-    problem, initial, _ = SCENE.pack(fixed_intrinsics=True)
+    problem, initial, _ = SCENE.pack(fixed=True)
     truth = SCENE.poses
     rng = np.random.default_rng(0)
     rotation, shift = Rotation.from_quat(truth[:, :4], scalar_first=True), truth[:, 4:]

@@ -53,10 +53,8 @@ def found_in(window: vg.data.SimulatedWindow, focal: float) -> FoundLens:
     packed = vg.pack(
         window.observations,
         window.start,
-        guess,
+        vg.cameras.Intrinsics(guess, shared_focal=True, prior_sigma=np.full(3, 0.3 * guess[0])),
         1.0 / window.observations.depth_mean,
-        intrinsics_sigma=np.full(3, 0.3 * guess[0]),
-        shared_focal=True,
     )
     problem = packed[0]
     size = (round(2 * cy + 1), round(2 * cx + 1))
@@ -95,8 +93,9 @@ def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
     # Proves that a focal length below zero, or NaN, as a solver may end with, does not end the run. Oracle: the rule.
     window = vg.simulate_window(3, 12, 0)
     _, _, cx, cy = window.intrinsics
-    guess = window.observations, window.start, np.array([window.intrinsics[0], cx, cy])
-    problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, shared_focal=True)
+    square = vg.cameras.Intrinsics(np.array([window.intrinsics[0], cx, cy]), shared_focal=True)
+    guess = window.observations, window.start, square
+    problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean)
     for focal in (-1.0, float("nan")):
         ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[0].set(f))
         assert find_lens(problem, state, (480, 640), ends_at) is None
@@ -108,8 +107,9 @@ def test_few_keyframes_tell_no_lens() -> None:
     for keyframes in (5, 7):
         window = vg.simulate_window(keyframes, 12, 0)
         _, _, cx, cy = window.intrinsics
-        guess = window.observations, window.start, np.array([window.intrinsics[0], cx, cy])
-        problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean, shared_focal=True)
+        square = vg.cameras.Intrinsics(np.array([window.intrinsics[0], cx, cy]), shared_focal=True)
+        guess = window.observations, window.start, square
+        problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean)
         packed.append(find_lens(problem, state, (480, 640), lambda _, state: state))
     few, enough = packed
     assert few is not None

@@ -71,10 +71,8 @@ def as_square(window: vg.data.SimulatedWindow, squeeze: float) -> tuple[Problem,
     packed = vg.pack(
         window.observations,
         window.start,
-        guess,
+        vg.cameras.Intrinsics(guess, shared_focal=True, prior_sigma=np.full(3, 0.3 * f)),
         depths,
-        intrinsics_sigma=np.full(3, 0.3 * f),
-        shared_focal=True,
     )
     return packed[0], solve(*packed[:2])
 
@@ -115,7 +113,8 @@ def test_what_ends_in_no_camera_is_none() -> None:
     window = vg.simulate_window(3, 12, 0)
     f, _, cx, cy = window.intrinsics
     depths = 1.0 / window.observations.depth_mean
-    problem, state, _ = vg.pack(window.observations, window.start, np.array([f, cx, cy]), depths, shared_focal=True)
+    guess = vg.cameras.Intrinsics(np.array([f, cx, cy]), shared_focal=True)
+    problem, state, _ = vg.pack(window.observations, window.start, guess, depths)
     for focal in (-1.0, float("nan")):
         ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[1].set(f))
         assert find_aspect(problem, state, ends_at) is None

@@ -36,9 +36,8 @@ def pairs(window: vg.data.SimulatedWindow) -> list[CameraPair]:
 
 def trial(window: vg.data.SimulatedWindow, given: np.ndarray) -> RefinedCamera:
     """Adjusted with `given` held, then tried."""
-    problem, initial, _ = window.pack(
-        fixed_intrinsics=False, intrinsics_mean=given, intrinsics_sigma=np.full(4, HELD * given[0])
-    )
+    held = vg.cameras.Intrinsics(window.intrinsics, prior_mean=given, prior_sigma=np.full(4, HELD * given[0]))
+    problem, initial, _ = window.pack(intrinsics=held)
     start = eqx.tree_at(lambda state: state.intrinsics, initial, jnp.asarray(given))
     solve = lambda problem, state: _solve(problem, state).state
     found = refine_given_camera(pairs(window), problem, solve(problem, start), solve)

@@ -126,7 +126,7 @@ def test_surfaces_bring_keyframes_back(keyframes: list[Keyframe]) -> None:
         wrong.append(replace(each, pose=moved(each.pose, tangent)))
     pairs = [(0, 1), (1, 2), (0, 2)]
     surfaces = [Surface.of(each, INTRINSICS) for each in wrong]
-    problem, initial, _ = make_scene().pack(fixed_intrinsics=True)
+    problem, initial, _ = make_scene().pack(fixed=True)
     solve = jax.jit(vg.solve)
     for _ in range(6):
         term = align_pairs(wrong, pairs, surfaces, EFFECTIVE)

@@ -45,7 +45,7 @@ def test_an_undetermined_keyframe_leaves_the_others_known() -> None:
     """NaN for the keyframe without matches alone; None if no free keyframe is determined. Oracle: the same problem with
     that keyframe fixed.
     """
-    problem, state = packed(without_matches_of(2), at_truth=True, fixed_intrinsics=True)
+    problem, state = packed(without_matches_of(2), at_truth=True, fixed=True)
     found = keyframe_sigma(problem, state, 3)
     held = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[2].set(True))
     expected = keyframe_sigma(held, state, 3)

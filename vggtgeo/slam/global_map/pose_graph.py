@@ -20,6 +20,7 @@ import numpy as np
 from scipy.stats import chi2 as chi_square
 
 from vggtgeo.bundle.graduation import Graduation
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.problem import Problem, State
@@ -94,11 +95,10 @@ def solve_pose_graph(graph: PoseGraph) -> SolvedPoseGraph:
     problem, initial, _ = pack(
         _no_observations(),
         rigid.to_quaternion(np.concatenate([graph.poses, np.tile(np.eye(4), (padding, 1, 1))])),
-        np.array([1.0, 1.0, 0.0, 0.0]),
+        Intrinsics(np.array([1.0, 1.0, 0.0, 0.0]), fixed=True),
         np.zeros(0),
         # Padding poses are fixed: without factors they would make the system singular.
         fixed_pose=np.concatenate([graph.held, np.ones(padding, bool)]),
-        fixed_intrinsics=True,
         terms=(motions, loops),
     )
     small = count <= DENSE_POSES

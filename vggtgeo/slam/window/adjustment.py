@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize, SlotIndex
@@ -92,14 +93,15 @@ def build(
     problem, initial, index = pack(
         observations,
         rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
-        camera.parameters(intrinsics),
+        Intrinsics(
+            camera.parameters(intrinsics),
+            shared_focal=camera.shared_focal,
+            prior_mean=camera.parameters(camera.mean),
+            prior_sigma=camera.parameters(camera.sigma),
+        ),
         np.maximum(depths, MIN_INVERSE_DEPTH),
         size=size,
-        intrinsics_mean=camera.parameters(camera.mean),
-        intrinsics_sigma=camera.parameters(camera.sigma),
-        shared_focal=camera.shared_focal,
         fixed_pose=fixed_pose,
-        kernel=settings.window.kernel,
         terms=terms,
     )
     return Adjustment(
@@ -146,6 +148,7 @@ def _observed(
         depth_weight=weight if settings.depth_terms.depth_weight > 0 else np.zeros_like(weight),
         alpha=settings.depth_terms.depth_weight,
         segment=_segments(keyframes, points, lines) if settings.line.two_ends_lines else None,
+        kernel=settings.window.kernel,
     )
     informed = np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
     estimate_sigma = np.concatenate([estimate_sigma, np.full(len(lines.host), np.nan)])

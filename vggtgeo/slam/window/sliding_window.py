@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
@@ -97,13 +98,12 @@ def smallest_problem(
         point_target=np.zeros((1, 2)),
         point_weight=np.ones(1),
         segment=np.full(1, -1) if settings.line.two_ends_lines else None,
+        kernel=settings.window.kernel,
     )
     poses = rigid.to_quaternion(np.tile(np.eye(4), (2, 1, 1)))
-    intrinsics = np.array([100.0, 100.0, 50.0, 50.0])[int(shared_focal) :]
-    kernel, depth = settings.window.kernel, np.ones(1)
-    problem, initial, _ = pack(
-        one, poses, intrinsics, depth, size=size, shared_focal=shared_focal, kernel=kernel, terms=terms
-    )
+    values = np.array([100.0, 100.0, 50.0, 50.0])[int(shared_focal) :]
+    intrinsics = Intrinsics(values, shared_focal=shared_focal)
+    problem, initial, _ = pack(one, poses, intrinsics, np.ones(1), size=size, terms=terms)
     return problem, initial
 
 

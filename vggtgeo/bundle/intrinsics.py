@@ -1,0 +1,116 @@
+"""Initial intrinsics of a problem with their camera model and prior, as arguments of `pack`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vggtgeo.bundle.packing_checks import check_fixed
+from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, with_shared_focal
+from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import real_numbers
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Initial intrinsics of one or several cameras, their model, their prior, and which of them are fixed.
+
+    Fields:
+        values: `[k]`, parameters of the camera, `fx, fy, cx, cy` in pixels; for other models in the order of their
+            `names`; for several cameras `[g, k]`.
+        model: Camera model: `Pinhole`, `RadialTangential`, `KannalaBrandt`, or your own class.
+        shared_focal: One focal length, `fx = fy = f`: `values` are then `f, cx, cy`, and the distortion's.
+        camera_of: int `[n]`: camera of each keyframe, a row of `values`; None: one camera for all.
+        prior_mean: Mean of the prior, shape of `values`; None = `values`.
+        prior_sigma: Standard deviation of the prior, pixels: one for all, or the shape of `values`; None = no prior.
+        fixed: Which parameters are fixed: one bool, one for each parameter of a camera, or their full shape.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> window = vg.simulate_window(keyframes=3)
+        >>> known = vg.cameras.Intrinsics(window.intrinsics, fixed=True)
+        >>> problem, _, _ = vg.pack(window.observations, window.start, known, window.observations.depth_mean)
+        >>> problem.fixed_intrinsics.tolist()
+        [True, True, True, True]
+
+    """
+
+    values: np.ndarray
+    model: type[AbstractCamera] = Pinhole
+    shared_focal: bool = False
+    camera_of: np.ndarray | None = None
+    prior_mean: np.ndarray | None = None
+    prior_sigma: np.ndarray | float | None = None
+    fixed: np.ndarray | bool = False
+
+
+@dataclass(frozen=True)
+class CheckedIntrinsics:
+    """`Intrinsics` after validation: the model with its shared focal length, all others as arrays."""
+
+    values: np.ndarray
+    model: type[AbstractCamera]
+    camera_of: np.ndarray | None
+    prior_mean: np.ndarray
+    prior_sigma: np.ndarray | None
+    fixed: np.ndarray
+
+    def focal(self, keyframes: int) -> np.ndarray:
+        """Return the first parameter of each keyframe's camera, `[n]`, pixels."""
+        camera = np.zeros(keyframes, int) if self.camera_of is None else self.camera_of
+        focal: np.ndarray = np.atleast_2d(self.values)[camera, 0]
+        return focal
+
+
+def checked_intrinsics(given: Any, keyframes: int) -> CheckedIntrinsics:
+    """Return `Intrinsics`, or parameters of one free pinhole camera, after validation.
+
+    Raises:
+        InputError: a field is invalid; names it.
+
+    """
+    own = given if isinstance(given, Intrinsics) else Intrinsics(real_numbers("intrinsics", given))
+    values = real_numbers("intrinsics", own.values)
+    model: Any = own.model
+    if not (isinstance(model, type) and issubclass(model, AbstractCamera)):
+        raise InputError(
+            f"`model` must be a camera class, such as `vggtgeo.cameras.RadialTangential`, got {model!r:.60}"
+        )
+    model = with_shared_focal(model) if own.shared_focal else model
+    camera_of = None if own.camera_of is None else real_numbers("camera_of", own.camera_of)
+    _check_values(model, values, several=camera_of is not None)
+    if camera_of is not None:
+        _check_camera_of(camera_of, keyframes, len(values))
+    mean = values if own.prior_mean is None else real_numbers("prior_mean", own.prior_mean)
+    if mean.shape != values.shape or not np.all(np.isfinite(mean)):
+        raise InputError(f"`prior_mean` must be {' x '.join(map(str, values.shape))} finite numbers, got {mean}")
+    sigma = None if own.prior_sigma is None else real_numbers("prior_sigma", own.prior_sigma)
+    if sigma is not None and not np.all(sigma > 0):
+        raise InputError(f"`prior_sigma` must be positive, or None for no prior, got {sigma}")
+    return CheckedIntrinsics(values, model, camera_of, mean, sigma, check_fixed("fixed", own.fixed, values.shape))
+
+
+def _check_values(model: type[AbstractCamera], values: np.ndarray, *, several: bool) -> None:
+    """Check the number of parameters, and that focal lengths are positive."""
+    names, cameras = ", ".join(model.names), "g, " if several else ""
+    if values.ndim != 1 + several or values.shape[-1] != len(model.names):
+        raise InputError(
+            f"`intrinsics` must have shape ({cameras}{len(model.names)}), got {values.shape}: {names} of a "
+            f"{model.__name__}{', a row a camera' if cameras else ''}"
+        )
+    focal = [name in ("f", "fx", "fy") for name in model.names]
+    if not np.all(np.isfinite(values)) or np.any(values[..., focal] <= 0):
+        raise InputError(f"`intrinsics` must be finite with positive focal lengths, got {values}")
+
+
+def _check_camera_of(camera_of: np.ndarray, keyframes: int, cameras: int) -> None:
+    """Check that each keyframe has one of the cameras."""
+    if camera_of.shape != (keyframes,) or not np.issubdtype(camera_of.dtype, np.integer):
+        raise InputError(f"`camera_of` must be {keyframes} whole numbers, one a keyframe, got {camera_of!r:.60}")
+    if camera_of.size and (camera_of.min() < 0 or camera_of.max() >= cameras):
+        raise InputError(
+            f"`camera_of` must be from 0 to {cameras - 1}, the rows of `intrinsics`, got {camera_of.min()} to "
+            f"{camera_of.max()}"
+        )
