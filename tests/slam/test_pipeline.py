@@ -172,13 +172,13 @@ def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
     """Compiled for a map of so many keyframes, the solver of the last adjustment is not compiled again; oracle: how
     many programs of it were prepared.
     """
-    settings = updated(SETTINGS, {"refinement": {"global_adjustment": True, "global_rounds": 1}})
+    settings = updated(SETTINGS, {"refinement": {"global_adjustment": True}})
     kept = lambda: solve_jit.prepared
     before = kept()
     compile_global(shape_for(len(tracked.keyframes), 0, settings), settings)
     compiled = kept()
     assert compiled == before + 1
-    finish(tracked, ROLES, settings)
+    finish(tracked, ROLES, settings, rounds=1)
     assert kept() == compiled
 
 

@@ -24,7 +24,7 @@ from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.frame_poses import frame_poses
-from vggtgeo.slam.global_map.global_adjustment import adjust_all
+from vggtgeo.slam.global_map.global_adjustment import ROUNDS, adjust_all
 from vggtgeo.slam.global_map.join_at_end import join_at_end
 from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
@@ -143,6 +143,7 @@ def finish(
     settings: SlamSettings | None = None,
     clock: Clock | None = None,
     *,
+    rounds: int = ROUNDS,
     uncertainty: bool = True,
 ) -> Slam:
     """Join what was seen twice, and adjust the whole map once more.
@@ -152,6 +153,7 @@ def finish(
         roles: those of the run, by default the default ones.
         settings: those of the run, by default the default ones.
         clock: adds up seconds by stage.
+        rounds: adjustments of the map; one is enough for its camera.
         uncertainty: whether to compute the uncertainty of the poses.
 
     Example:
@@ -161,6 +163,7 @@ def finish(
 
     """
     check_kind("slam", slam, Slam, "the state that `vggtgeo.run` yields")
+    check_whole("rounds", rounds, 1)
     slam, roles, settings = merge_pending_window(slam), roles or default_roles(slam.metric), settings or SlamSettings()
     fixed = settings.keyframes.localise_only or not settings.refinement.global_adjustment
     if fixed or len(slam.keyframes) < 3:
@@ -173,7 +176,7 @@ def finish(
         slam = with_recorded_ties(join_at_end(slam, roles), roles)
         slam = close_loops(slam, roles, settings)
     with clock.measure("global adjustment"):
-        return adjust_all(slam, settings, uncertainty=uncertainty)
+        return adjust_all(slam, settings, rounds=rounds, uncertainty=uncertainty)
 
 
 def frame_trajectory(slam: Slam, submap: int = 0) -> Trajectory:

@@ -59,8 +59,7 @@ def self_calibrate(
             return None
         progress(passes, None)
         # Later rounds do not change the camera.
-        once = replace(settings, refinement=replace(settings.refinement, global_rounds=1))
-        found = finish(last, roles, once, uncertainty=False)
+        found = finish(last, roles, settings, rounds=1, uncertainty=False)
         if not _is_plausible(found, camera):
             return None
         before = begin(camera, roles)

@@ -42,7 +42,6 @@ WRONG = {
     "window.line_slots": (0,),
     "window.kernel": (2.0, "cauchy 0", "cauchy 1 2 3", "welsch", ""),
     "refinement.global_adjustment": ("no",),
-    "refinement.global_rounds": (0,),
     "refinement.rolling_shutter": ("yes",),
     "refinement.loop_candidates": (-1, 1.5),
 }

@@ -29,6 +29,9 @@ from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
 from vggtgeo.slam.window.sliding_window import solve_jit
 
+ROUNDS = 3
+"""Adjustments of the whole map: each relinearises the dense depth between keyframes, which was aligned at the poses of
+the round before."""
 REPORTED_CHANGE = 0.01
 """Relative change of the camera above which the user is informed."""
 MAX_NAMED = 4
@@ -37,7 +40,7 @@ DISTORTION_SIGMAS, MAX_WARP = 5.0, 3.0
 """Standard deviations, and pixels in the corners of the image, above which a distortion is reported."""
 
 
-def adjust_all(slam: Slam, settings: SlamSettings, *, uncertainty: bool = True) -> Slam:
+def adjust_all(slam: Slam, settings: SlamSettings, *, rounds: int = ROUNDS, uncertainty: bool = True) -> Slam:
     """Bundle-adjust every keyframe, with surfaces if there is metric depth, in a few rounds.
 
     The first round also estimates the readout time of a rolling shutter, and corrections of the camera; later rounds
@@ -46,7 +49,7 @@ def adjust_all(slam: Slam, settings: SlamSettings, *, uncertainty: bool = True) 
     if len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA or not slam.map.pairs:
         return slam
     shared, solved = _SharedByRounds.of(slam, settings), None
-    for number in range(settings.refinement.global_rounds):
+    for number in range(rounds):
         is_first = number == 0
         adjustment, notes = shared.adjustment(slam, settings, finds_camera=is_first and not slam.camera.calibrated)
         slam = replace(slam, notes=(*slam.notes, *notes)) if is_first else slam
@@ -56,7 +59,7 @@ def adjust_all(slam: Slam, settings: SlamSettings, *, uncertainty: bool = True) 
         slam, solved = _apply_solution(slam, adjustment, solution.state), (adjustment.problem, solution.state)
         if is_first:
             slam, adjustment, state = _try_rolling_shutter(slam, adjustment, solution.state, settings)
-            slam, shared = shared.try_camera(slam, adjustment, state, settings)
+            slam, shared = shared.try_camera(slam, adjustment, state, settings, last=rounds == 1)
             solved = adjustment.problem, state
     if not uncertainty:
         return slam
@@ -126,16 +129,16 @@ class _SharedByRounds:
         return _without_readout(slam, replace(adjustment, problem=problem)), notes
 
     def try_camera(
-        self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
+        self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings, *, last: bool
     ) -> tuple[Slam, _SharedByRounds]:
         """Return the state after trying to refine its camera, and the data for the following rounds.
 
-        A guessed camera is fixed after its estimation (see `_factors_without_intrinsics`).
+        A guessed camera is fixed after its estimation (see `_factors_without_intrinsics`). last: no round follows.
         """
         before = slam.intrinsics
         if settings.camera.refine_intrinsics != "never":
             slam = _try_camera(slam, adjustment, state, self.edges, settings)
-        if settings.refinement.global_rounds == 1 or (slam.camera.calibrated and slam.intrinsics is before):
+        if last or (slam.camera.calibrated and slam.intrinsics is before):
             return slam, self
         camera = replace(self.camera, mean=slam.intrinsics)
         if not slam.camera.calibrated:

@@ -191,7 +191,6 @@ class GlobalMapSettings(CheckedSettings):
 
     Fields:
         global_adjustment: Adjust all keyframes together; without it, the sliding window alone.
-        global_rounds: Adjustments, each after relinearising the dense depth between keyframes.
         rolling_shutter: Estimate the readout time of a rolling shutter, and correct the map for it.
         loop_candidates: Pairs that each keyframe proposes for loop closure, at most; 0 disables it.
 
@@ -204,6 +203,5 @@ class GlobalMapSettings(CheckedSettings):
 
     group: ClassVar[str] = "refinement"
     global_adjustment: bool = switch(True)
-    global_rounds: int = whole(3, at_least=1)
     rolling_shutter: bool = switch(True)
     loop_candidates: int = whole(3, at_least=0)
