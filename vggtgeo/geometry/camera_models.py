@@ -24,6 +24,10 @@ MIN_RELATIVE_DEPTH = 1e-2
 behind it, is projected as if at this bound, far outside the image, where a robust kernel treats it as an outlier; the
 projection never divides by zero."""
 
+MAX_RADIUS = 2.0
+"""Radius up to which `RadialTangential` evaluates its polynomial, in focal lengths, a field of view of 127 degrees.
+Rays beyond it get the shift of this radius. They are outliers, whose powers of the radius would alone determine the
+coefficients."""
 _NEWTON_STEPS = 8
 """Newton steps to invert a distortion: convergence is quadratic, so that all digits are reached long before."""
 
@@ -105,10 +109,11 @@ class RadialTangential(AbstractCamera):
 
     def _distort(self, flat: Float[Array, "2"]) -> Float[Array, "2"]:
         k1, k2, p1, p2 = self.parameters[4:]
-        x, y = flat
+        radius = _norm(flat)
+        x, y = flat * jnp.where(radius > MAX_RADIUS, MAX_RADIUS / jnp.maximum(radius, MAX_RADIUS), 1.0)
         r2 = x * x + y * y
-        radial = 1 + k1 * r2 + k2 * r2 * r2
-        return jnp.stack(
+        radial = k1 * r2 + k2 * r2 * r2
+        return flat + jnp.stack(
             [
                 x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
                 y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
