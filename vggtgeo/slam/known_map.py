@@ -20,7 +20,6 @@ from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
-from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
@@ -52,7 +51,7 @@ def as_map(slam: Slam) -> Slam:
     )
     known = replace(slam.map, keyframes=keyframes, axes=())
     estimate = slam.camera
-    camera = CameraEstimate(estimate.intrinsics, estimate.given, estimate.sigma, lens=estimate.lens)
+    camera = replace(estimate, self_calibrated=False, readout=None)
     return Slam(known, camera)
 
 

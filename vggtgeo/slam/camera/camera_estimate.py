@@ -45,6 +45,7 @@ class CameraEstimate:
         self_calibrated: The camera was not given; `given` and `lens` come from calibration frames
             (`self_calibration.py`), or from the run that made the known map. Windows hold them, and the last adjustment
             estimates the camera again.
+        given_lens: The calibration has distortion coefficients; the images were undistorted when they were read.
         lens: The distorting camera of the images as they were read, where the last adjustment found one. Pixels and
             images of all keyframes, and `intrinsics`, are then of undistorted images (`lens.py`).
         readout: Of the rolling shutter that the last adjustment found and removed from the poses
@@ -56,6 +57,7 @@ class CameraEstimate:
     given: np.ndarray
     sigma: np.ndarray
     self_calibrated: bool = False
+    given_lens: bool = False
     lens: Camera | None = None
     readout: Readout | None = None
 
@@ -69,7 +71,7 @@ class CameraEstimate:
             focal = GUESSED_FOCAL_SIGMA * intrinsics[0]
             centre = GUESSED_CENTRE_SIGMA * np.array([camera.width, camera.height])
             sigma = np.array([focal, focal, *centre])
-        return cls(intrinsics, given=intrinsics, sigma=sigma)
+        return cls(intrinsics, given=intrinsics, sigma=sigma, given_lens=camera.distorts)
 
     @property
     def calibrated(self) -> bool:

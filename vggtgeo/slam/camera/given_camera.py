@@ -1,4 +1,4 @@
-"""Refinement of given intrinsics in the last adjustment, only if held-out matches confirm it.
+"""Refinement of given intrinsics in the last adjustment, only if the matches confirm it.
 
 Given intrinsics are fixed: free ones would absorb errors of the poses. But a calibration may be off by a percent, which
 a whole map shows. So, once, in the last adjustment:
@@ -13,8 +13,9 @@ a whole map shows. So, once, in the last adjustment:
 
 Aligned surfaces are left out of the trial: they were measured with the given camera and would favour it.
 
-Without measured depth the depths come from the given camera, and the pairs confirm it, whatever it is. The camera then
-stays, and the verdict tests it.
+Without measured depth the depths come from the given camera, and the pairs confirm it, whatever it is. There the
+intrinsics are estimated with the map (`estimate_with_map`), and its lens after that (`lens.py`): a focal length that is
+1 % off makes the scale of a map without depth drift (`docs/results/clips.md`).
 """
 
 from __future__ import annotations
@@ -109,6 +110,26 @@ def refine_given_camera(pairs: list[CameraPair], problem: Problem, state: State,
     # Weights of the whole problem: in training the held-out matches have weight zero.
     found, needed = gain((problem, held), (problem, moved), held_out)
     return RefinedCamera(given, wanted, distortion, moved, found, needed)
+
+
+def estimate_with_map(problem: Problem, state: State, solve: Solve) -> tuple[Problem, RefinedCamera]:
+    """Estimate the intrinsics with the map, with the prior of a calibration; return that problem and its result.
+
+    problem, state: an adjustment with fixed intrinsics, its camera a `Pinhole`. solve: adjusts any problem.
+    """
+    given = np.asarray(state.intrinsics, np.float64)
+    weight = jnp.asarray(calibration_sigma(given) ** -2)
+    free = problem.with_term(eqx.tree_at(lambda term: term.weight, problem.intrinsics_prior, weight))
+    moved = solve(free, state)
+    # No matches are held out: four parameters do not overfit thousands of matches.
+    better = gain((problem, state), (free, moved), np.asarray(problem.points.present()), fitted=len(given))
+    wanted = np.asarray(moved.intrinsics, np.float64)
+    return free, RefinedCamera(given, wanted, (0.0, float("inf")), moved, *better)
+
+
+def calibration_sigma(given: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of given intrinsics, float64 [4], pixels."""
+    return float(given[0]) * np.array([FOCAL_SIGMA, FOCAL_SIGMA, CENTRE, CENTRE])
 
 
 def camera_held_at(problem: Problem, intrinsics: np.ndarray) -> Problem:

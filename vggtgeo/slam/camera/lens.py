@@ -1,10 +1,11 @@
-"""Lens distortion of an uncalibrated camera: estimated once in the last adjustment, then removed from the map.
+"""Lens distortion that no calibration tells: estimated once in the last adjustment, then removed from the map.
 
 A guessed camera is a pinhole until a whole map is adjusted: that of the calibration frames (`self_calibration.py`), or
-of the run. If the lens distorts, the focal length absorbs the distortion and is wrong. So the map is adjusted once more
-with two radial coefficients free (`benchmarks/no_calibration.py`). If that explains the matches significantly better
-and moves pixels by more than `MIN_WARP`, then images, key points and segments of the keyframes are undistorted, and all
-later steps use the ideal pinhole.
+of the run. So is a given one without distortion coefficients, in a map without measured depth. If the lens distorts,
+the focal length absorbs the distortion and is wrong. So the map is adjusted once more with two radial coefficients free
+(`benchmarks/no_calibration.py`). If that explains the matches significantly better and moves pixels by more than
+`MIN_WARP`, then images, key points and segments of the keyframes are undistorted, and all later steps use the ideal
+pinhole.
 
 Poses of tracked frames are relative to keyframes, so they follow.
 """
@@ -33,8 +34,8 @@ from vggtgeo.slam.sparse_map.map import Map
 
 RADIAL = 0.3
 """Prior standard deviation of k1 and k2; it covers lenses of phones and action cameras."""
-MIN_WARP = 1.0
-"""Largest displacement by the lens, pixels: below it, resampling costs more than distortion."""
+MIN_WARP = 0.5
+"""Largest displacement by the lens, pixels, for which it is removed: the noise of a match."""
 
 Solve = Callable[[Problem, State], State]
 

@@ -1,4 +1,4 @@
-"""The pixel aspect ratio of an uncalibrated camera, estimated once in the last adjustment.
+"""The pixel aspect ratio: a prior where the camera is calibrated, else estimated once in the last adjustment.
 
 Cameras have square pixels, so a guessed camera has one focal length. But images may have been resized to the input of a
 network, or squeezed from widescreen into 4:3. One focal length then does not fit, and depths and motions absorb the
@@ -14,15 +14,19 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.node import CameraTerm
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.slam.camera.camera_gain import gain
 
 MIN_STRETCH = 0.03
 """Logarithm of `f_x / f_y`. Images that are reduced to whole pixels differ by 0.005 at most, and pixels of tapes by at
 least 0.065 (720 x 576 shown as 768 x 576)."""
+ASPECT_SIGMA = 1e-3
+"""Standard deviation of the logarithm of `f_x / f_y` of a calibration."""
 
 Solve = Callable[[Problem, State], State]
 
@@ -45,6 +49,30 @@ class FoundAspect:
     def pays(self) -> bool:
         """Whether the pixels are significantly not square."""
         return self.gain > self.needed and abs(self.stretch) > MIN_STRETCH
+
+
+class AspectPrior(CameraTerm):
+    """A Gaussian prior on the shape of pixels, which a calibration knows far better than its focal length.
+
+    `r = log(fx / fy) - mean`, weight `1 / sigma^2`.
+
+    Fields:
+        mean: logarithm of fx / fy.
+
+    """
+
+    mean: Float[Array, " m"]
+
+    name = "pixel_aspect"
+
+    def residual(self, parameters: Float[Array, " q"]) -> Float[Array, ""]:
+        return jnp.log(parameters[0] / parameters[1]) - self.mean
+
+
+def aspect_prior(given: np.ndarray) -> AspectPrior:
+    """Return the prior of given intrinsics, fx and fy first."""
+    mean = np.log(given[0] / given[1])
+    return AspectPrior(weight=jnp.full(1, ASPECT_SIGMA**-2), mean=jnp.full(1, mean))
 
 
 def are_square(intrinsics: np.ndarray) -> bool:

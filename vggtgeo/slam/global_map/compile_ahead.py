@@ -10,6 +10,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.camera.pixel_aspect import aspect_prior
 from vggtgeo.slam.global_map.global_adjustment import shares_focal
 from vggtgeo.slam.global_map.global_shape import (
     EDGE_SHARES,
@@ -92,6 +93,8 @@ def compile_global(
     Both programs are compiled at once, on two cores. metric: with surfaces, of measured depth.
     """
     terms = factor_terms((), {}, shape.room, metric=metric)
+    if not (metric or shared_focal):
+        terms = (*terms, aspect_prior(np.ones(2)))
     if metric and settings.depth_terms.surface_points > 0:
         nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
         terms = (*terms, surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing))

@@ -11,14 +11,23 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
-from vggtgeo.slam.camera.given_camera import RefinedCamera, Solve, keyframe_pairs, refine_given_camera, without_surfaces
+from vggtgeo.slam.camera.given_camera import (
+    RefinedCamera,
+    Solve,
+    calibration_sigma,
+    estimate_with_map,
+    keyframe_pairs,
+    refine_given_camera,
+    without_surfaces,
+)
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair
-from vggtgeo.slam.camera.pixel_aspect import are_square, find_aspect
+from vggtgeo.slam.camera.pixel_aspect import are_square, aspect_prior, find_aspect
 from vggtgeo.slam.camera.rolling_shutter import find_readout, without_readout
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS, GlobalShape, global_solver, shape_of
+from vggtgeo.slam.global_map.guided_matches import guided_pairs
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
@@ -44,11 +53,12 @@ def adjust_all(slam: Slam, settings: SlamSettings, *, rounds: int = ROUNDS, unce
     """Bundle-adjust every keyframe, with surfaces if there is metric depth, in a few rounds.
 
     The first round also estimates the readout time of a rolling shutter, and corrections of the camera; later rounds
-    keep both. uncertainty: whether to compute that of the poses.
+    keep both. Without measured depth, each but the last is followed by a search for further matches.
+    uncertainty: whether to compute that of the poses.
     """
     if len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA or not slam.map.pairs:
         return slam
-    shared, solved = _SharedByRounds.of(slam, settings), None
+    shared, solved, described = _SharedByRounds.of(slam, settings), None, slam.map.pairs
     for number in range(rounds):
         is_first = number == 0
         adjustment, notes = shared.adjustment(slam, settings, finds_camera=is_first and not slam.camera.calibrated)
@@ -60,7 +70,11 @@ def adjust_all(slam: Slam, settings: SlamSettings, *, rounds: int = ROUNDS, unce
         if is_first:
             slam, adjustment, state = _try_rolling_shutter(slam, adjustment, solution.state, settings)
             slam, shared = shared.try_camera(slam, adjustment, state, settings, last=rounds == 1)
-            solved = adjustment.problem, state
+            solved, described = (adjustment.problem, state), slam.map.pairs
+        if not slam.metric and number < rounds - 1:
+            pairs = guided_pairs(replace(slam.map, pairs=described), slam.intrinsics)
+            slam = replace(slam, map=replace(slam.map, pairs=pairs))
+            shared = replace(_SharedByRounds.of(slam, settings), camera=shared.camera)
     if not uncertainty:
         return slam
     sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
@@ -146,6 +160,9 @@ class _SharedByRounds:
             # one.
             held = KNOWN_SIGMA * slam.intrinsics[0]
             camera = replace(camera, sigma=np.full(4, held), shared_focal=are_square(slam.intrinsics))
+        elif not slam.metric:
+            # Later rounds have more matches: they estimate it again.
+            camera = replace(self.camera, sigma=calibration_sigma(self.camera.mean))
         return slam, replace(self, edges=_edges(slam), surfaces=_surfaces(slam), camera=camera)
 
 
@@ -184,12 +201,19 @@ def _try_rolling_shutter(
 def _try_camera(
     slam: Slam, adjustment: Adjustment, state: State, edges: list[Directed], settings: SlamSettings
 ) -> Slam:
-    """Return the state after trying to refine a given camera, or to undistort a guessed one."""
-    if slam.camera.calibrated:
+    """Return the state after trying to refine a given camera, and to find a lens that no calibration tells."""
+    camera = slam.camera
+    if camera.calibrated and slam.metric:
         found = refine_given_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, _solved)
         return _apply_refined_camera(slam, adjustment, found, settings)
-    slam, adjustment, state = _try_pixel_aspect(slam, adjustment, state, _solved)
-    if slam.camera.lens is not None or not can_undistort(slam.keyframes):
+    if camera.calibrated:
+        free, refined = estimate_with_map(adjustment.problem, state, _solved)
+        slam = _apply_refined_camera(slam, adjustment, refined, settings)
+        # The prior of a focal length and a lens must be free together: either alone absorbs the other.
+        adjustment, state = replace(adjustment, problem=free), refined.state or state
+    else:
+        slam, adjustment, state = _try_pixel_aspect(slam, adjustment, state, _solved)
+    if camera.lens is not None or camera.given_lens or not can_undistort(slam.keyframes):
         return slam
     return _apply_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, _solved))
 
@@ -267,8 +291,8 @@ def _apply_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> 
     adjusted = undistorted(_apply_solution(slam, adjustment, found.state), found.camera)
     k1, k2, *_ = found.camera.distortion
     note = (
-        f"the unknown camera was estimated with lens distortion: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "
-        f"{found.camera.intrinsics[0]:.1f} px, {found.warp:.0f} px at most; the images were undistorted"
+        f"the camera was estimated with lens distortion: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "
+        f"{found.camera.intrinsics[0]:.1f} px, {found.warp:.1f} px at most; the images were undistorted"
     )
     return replace(adjusted, notes=(*adjusted.notes, note))
 
@@ -306,6 +330,8 @@ def _terms(
     """Return the terms on poses besides matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
     terms = factor_terms(factors, places, shape.room, metric=slam.metric)
+    if slam.camera.calibrated and not slam.metric:
+        terms = (*terms, aspect_prior(slam.camera.given))
     if not surfaces or settings.depth_terms.surface_points <= 0:
         return terms
     pairs = [(places[first], places[second]) for first, second in (pair.key for pair in slam.map.pairs)]

@@ -98,7 +98,7 @@ def joint_matches(
     found = [(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))]
     for keyframe in in_view(keyframes, pose) if can_search(features) else []:
         if can_search(keyframe.features):
-            index, points, pixels = _should_show(keyframe, pose, intrinsics)
+            index, points, pixels = expected_pixels(keyframe, pose, intrinsics)
             matches = search_around(keyframe.features, index, pixels, features, radius=radius)
             found.append((points[np.searchsorted(index, matches.index_i)], matches.pixels_j, matches.confidence))
     points, pixels, confidence = (np.concatenate(parts) for parts in zip(*found, strict=True))
@@ -158,7 +158,7 @@ def _matched(
     """Match some of the keyframe's points of known depth that are expected in the image."""
     if not can_search(keyframe.features):
         return None
-    index, points, pixels = _should_show(keyframe, pose, intrinsics)
+    index, points, pixels = expected_pixels(keyframe, pose, intrinsics)
     # Key points come strongest first, spread over the image.
     index, points, pixels = index[:MAX_POINTS], points[:MAX_POINTS], pixels[:MAX_POINTS]
     found = search_near(keyframe.features, index, pixels, features, tree, radius=radius)
@@ -167,7 +167,7 @@ def _matched(
     return _Part(keyframe, points[np.searchsorted(index, found.index_i)], found.pixels_j)
 
 
-def _should_show(
+def expected_pixels(
     keyframe: Keyframe, pose: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return key points of known depth expected in the image: their numbers (ascending), world points, pixels."""

@@ -1,0 +1,100 @@
+"""Guided matching of keyframes whose key points look alike in pairs. Exact truth: points on a plane, known poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_state import keyframe as tiny_keyframe
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
+from vggtgeo.models.roles import Features, PointMatches
+
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.global_map.guided_matches import RADIUS, guided_pairs
+from vggtgeo.slam.sparse_map.covisibility import Pair, without_matches
+from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
+from vggtgeo.slam.sparse_map.map import Map
+
+CAMERA = np.array([60.0, 60.0, 31.5, 23.5])
+WORLD = np.stack([*np.meshgrid(np.linspace(-0.7, 0.7, 12), np.linspace(-0.5, 0.5, 6)), np.full((6, 12), 2.0)], -1)
+POINTS = WORLD.reshape(-1, 3)
+LOOKS = np.random.default_rng(0).normal(size=(36, 64)).astype(np.float32)
+LOOKS = np.concatenate([LOOKS, LOOKS]) / np.linalg.norm(LOOKS, axis=1).mean()
+LOOKS /= np.linalg.norm(LOOKS, axis=1, keepdims=True)
+"""Descriptors: each point of the upper half looks like one of the lower half."""
+
+
+def keyframe(number: int, right: float, points: np.ndarray = POINTS) -> Keyframe:
+    """A camera so far to the right that sees all points; its key points are in an order of its own."""
+    to_world = np.eye(4)
+    to_world[0, 3] = right
+    pose = rigid.invert(to_world)
+    order = np.random.default_rng(number).permutation(len(points))
+    pixels, one = rigid.project(points, pose, CAMERA)[order], np.ones(len(points))
+    made = replace(tiny_keyframe(number), pose=pose)
+    described = PixelDescriptors(LOOKS[order], made.features.descriptors.gray)
+    unknown = np.nan * one
+    depth = Slots(pixels, one / 2, unknown, unknown, one, one, 1e-4 * one)
+    return replace(made, features=Features(pixels, one, described), points=depth)
+
+
+def known(*keyframes: Keyframe, pairs: tuple[Pair, ...] = ()) -> Map:
+    """A map in one piece: tracked motions join each keyframe to the one before."""
+    ties = tuple(MeasuredRelativePose(k, k + 1, np.eye(4), np.eye(6)) for k in range(len(keyframes) - 1))
+    return Map(False, keyframes, pairs, ties, roots=(0,))
+
+
+def right_share(pair: Pair, keyframes: tuple[Keyframe, ...]) -> float:
+    """Share of the matches that join a point with itself: the same place on the plane."""
+    first, second = (keyframes[number] for number in pair.key)
+    places = [
+        rigid.unproject(pixels, np.full(len(pixels), 0.5), of.pose, CAMERA)
+        for of, pixels in ((first, pair.points.pixels_i), (second, pair.points.pixels_j))
+    ]
+    return float(np.mean(np.linalg.norm(places[0] - places[1], axis=1) < 1e-6))
+
+
+def test_points_that_look_alike_are_told_apart_by_their_place() -> None:
+    """A pair of two matches gets all of the image's, all right, and keeps its own. Oracle: the plane."""
+    frames = keyframe(0, 0.0), keyframe(1, 0.1)
+    own = [np.flatnonzero(np.random.default_rng(n).permutation(len(POINTS)) == 5)[0] for n in (0, 1)]
+    index = np.array(own[:1]), np.array(own[1:])
+    two = PointMatches(*index, frames[0].features.pixels[index[0]], frames[1].features.pixels[index[1]], np.ones(1))
+    (pair,) = guided_pairs(known(*frames, pairs=(replace(without_matches(0, 1), points=two),)), CAMERA)
+    assert len(pair.points) == len(POINTS)
+    assert right_share(pair, frames) == 1.0
+    np.testing.assert_array_equal(pair.points.index_i[:1], index[0])
+    assert len(np.unique(pair.points.index_j)) == len(POINTS)
+
+
+def test_keyframes_that_were_never_compared_are_paired_where_they_see_the_same() -> None:
+    """A pair is added where poses predict shared points, not where the camera looks away. Oracle: the poses."""
+    away = replace(keyframe(2, 0.0), pose=np.diag([-1.0, 1.0, -1.0, 1.0]))
+    found = guided_pairs(known(keyframe(0, 0.0), keyframe(1, 0.2), away), CAMERA)
+    assert [pair.key for pair in found] == [(0, 1)]
+    assert right_share(found[0], (keyframe(0, 0.0), keyframe(1, 0.2))) == 1.0
+
+
+@pytest.mark.parametrize("change", ["pose", "depth"])
+def test_a_wrong_prediction_finds_nothing(change: str) -> None:
+    """Where the pose is wrong by more than the radius, or no depth is determined, nothing is added. Oracle: none."""
+    first, second = keyframe(0, 0.0), keyframe(1, 0.2)
+    if change == "pose":
+        # The grid's pitch is 3.8 pixels: half of it beside a column, and far above the rows.
+        second = replace(second, pose=keyframe(1, 0.2 + 25 * RADIUS / 30).pose)
+    else:
+        first, second = (
+            replace(one, points=replace(one.points, estimate_sigma=np.full(len(POINTS), 1.0)))
+            for one in (first, second)
+        )
+    assert guided_pairs(known(first, second), CAMERA) == ()
+
+
+def test_descriptors_that_cannot_be_compared_leave_the_pairs() -> None:
+    """A matcher with descriptors of its own keeps the map's pairs. Oracle: the pairs given."""
+    first = keyframe(0, 0.0)
+    opaque = replace(first, features=replace(first.features, descriptors=object()))
+    pairs = (without_matches(0, 1),)
+    assert guided_pairs(known(opaque, keyframe(1, 0.1), pairs=pairs), CAMERA) == pairs

@@ -1,0 +1,98 @@
+"""Guided matching in a map without measured depth: points are searched where the adjusted map predicts them.
+
+Descriptors alone match what looks like nothing else in the image; of repeated texture and plain walls that is little.
+An adjusted map predicts a point within a few pixels, where few others resemble it, also in keyframes that were never
+compared. The search follows an adjustment: before one, it confirms the drift of the poses instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vggtgeo.models.classical import can_search, search_near, search_tree
+from vggtgeo.models.roles import PointMatches
+from vggtgeo.slam.sparse_map.connected import submap_of
+from vggtgeo.slam.sparse_map.covisibility import (
+    MIN_MATCHES,
+    MIN_OVERLAP,
+    Pair,
+    overlap,
+    some_points,
+    without_matches,
+)
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.threads import map_in_threads
+from vggtgeo.slam.tracking.map_points import MAX_TURN, expected_pixels
+
+RADIUS = 4.0
+"""Largest distance of a match from its prediction, pixels: eight standard deviations of a match. A wider one finds what
+confirms an error of the map."""
+
+
+def guided_pairs(known: Map, intrinsics: np.ndarray) -> tuple[Pair, ...]:
+    """Return the pairs of the map with further matches, and pairs of keyframes that are predicted to see the same.
+
+    Without descriptors that can be compared one by one, return the pairs as they are.
+    """
+    if not all(can_search(keyframe.features) for keyframe in known.keyframes):
+        return known.pairs
+    own = {pair.key: pair for pair in known.pairs}
+    trees = [search_tree(keyframe.features) for keyframe in known.keyframes]
+
+    def searched(key: tuple[int, int]) -> Pair | None:
+        pair = own.get(key)
+        found = _further_matches(pair or without_matches(*key), known.keyframes, trees, intrinsics)
+        return found if pair is not None or len(found.points) >= MIN_MATCHES else None
+
+    candidates = [*own, *_predicted_pairs(known, intrinsics, set(own))]
+    return tuple(pair for pair in map_in_threads(searched, candidates) if pair is not None)
+
+
+def _predicted_pairs(known: Map, intrinsics: np.ndarray, but: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the pairs of keyframes of one submap that should share points, in a similar viewing direction."""
+    label, points = submap_of(known), [some_points(keyframe, intrinsics) for keyframe in known.keyframes]
+    rotations = np.array([keyframe.pose[:3, :3] for keyframe in known.keyframes])
+    # `trace(R1 R2') = 1 + 2 cos(angle)`.
+    turned = np.einsum("nij,mij->nm", rotations, rotations) < 1 + 2 * np.cos(MAX_TURN)
+    labels = np.array([label[keyframe.number] for keyframe in known.keyframes])
+    near = np.argwhere(~turned & (labels[:, None] == labels))
+    return [
+        (first, second)
+        for first, second in near.tolist()
+        if first < second
+        and (first, second) not in but
+        and overlap(points[first], known.keyframes[second], intrinsics) > MIN_OVERLAP
+    ]
+
+
+def _further_matches(pair: Pair, keyframes: Sequence[Keyframe], trees: list[cKDTree], intrinsics: np.ndarray) -> Pair:
+    """Return the pair with the matches of points of either keyframe that the other shows near their projection."""
+    first, second = (keyframes[number] for number in pair.key)
+    there = _near_projection(first, second, trees[pair.second], intrinsics)
+    back = _near_projection(second, first, trees[pair.first], intrinsics)
+    index_i = np.concatenate([pair.points.index_i, there.index_i, back.index_j])
+    index_j = np.concatenate([pair.points.index_j, there.index_j, back.index_i])
+    # A key point is matched once, to the one that was found first; -1 is no key point.
+    lone = np.where(index_j < 0, -1 - np.arange(len(index_j)), index_j)
+    once = np.zeros(len(index_i), bool)
+    once[np.intersect1d(*(np.unique(index, return_index=True)[1] for index in (index_i, lone)))] = True
+    once[: len(pair.points)] = True
+    added = PointMatches(
+        index_i,
+        index_j,
+        np.concatenate([pair.points.pixels_i, there.pixels_i, back.pixels_j]),
+        np.concatenate([pair.points.pixels_j, there.pixels_j, back.pixels_i]),
+        np.concatenate([pair.points.confidence, there.confidence, back.confidence]),
+    )
+    return replace(pair, points=added.select(once))
+
+
+def _near_projection(of: Keyframe, other: Keyframe, tree: cKDTree, intrinsics: np.ndarray) -> PointMatches:
+    index, _, pixels = expected_pixels(of, other.pose, intrinsics)
+    known = of.points.determined[index]
+    return search_near(of.features, index[known], pixels[known], other.features, tree, radius=RADIUS)
