@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.settings.groups import KeyframeSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -15,43 +17,85 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import close_loop_while_tracking, view_of
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_between, track
 
+MIN_OVERLAP, MAX_PARALLAX = 0.8, math.radians(10.0)
+"""Least share of a keyframe's key points in the image, and largest angle between a point's rays, of a frame that needs
+no keyframe of its own, where lengths have no unit. In simulated walks closer keyframes take longer and are no more
+accurate; fewer (0.7; 0.6 and 15 degrees) lose frames (`benchmarks/keyframe_spacing.py`)."""
+MAX_SHIFT = 1.0
+"""Pixels by which errors of the keyframe's depths may move its points in the image: the noise of a match. Beyond it
+the map, not the image, limits the pose."""
+THIRD_VIEW = 0.25
+"""Share of these limits at which a map gets its third keyframe."""
+SAMPLES = 64
+"""Key points that this is measured on."""
 
-def becomes_keyframe(found: Track, settings: KeyframeSettings) -> bool:
+
+def becomes_keyframe(slam: Slam, found: Track, settings: KeyframeSettings) -> bool:
     """Return whether a tracked frame needs a keyframe of its own (`needs_keyframe`); one placed by rays always does."""
-    own, reference = found.pose, found.keyframe.pose
-    return found.evidence.by_rays or needs_keyframe(own, reference, found.evidence.inliers, settings)
+    evidence = found.evidence
+    return evidence.by_rays or needs_keyframe(slam, found.pose, found.keyframe, evidence.inliers, settings)
 
 
-def needs_keyframe(pose: np.ndarray, keyframe_pose: np.ndarray, inliers: int, settings: KeyframeSettings) -> bool:
-    """Return whether a frame moved or turned too far from its keyframe, or shares too little with it.
+def needs_keyframe(slam: Slam, pose: np.ndarray, keyframe: Keyframe, inliers: int, settings: KeyframeSettings) -> bool:
+    """Return whether a frame sees too little of its keyframe (`view_change`), or shares too few matches with it.
 
     Args:
+        slam: the state, for its camera and whether lengths are metres.
         pose: of the frame, float64 [4, 4], world -> camera.
-        keyframe_pose: of the keyframe that it was tracked against, likewise.
+        keyframe: that it was tracked against.
         inliers: matches with that keyframe that agree with the pose.
         settings: largest distance and angle, least inliers.
 
     """
-    return view_change(pose, keyframe_pose, settings) > 1.0 or inliers < settings.min_inliers
+    return view_change(slam, pose, keyframe, settings) > 1.0 or inliers < settings.min_inliers
 
 
-def view_change(pose: np.ndarray, keyframe_pose: np.ndarray, settings: KeyframeSettings) -> float:
-    """Return the larger of distance and angle between poses [4, 4], world -> camera, each as a share of its limit."""
-    distance = np.linalg.norm(rigid.centre(pose) - rigid.centre(keyframe_pose))
-    angle = rigid.angle_between(pose, keyframe_pose)
+def view_change(slam: Slam, pose: np.ndarray, keyframe: Keyframe, settings: KeyframeSettings) -> float:
+    """Return the change of the view from a keyframe to `pose` [4, 4], world -> camera, as a share of its limit.
+
+    The larger of distance and angle where lengths are metres, else of lost overlap and parallax.
+    """
+    if not slam.metric:
+        # A third view is the first that checks the depths of two, and without it nothing is adjusted at the end.
+        limit = 1.0 if len(slam.keyframes) >= MIN_KEYFRAMES_FOR_CAMERA else THIRD_VIEW
+        return _unitless_change(pose, keyframe, slam.intrinsics) / limit
+    distance = np.linalg.norm(rigid.centre(pose) - rigid.centre(keyframe.pose))
+    angle = rigid.angle_between(pose, keyframe.pose)
     return max(float(distance) / settings.keyframe_distance, float(angle) / settings.keyframe_angle)
 
 
-def nearest_keyframe(pose: np.ndarray, keyframes: Iterable[Keyframe], settings: KeyframeSettings) -> Keyframe | None:
+def _unitless_change(pose: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> float:
+    """Return the largest of three shares of their limits: overlap that is lost, parallax, and shift by depth errors.
+
+    The parallax is the root mean square of the angles between the rays to a point from both places: near points tell a
+    position, and count in it as in the information on it. A point of unknown depth counts as the mean of the others,
+    and as infinitely far where no depth is known.
+    """
+    some = np.s_[:: max(len(keyframe.points.pixels) // SAMPLES, 1)]
+    inverse = keyframe.points.inverse_depth[some]
+    known = np.isfinite(inverse)
+    inverse = np.where(known, inverse, np.mean(inverse[known]) if known.any() else 0.0)
+    relative = pose @ rigid.invert(keyframe.pose)
+    turned = pinhole.rays(keyframe.points.pixels[some], intrinsics) @ relative[:3, :3].T
+    moved = turned + inverse[:, None] * relative[:3, 3]
+    height, width = keyframe.size
+    with np.errstate(invalid="ignore"):
+        x, y = pinhole.project(moved, intrinsics).T
+        left = 1.0 - np.mean((x > 0) & (x < width) & (y > 0) & (y < height))
+    sine = np.linalg.norm(np.cross(turned, moved), axis=1)
+    parallax = np.sqrt(np.mean(np.arctan2(sine, (turned * moved).sum(1)) ** 2))
+    sigma = keyframe.points.estimate_sigma[np.isfinite(keyframe.points.estimate_sigma)]
+    shift = float(intrinsics[0] * np.linalg.norm(relative[:3, 3]) * np.median(sigma)) if len(sigma) else 0.0
+    return float(max(left / (1.0 - MIN_OVERLAP), parallax / MAX_PARALLAX, shift / MAX_SHIFT))
+
+
+def nearest_keyframe(
+    slam: Slam, pose: np.ndarray, keyframes: Iterable[Keyframe], settings: KeyframeSettings
+) -> Keyframe | None:
     """Return the keyframe with the smallest view change to `pose`; None if a frame there would need a new keyframe."""
-    # Angles cost more than distances, and most keyframes of a long run are far away.
-    near = [
-        keyframe
-        for keyframe in keyframes
-        if np.linalg.norm(rigid.centre(keyframe.pose) - rigid.centre(pose)) < settings.keyframe_distance
-    ]
-    best = min(near, key=lambda keyframe: view_change(keyframe.pose, pose, settings), default=None)
-    return best if best is not None and view_change(best.pose, pose, settings) < 1.0 else None
+    changes = [(view_change(slam, pose, keyframe, settings), keyframe) for keyframe in keyframes]
+    change, best = min(changes, key=lambda one: one[0], default=(1.0, None))
+    return best if change < 1.0 else None
 
 
 def track_by_old_keyframe(
@@ -63,18 +107,22 @@ def track_by_old_keyframe(
     such a keyframe, return the state and the track as given.
     """
     others = (keyframe for keyframe in slam.keyframes if keyframe.number != found.keyframe.number)
-    near = nearest_keyframe(found.pose, others, settings.keyframes)
+    near = nearest_keyframe(slam, found.pose, others, settings.keyframes)
     again = None
     if near is not None:
         prior = MotionPrior(found.pose, slam.tracker.velocity)
         given = TrackingInput(data, slam.intrinsics, roles, prior)
         again = track(given, near, view_of(near, slam.tracker, slam.intrinsics, roles))
-        if not (again.accepted and again.evidence.certain) or becomes_keyframe(again, settings.keyframes):
+        if not (again.accepted and again.evidence.certain) or becomes_keyframe(slam, again, settings.keyframes):
             again = None  # drift may have put another keyframe there
     if again is None:
         given = TrackingInput(data, slam.intrinsics, roles)
         again = close_loop_while_tracking(given, found, slam.map, slam.tracker, slam.window.members)
-    if again is None or becomes_keyframe(again, settings.keyframes) or not again.evidence.shows_as_well(found.evidence):
+    if (
+        again is None
+        or becomes_keyframe(slam, again, settings.keyframes)
+        or not again.evidence.shows_as_well(found.evidence)
+    ):
         return slam, found
     near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):

@@ -162,7 +162,7 @@ def _track(
         slam = _merge_pending_window(slam, clock)
         with clock.measure("track"):
             found = _find(slam, data, recorded, roles, settings)
-    if slam.pending is not None and found is not None and becomes_keyframe(found, settings.keyframes):
+    if slam.pending is not None and found is not None and becomes_keyframe(slam, found, settings.keyframes):
         slam = _merge_pending_window(slam, clock)
         found = moved_with(found, slam.keyframes[found.keyframe.number])
     if (slam.tracker.lost or not slam.metric) and (found is None or not found.accepted):
@@ -199,11 +199,11 @@ def _decide(
 
     It does not where an old keyframe shows it as well; that one is then its keyframe.
     """
-    if becomes_keyframe(found, settings.keyframes):
+    if becomes_keyframe(slam, found, settings.keyframes):
         with clock.measure("track"):
             tied, found = track_by_old_keyframe(slam, data, found, roles, settings)
             slam = slam if settings.keyframes.localise_only else tied
-    return slam, found, not settings.keyframes.localise_only and becomes_keyframe(found, settings.keyframes)
+    return slam, found, not settings.keyframes.localise_only and becomes_keyframe(slam, found, settings.keyframes)
 
 
 def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Roles, settings: SlamSettings) -> Track:
@@ -366,7 +366,7 @@ def _handle_lost_frame(
     if carried is not None:
         slam = _moved(slam, frame, carried)
         shows = len(features) > settings.keyframes.min_inliers
-        moved = view_change(carried.pose, slam.keyframes[-1].pose, settings.keyframes) > 1.0
+        moved = view_change(slam, carried.pose, slam.keyframes[-1], settings.keyframes) > 1.0
         if settings.keyframes.localise_only or not (shows and moved):
             return _with_record(slam, record_of(frame, carried))
         return _insert_and_adjust(slam, data, carried, recorded, roles, settings, clock)

@@ -86,7 +86,7 @@ def _beside(slam: Slam, waiting: UnplacedFrame) -> FramePose | None:
 def _with_frame(slam: Slam, waiting: UnplacedFrame, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
     """Add the frame's pose, and the frame as a keyframe if it sees what others do not."""
     record = record_of(_data(waiting).frame, found)
-    if needs_keyframe(found.pose, found.keyframe.pose, found.evidence.inliers, settings.keyframes):
+    if needs_keyframe(slam, found.pose, found.keyframe, found.evidence.inliers, settings.keyframes):
         slam, record = _with_keyframe(slam, waiting, found, record, roles, settings)
     frames = tuple(record if other.frame == waiting.frame else other for other in slam.frames)
     left = tuple(other for other in slam.tracker.unplaced if other.frame != waiting.frame)

@@ -22,7 +22,7 @@ class KeyframeSettings(CheckedSettings):
     Fields:
         min_inliers: A frame with fewer tracked inliers becomes a keyframe.
         keyframe_distance: Metres from the keyframe that the frame is tracked against.
-        keyframe_angle: Radians from it.
+        keyframe_angle: Radians from it. Without measured depth, overlap and parallax decide instead of both.
         localise_only: Track frames in a known map without changing it.
 
     Example:
