@@ -19,8 +19,8 @@ from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingI
 
 MIN_OVERLAP, MAX_PARALLAX = 0.8, math.radians(10.0)
 """Least share of a keyframe's key points in the image, and largest angle between a point's rays, of a frame that needs
-no keyframe of its own, where lengths have no unit. In simulated walks closer keyframes take longer and are no more
-accurate; fewer (0.7; 0.6 and 15 degrees) lose frames (`benchmarks/keyframe_spacing.py`)."""
+no keyframe of its own, where lengths have no unit. In simulated walks limits from 0.9 and 5 degrees to 0.7 and 10 are
+equally accurate (`benchmarks/keyframe_spacing.py`)."""
 MAX_SHIFT = 1.0
 """Pixels by which errors of the keyframe's depths may move its points in the image: the noise of a match. Beyond it
 the map, not the image, limits the pose."""
