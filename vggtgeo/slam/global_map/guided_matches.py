@@ -79,9 +79,7 @@ def _further_matches(pair: Pair, keyframes: Sequence[Keyframe], trees: list[cKDT
     index_j = np.concatenate([pair.points.index_j, there.index_j, back.index_i])
     # A key point is matched once, to the one that was found first; -1 is no key point.
     lone = np.where(index_j < 0, -1 - np.arange(len(index_j)), index_j)
-    once = np.zeros(len(index_i), bool)
-    once[np.intersect1d(*(np.unique(index, return_index=True)[1] for index in (index_i, lone)))] = True
-    once[: len(pair.points)] = True
+    once = _first(index_i) & _first(lone)
     added = PointMatches(
         index_i,
         index_j,
@@ -96,3 +94,10 @@ def _near_projection(of: Keyframe, other: Keyframe, tree: cKDTree, intrinsics: n
     index, _, pixels = expected_pixels(of, other.pose, intrinsics)
     known = of.points.determined[index]
     return search_near(of.features, index[known], pixels[known], other.features, tree, radius=RADIUS)
+
+
+def _first(values: np.ndarray) -> np.ndarray:
+    """Return where each value occurs for the first time, bool [m]."""
+    found = np.zeros(len(values), bool)
+    found[np.unique(values, return_index=True)[1]] = True
+    return found
