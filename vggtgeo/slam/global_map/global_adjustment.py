@@ -206,16 +206,19 @@ def _try_camera(
     if camera.calibrated and slam.metric:
         found = refine_given_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, _solved)
         return _apply_refined_camera(slam, adjustment, found, settings)
+    refined = None
     if camera.calibrated:
+        # Focal length and lens are free together: either alone absorbs the other.
         free, refined = estimate_with_map(adjustment.problem, state, _solved)
-        slam = _apply_refined_camera(slam, adjustment, refined, settings)
-        # The prior of a focal length and a lens must be free together: either alone absorbs the other.
         adjustment, state = replace(adjustment, problem=free), refined.state or state
     else:
         slam, adjustment, state = _try_pixel_aspect(slam, adjustment, state, _solved)
-    if camera.lens is not None or camera.given_lens or not can_undistort(slam.keyframes):
-        return slam
-    return _apply_lens(slam, adjustment, find_lens(adjustment.problem, state, slam.keyframes[0].size, _solved))
+    if camera.lens is None and not camera.given_lens and can_undistort(slam.keyframes):
+        lens = find_lens(adjustment.problem, state, slam.keyframes[0].size, _solved)
+        undistorting = _apply_lens(slam, adjustment, lens)
+        if undistorting is not slam:
+            return undistorting
+    return _apply_refined_camera(slam, adjustment, refined, settings)
 
 
 def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
