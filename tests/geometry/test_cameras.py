@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from vggtgeo.geometry.camera_models import (
+    MAX_RADIUS,
     AbstractCamera,
     KannalaBrandt,
     Pinhole,
@@ -124,3 +125,14 @@ def test_without_distortion_they_are_what_they_generalise() -> None:
     ray = KannalaBrandt(jnp.asarray(FOCAL + (0.0,) * 4)).unproject(pixel)
     radius = np.linalg.norm((np.asarray(pixel) - FOCAL[2:]) / FOCAL[:2])
     assert np.arctan(np.linalg.norm(ray[:2])) == pytest.approx(radius, rel=1e-12)
+
+
+def test_a_ray_beside_the_camera_has_a_bounded_say_in_the_lens() -> None:
+    # Proves that coefficients of distortion move no pixel more than at the bound, and that the bound leaves no step.
+    # Oracle: the polynomial there. Powers of the radius itself would be a million times that.
+    camera = camera_of("radial-tangential")
+    by_lens = lambda point: jax.jacfwd(lambda own: type(camera)(own).project(point))(camera.parameters)[:, 4:]
+    at_bound = by_lens(jnp.array([MAX_RADIUS, 0.0, 1.0]))
+    np.testing.assert_allclose(by_lens(jnp.array([1.0, 0.0, 1e-3])), at_bound)
+    near = [camera.project(jnp.array([share * MAX_RADIUS, 0.0, 1.0])) for share in (1 - 1e-9, 1 + 1e-9)]
+    np.testing.assert_allclose(near[0], near[1], atol=1e-4)

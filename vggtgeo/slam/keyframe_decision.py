@@ -59,9 +59,9 @@ def view_change(slam: Slam, pose: np.ndarray, keyframe: Keyframe, settings: Keyf
         # A third view is the first that checks the depths of two, and without it nothing is adjusted at the end.
         limit = 1.0 if len(slam.keyframes) >= MIN_KEYFRAMES_FOR_CAMERA else THIRD_VIEW
         return _unitless_change(pose, keyframe, slam.intrinsics) / limit
-    distance = np.linalg.norm(rigid.centre(pose) - rigid.centre(keyframe.pose))
-    angle = rigid.angle_between(pose, keyframe.pose)
-    return max(float(distance) / settings.keyframe_distance, float(angle) / settings.keyframe_angle)
+    share = float(np.linalg.norm(rigid.centre(pose) - rigid.centre(keyframe.pose))) / settings.keyframe_distance
+    # Angles cost more than distances, and most keyframes of a long run are beyond the limit by distance alone.
+    return share if share > 1.0 else max(share, rigid.angle_between(pose, keyframe.pose) / settings.keyframe_angle)
 
 
 def _unitless_change(pose: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> float:

@@ -83,20 +83,6 @@ def test_a_lens_is_found() -> None:
 
 
 @pytest.mark.long
-def test_a_match_beside_the_camera_does_not_hide_a_lens() -> None:
-    # Proves that a landmark that a wrong match puts beside a camera, where a polynomial of its radius is a million
-    # times any other's, leaves the lens as it is found without it. Oracle: the lens without that landmark's start.
-    window = bent(vg.simulate_window(seed=0, **WINDOW), -0.15, 0.05)
-    start = window.observations.depth_mean.copy()
-    start[0] = 0.02
-    found, beside = (
-        found_in(replace(window, observations=replace(window.observations, depth_mean=depth)), 1.1)
-        for depth in (window.observations.depth_mean, start)
-    )
-    np.testing.assert_allclose(beside.camera.distortion, found.camera.distortion, atol=0.01)
-
-
-@pytest.mark.long
 def test_no_lens_is_found_where_there_is_none() -> None:
     # Proves that noise alone is no lens, in six windows. Oracle: the pinhole that they were drawn with.
     found = [found_in(vg.simulate_window(seed=seed, **WINDOW), 1.1) for seed in range(6)]
