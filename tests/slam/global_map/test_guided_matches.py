@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from tiny_state import keyframe as tiny_keyframe
@@ -24,6 +25,10 @@ LOOKS = np.random.default_rng(0).normal(size=(36, 64)).astype(np.float32)
 LOOKS = np.concatenate([LOOKS, LOOKS]) / np.linalg.norm(LOOKS, axis=1).mean()
 LOOKS /= np.linalg.norm(LOOKS, axis=1, keepdims=True)
 """Descriptors: each point of the upper half looks like one of the lower half."""
+MARGIN, PITCH = 20, CAMERA[0] / 2.0
+"""Of the plane's texture, pixels around an image; pixels of a metre on the plane."""
+TEXTURE = cv2.GaussianBlur(np.random.default_rng(1).uniform(0, 255, (48 + 2 * MARGIN, 64 + 2 * MARGIN)), None, 1.5)
+TEXTURE = np.interp(TEXTURE, (TEXTURE.min(), TEXTURE.max()), (0, 255)).astype(np.uint8)
 
 
 def keyframe(number: int, right: float, points: np.ndarray = POINTS) -> Keyframe:
@@ -34,7 +39,9 @@ def keyframe(number: int, right: float, points: np.ndarray = POINTS) -> Keyframe
     order = np.random.default_rng(number).permutation(len(points))
     pixels, one = rigid.project(points, pose, CAMERA)[order], np.ones(len(points))
     made = replace(tiny_keyframe(number), pose=pose)
-    described = PixelDescriptors(LOOKS[order], made.features.descriptors.gray)
+    shift = np.array([[1.0, 0.0, MARGIN + PITCH * right], [0.0, 1.0, MARGIN]])
+    gray = cv2.warpAffine(TEXTURE, shift, (64, 48), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    described = PixelDescriptors(LOOKS[order], gray)
     unknown = np.nan * one
     depth = Slots(pixels, one / 2, unknown, unknown, one, one, 1e-4 * one)
     return replace(made, features=Features(pixels, one, described), points=depth)
@@ -46,14 +53,14 @@ def known(*keyframes: Keyframe, pairs: tuple[Pair, ...] = ()) -> Map:
     return Map(False, keyframes, pairs, ties, roots=(0,))
 
 
-def right_share(pair: Pair, keyframes: tuple[Keyframe, ...]) -> float:
-    """Share of the matches that join a point with itself: the same place on the plane."""
+def right_share(pair: Pair, keyframes: tuple[Keyframe, ...], within: float = 0.5) -> float:
+    """Share of the matches that join a point with itself: the same place on the plane, within so many pixels."""
     first, second = (keyframes[number] for number in pair.key)
     places = [
         rigid.unproject(pixels, np.full(len(pixels), 0.5), of.pose, CAMERA)
         for of, pixels in ((first, pair.points.pixels_i), (second, pair.points.pixels_j))
     ]
-    return float(np.mean(np.linalg.norm(places[0] - places[1], axis=1) < 1e-6))
+    return float(np.mean(np.linalg.norm(places[0] - places[1], axis=1) < within / PITCH))
 
 
 def test_points_that_look_alike_are_told_apart_by_their_place() -> None:
@@ -72,9 +79,25 @@ def test_points_that_look_alike_are_told_apart_by_their_place() -> None:
 def test_keyframes_that_were_never_compared_are_paired_where_they_see_the_same() -> None:
     """A pair is added where poses predict shared points, not where the camera looks away. Oracle: the poses."""
     away = replace(keyframe(2, 0.0), pose=np.diag([-1.0, 1.0, -1.0, 1.0]))
-    found = guided_pairs(known(keyframe(0, 0.0), keyframe(1, 0.2), away), CAMERA)
+    found = guided_pairs(known(keyframe(0, 0.0), keyframe(1, 0.1), away), CAMERA)
     assert [pair.key for pair in found] == [(0, 1)]
-    assert right_share(found[0], (keyframe(0, 0.0), keyframe(1, 0.2))) == 1.0
+    assert right_share(found[0], (keyframe(0, 0.0), keyframe(1, 0.1))) == 1.0
+
+
+def test_matches_are_aligned_by_the_images() -> None:
+    """Key points found half a pixel off are mostly matched to a tenth; hidden ones are not. Oracle: the plane."""
+    first, second = keyframe(0, 0.0), keyframe(1, 0.1)
+    off = second.features.pixels + np.random.default_rng(2).normal(0.0, 0.5, second.features.pixels.shape)
+    gray = second.features.descriptors.gray.copy()
+    gray[:, :20] = np.random.default_rng(3).integers(0, 255, (48, 20))
+    described = replace(second.features.descriptors, gray=gray)
+    # Without depths of its own: only the first predicts.
+    unknown = replace(second.points, inverse_depth=np.full(len(off), np.nan))
+    second = replace(second, features=replace(second.features, pixels=off, descriptors=described), points=unknown)
+    (pair,) = guided_pairs(known(first, second), CAMERA)
+    assert right_share(pair, (first, second), within=0.1) > 0.85
+    assert pair.points.pixels_j[:, 0].min() > 15
+    assert len(pair.points) > 0.5 * len(POINTS)
 
 
 @pytest.mark.parametrize("change", ["pose", "depth"])

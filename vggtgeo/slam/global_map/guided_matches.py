@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vggtgeo.models.classical import can_search, search_near, search_tree
+from vggtgeo.models.classical import PatchAlignment, can_search, search_near, search_tree
 from vggtgeo.models.roles import PointMatches
+from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS
 from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import (
     MIN_MATCHES,
@@ -32,6 +33,10 @@ from vggtgeo.slam.tracking.map_points import MAX_TURN, expected_pixels
 RADIUS = 4.0
 """Largest distance of a match from its prediction, pixels: eight standard deviations of a match. A wider one finds what
 confirms an error of the map."""
+
+REFINEMENT = PatchAlignment()
+"""As of the matches by descriptors alone, whose noise the adjustment assumes. Here it also verifies: a match whose
+patches do not align is left out."""
 
 
 def guided_pairs(known: Map, intrinsics: np.ndarray) -> tuple[Pair, ...]:
@@ -54,20 +59,22 @@ def guided_pairs(known: Map, intrinsics: np.ndarray) -> tuple[Pair, ...]:
 
 
 def _predicted_pairs(known: Map, intrinsics: np.ndarray, but: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the pairs of keyframes of one submap that should share points, in a similar viewing direction."""
+    """Return the pairs of keyframes of one submap that should share points, in a similar viewing direction.
+
+    Of each keyframe only those that should share most: the adjustment uses no more (`MAX_NEIGHBOURS`).
+    """
     label, points = submap_of(known), [some_points(keyframe, intrinsics) for keyframe in known.keyframes]
     rotations = np.array([keyframe.pose[:3, :3] for keyframe in known.keyframes])
     # `trace(R1 R2') = 1 + 2 cos(angle)`.
     turned = np.einsum("nij,mij->nm", rotations, rotations) < 1 + 2 * np.cos(MAX_TURN)
     labels = np.array([label[keyframe.number] for keyframe in known.keyframes])
-    near = np.argwhere(~turned & (labels[:, None] == labels))
-    return [
-        (first, second)
-        for first, second in near.tolist()
-        if first < second
-        and (first, second) not in but
-        and overlap(points[first], known.keyframes[second], intrinsics) > MIN_OVERLAP
-    ]
+    shares = np.zeros(turned.shape)
+    for first, second in np.argwhere(np.triu(~turned & (labels[:, None] == labels), 1)):
+        shares[first, second] = overlap(points[first], known.keyframes[second], intrinsics)
+    shares += shares.T
+    best = np.argsort(-shares, axis=1, kind="stable")[:, :MAX_NEIGHBOURS]
+    chosen = {(min(host, other), max(host, other)) for host, row in enumerate(best.tolist()) for other in row}
+    return sorted(pair for pair in chosen - but if shares[pair] > MIN_OVERLAP)
 
 
 def _further_matches(pair: Pair, keyframes: Sequence[Keyframe], trees: list[cKDTree], intrinsics: np.ndarray) -> Pair:
@@ -91,9 +98,13 @@ def _further_matches(pair: Pair, keyframes: Sequence[Keyframe], trees: list[cKDT
 
 
 def _near_projection(of: Keyframe, other: Keyframe, tree: cKDTree, intrinsics: np.ndarray) -> PointMatches:
+    """Return the matches of points of `of` that `other` shows near their projection, where both look alike."""
     index, _, pixels = expected_pixels(of, other.pose, intrinsics)
     known = of.points.determined[index]
-    return search_near(of.features, index[known], pixels[known], other.features, tree, radius=RADIUS)
+    found = search_near(of.features, index[known], pixels[known], other.features, tree, radius=RADIUS)
+    images = of.features.descriptors.gray, other.features.descriptors.gray
+    refined, aligned = REFINEMENT.refine(*images, found.pixels_i, found.pixels_j)
+    return replace(found, pixels_j=refined).select(aligned)
 
 
 def _first(values: np.ndarray) -> np.ndarray:

@@ -236,7 +236,7 @@ def _visible(segments: SpaceSegments, motion: np.ndarray, intrinsics: np.ndarray
     """Return the number of segments whose middle and at least one end are inside the image."""
     local = segments.rays / segments.inverse_depth[..., None] @ motion[:3, :3].T + motion[:3, 3]
     points = np.concatenate([local, local.mean(1, keepdims=True)], 1)
-    height, width = source.image.shape[:2]
+    height, width = source.size
     with np.errstate(invalid="ignore"):
         x, y = np.moveaxis(pinhole.project(points, intrinsics, MIN_DEPTH), -1, 0)
         inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)

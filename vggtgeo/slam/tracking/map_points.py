@@ -175,7 +175,7 @@ def expected_pixels(
     points = rigid.unproject(
         keyframe.features.pixels[known], keyframe.points.inverse_depth[known], keyframe.pose, intrinsics
     )
-    height, width = keyframe.image.shape[:2]
+    height, width = keyframe.size
     pixels = rigid.project(points, pose, intrinsics)
     with np.errstate(invalid="ignore"):
         inside = ((pixels > 0) & (pixels < [width - 1, height - 1])).all(1)
