@@ -15,6 +15,11 @@ REGULARISER = 1e-9
 """Information, 1/m^2 and 1/rad^2, that makes a singular matrix invertible: a standard deviation of 30 km."""
 
 
+def sigma_by_median(residuals: np.ndarray) -> float:
+    """Return the standard deviation of residuals about zero by their median absolute value, [...] not empty."""
+    return MAD_SIGMA * float(np.median(np.abs(residuals)))
+
+
 def inverse_information(information: np.ndarray) -> np.ndarray:
     """Return the covariances [..., 6, 6] of information matrices; very large in directions without information."""
     return np.asarray(np.linalg.inv(information + REGULARISER * np.eye(6)))
