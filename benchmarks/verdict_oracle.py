@@ -28,22 +28,20 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.verdict.alternatives import START, explain
+from vggtgeo.slam.verdict.alternatives import START, explain, scores, with_own_noise
 from vggtgeo.slam.verdict.claim import Claim, extent
 from vggtgeo.slam.verdict.corner_adjustment import (
     DRIFT,
     FOCAL,
-    KNOTS,
     OFFSET,
     RADIAL,
     SIZE,
-    Tracks,
     Unknowns,
     solve,
     start_of,
 )
-from vggtgeo.slam.verdict.judge import aligned, tracks_of_windows
-from vggtgeo.slam.verdict.noise import scores, with_own_noise
+from vggtgeo.slam.verdict.corner_tracks import KNOTS, Tracks, tracks_of_windows
+from vggtgeo.slam.verdict.judge import aligned
 
 Truth = tuple[np.ndarray, np.ndarray]
 """Weights of the knots, [m, KNOTS], in place of those linear in time, and `theta`."""
@@ -145,7 +143,8 @@ def row(name: str, out: Path) -> str:
     if corners is not None:
         row_of = {int(frame): place for place, frame in enumerate(truth["frames"])}
         true = truth["poses"][[row_of[int(frame)] for frame in claim.frames]]
-        for tracks in tracks_of_windows(slam, claim, corners):
+        height, width = slam.keyframes[0].size
+        for tracks in tracks_of_windows(claim, corners, (width, height)):
             found.append(window(case, tracks, claim, true[tracks.rows]))
     cells = [f"{max(getattr(each, field) for each in found):.3g}" for field in ("run", "corners", "gain") if found]
     return f"| {name} | {case['outcome']} | {100 * case['ate']:.1f} | {' | '.join(cells or ['-'] * 3)} |"

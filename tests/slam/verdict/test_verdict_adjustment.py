@@ -9,9 +9,8 @@ from corner_walk import walk
 from scipy.stats import binom, chi2
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.verdict.alternatives import TABLE
+from vggtgeo.slam.verdict.alternatives import TABLE, scores, with_own_noise
 from vggtgeo.slam.verdict.corner_adjustment import FOCAL, SIZE, Noise, Unknowns, linearise, reduce, solve, start_of
-from vggtgeo.slam.verdict.noise import scores, with_own_noise
 
 NOISE = Noise(0.3, 0.01)
 FOCAL_LENGTH = TABLE[0].columns

@@ -11,9 +11,8 @@ from corner_walk import SIZE, K, Walk, walk
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.alternatives import TABLE, explain, second_motion
 from vggtgeo.slam.verdict.claim import extent
-from vggtgeo.slam.verdict.consequence import confirmed
 from vggtgeo.slam.verdict.corner_adjustment import solve, start_of
-from vggtgeo.slam.verdict.corner_findings import contradiction
+from vggtgeo.slam.verdict.corner_findings import confirmed, contradiction
 from vggtgeo.slam.verdict.thresholds import MAX_DEPTH_NOISE, MIN_SECOND_MOTION_SHARE
 
 COUNT = 20

@@ -1,9 +1,24 @@
 """The explanations that the verdict knows, and which of them the corners of a window prefer.
 
-Each alternative is the run's claim with a few more free parameters. All have free poses, so that a wrong camera cannot
-hide behind poses that make up for it; they differ by what else is free (`TABLE`). The one of which a single linear step
-promises most (Rao's score test) is solved, and taken if it is significant with robust covariances (`noise.py`). Corners
-that another motion explains are set apart.
+Each alternative is the run's claim with a few more free parameters (`TABLE`). All have free poses, so that a wrong
+camera cannot hide behind poses that make up for it. The one of which a single linear step promises most (Rao's score
+test) is solved, and taken if it is significant (Wald). Corners that another motion explains are set apart.
+
+The noise is estimated from the run itself:
+
+- A corner has the standard deviation `pixel`, a measured depth the relative one `depth`, both by the median absolute
+  deviation of the residuals with free poses, corrected for the unknowns that these residuals determine.
+- The depth errors of a track are common to it (an edge, a material): `n` depths of a track weigh as one.
+- Errors are not independent along a track, which drifts, nor within a frame. So covariances are cluster-robust, by
+  track and by frame (two-way, Cameron, Gelbach & Miller 2011): with the score `g_o` of each observation, and `H` the
+  reduced information of the parameters that are asked for,
+
+      V = H^-1 (sum_track G G' + sum_frame G G' - sum_o g_o g_o') H^-1,   G the sum of the scores of a cluster.
+
+  `V H` is the number of observations that count as one.
+
+- A track that follows the wrong corner is wrong in all its frames, and free poses fit some of these. So likelihoods are
+  compared track by track (Vuong 1989): the sum of the gains must exceed what their scatter makes by chance.
 """
 
 from __future__ import annotations
@@ -11,31 +26,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
-from vggtgeo.slam.verdict.corner_adjustment import (
-    CENTRE,
-    DRIFT,
-    FOCAL,
-    OFFSET,
-    RADIAL,
-    READOUT,
-    SIZE,
-    Fit,
-    Noise,
-    Tracks,
-    solve,
-    start_of,
-)
-from vggtgeo.slam.verdict.noise import scores, with_own_noise
-from vggtgeo.slam.verdict.thresholds import MAX_UNPREDICTED, MIN_INLIER_WEIGHT, MIN_SECOND_MOTION_SHARE, SIGNIFICANCE
+from vggtgeo.geometry.robust import sigma_by_median
+from vggtgeo.slam.verdict import corner_adjustment as theta
+from vggtgeo.slam.verdict import thresholds
+from vggtgeo.slam.verdict.corner_adjustment import SIZE, Fit, Noise, reduce, solve, start_of
+from vggtgeo.slam.verdict.corner_tracks import Tracks
+from vggtgeo.slam.verdict.thresholds import MIN_INLIER_WEIGHT, MIN_SECOND_MOTION_SHARE, SIGNIFICANCE
 
-WIDE = 20.0
-"""Times the noise in the first steps towards a second motion, which begin far from it."""
-FIRST_STEPS = 6
-"""With that noise."""
 START = Noise(0.6, 0.03)
 """Pixels of an image of 320, relative: until residuals say more."""
+WIDE, FIRST_STEPS = 20.0, 6
+"""Times the noise in the first steps towards a second motion, which begin far from it, and their number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +46,18 @@ class Alternative:
     """One hypothesis.
 
     columns: float64 [SIZE, k], directions of `theta` that it frees. factor, unit: the estimate times `factor` is in
-    `unit`, for messages. needs_depth: only tried with measured depth.
+    `unit`, for messages.
     """
 
     name: str
     columns: np.ndarray
     factor: float
     unit: str
-    needs_depth: bool = False
+
+    @property
+    def chance(self) -> float:
+        """What minus twice the log likelihood ratio exceeds by chance at the level of `SIGNIFICANCE`."""
+        return float(chi2.isf(SIGNIFICANCE, self.columns.shape[1]))
 
 
 def _free(place: slice | int) -> np.ndarray:
@@ -58,16 +65,16 @@ def _free(place: slice | int) -> np.ndarray:
 
 
 TABLE = (
-    Alternative("focal length", _free(FOCAL).sum(1, keepdims=True), 100, "%"),
-    Alternative("focal length", _free(FOCAL), 100, "% (at four moments)"),
-    Alternative("principal point", _free(CENTRE), 100, "% of the focal length (right, down)"),
-    Alternative("distortion", _free(RADIAL), 1, "(k1)"),
-    Alternative("rolling shutter", _free(READOUT), 1000, "ms"),
-    Alternative("depth", _free(DRIFT)[:, 1:], 100, "% (later against the first moment)", needs_depth=True),
-    Alternative("depth", _free(OFFSET), 100, "cm", needs_depth=True),
+    Alternative("focal length", _free(theta.FOCAL).sum(1, keepdims=True), 100, "%"),
+    Alternative("focal length", _free(theta.FOCAL), 100, "% (at four moments)"),
+    Alternative("principal point", _free(theta.CENTRE), 100, "% of the focal length (right, down)"),
+    Alternative("distortion", _free(theta.RADIAL), 1, "(k1)"),
+    Alternative("rolling shutter", _free(theta.READOUT), 1000, "ms"),
+    Alternative("depth", _free(theta.DRIFT)[:, 1:], 100, "% (later against the first moment)"),
+    Alternative("depth", _free(theta.OFFSET), 100, "cm"),
 )
-"""A focal length that is wrong, or changes; a factor of the depth that changes, or an offset. With poses alone and a
-second motion these are seven explanations."""
+"""A focal length that is wrong, or changes; a factor of the depth that changes, or an offset; these two promise nothing
+where no depth was measured. With poses alone and a second motion these are seven explanations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +89,7 @@ class Added:
     def significant(self) -> bool:
         """Whether the estimate is significant by its robust covariance (Wald)."""
         wald = float(self.estimate @ np.linalg.pinv(self.covariance, hermitian=True) @ self.estimate)
-        return wald > float(chi2.isf(SIGNIFICANCE, len(self.estimate)))
+        return wald > self.alternative.chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,15 +105,10 @@ class Explanation:
     share: float
     rival: float
 
-    @property
-    def tracks(self) -> Tracks:
-        """The tracks that the first motion explains."""
-        return self.best.tracks
-
 
 def explain(tracks: Tracks) -> Explanation:
     """Return the preferred explanation of the tracks of a window."""
-    noise = Noise(START.pixel * max(tracks.size) / 320.0, START.depth)
+    noise = replace(START, pixel=START.pixel * max(tracks.size) / 320.0)
     held = solve(tracks, start_of(tracks), noise, poses_free=False, iterations=4)
     free = with_own_noise(solve(tracks, held.unknowns, noise))
     best, added = _selected(free)
@@ -123,11 +125,9 @@ def explain(tracks: Tracks) -> Explanation:
 def _selected(fit: Fit) -> tuple[Fit, Added | None]:
     """Return the fit with the significant alternative, and that alternative; else the same fit and None."""
     around = scores(fit)
-    chance = lambda one: float(chi2.isf(SIGNIFICANCE, one.columns.shape[1]))
-    known = [one for one in TABLE if fit.tracks.with_depth or not one.needs_depth]
-    one = max(known, key=lambda one: around.gain(one.columns) / around.as_one - chance(one))
+    one = max(TABLE, key=lambda one: around.gain(one.columns) / around.as_one - one.chance)
     # Before the solution, as if all observations were independent: a linear step is not exact enough for more.
-    if around.gain(one.columns) < chance(one):
+    if around.gain(one.columns) < one.chance:
         return fit, None
     tried = solve(fit.tracks, fit.unknowns, fit.noise, one.columns)
     estimate = np.linalg.pinv(one.columns) @ tried.unknowns.theta
@@ -148,18 +148,16 @@ def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
     """
     own = replace(fit.tracks, depth=np.full(len(fit.tracks.depth), np.nan)).subset(outliers)
     still = np.tile(own.poses[:1], (len(own.poses), 1, 1))
-    starts = (replace(own, poses=poses) for poses in (still, own.poses))
-    fits = (_fit_from_afar(start, fit.noise) for start in starts)
+    wide = Noise(WIDE * fit.noise.pixel, WIDE * fit.noise.depth)
+    fits = []
+    for start in (replace(own, poses=still), own):
+        near = solve(start, start_of(start), wide, iterations=FIRST_STEPS)
+        fits.append(solve(start, near.unknowns, fit.noise))
     other = max(fits, key=lambda one: float(one.linear.weight[:, 0].sum()))
     theirs = np.zeros(len(outliers), bool)
     theirs[np.flatnonzero(outliers)[~_outliers(other)]] = True
     confirmed = np.mean(theirs[fit.tracks.track]) >= MIN_SECOND_MOTION_SHARE and _predicts(other)
-    return theirs if confirmed else np.zeros(len(outliers), bool)
-
-
-def _fit_from_afar(tracks: Tracks, noise: Noise) -> Fit:
-    wide = Noise(WIDE * noise.pixel, WIDE * noise.depth)
-    return solve(tracks, solve(tracks, start_of(tracks), wide, iterations=FIRST_STEPS).unknowns, noise)
+    return theirs & confirmed
 
 
 def _predicts(motion: Fit) -> bool:
@@ -167,8 +165,84 @@ def _predicts(motion: Fit) -> bool:
 
     Free poses fit few tracks in any case.
     """
-    half = np.arange(len(motion.tracks.first)) % 2 == 0
-    first = solve(*motion.part(half))
-    tracks, start, noise = motion.part(~half)
+    first = solve(*motion.part(motion.tracks.even))
+    tracks, start, noise = motion.part(~motion.tracks.even)
     second = solve(tracks, replace(start, poses=first.unknowns.poses), noise, poses_free=False)
-    return float(np.mean(_outliers(second))) < MAX_UNPREDICTED
+    return float(np.mean(_outliers(second))) < thresholds.MAX_UNPREDICTED
+
+
+def with_own_noise(fit: Fit) -> Fit:
+    """Repeat a fit of free poses with the noise that its residuals show."""
+    tracks, residual, count = fit.tracks, fit.linear.residual, 2 * len(fit.tracks.frame)
+    freedom = max(count - 3 * len(tracks.first) - 6 * len(tracks.rows), 0.15 * count)
+    pixel = fit.noise.pixel * sigma_by_median(residual[:, :2]) * np.sqrt(count / freedom)
+    known = np.isfinite(tracks.depth)
+    shared = residual[known, 2] * np.sqrt(tracks.depths[known])  # the error of a depth is common to its track
+    depth = fit.noise.depth * (sigma_by_median(shared) if known.any() else 1.0)
+    least = thresholds.MIN_PIXEL_NOISE, thresholds.MIN_RELATIVE_DEPTH_NOISE
+    return solve(tracks, fit.unknowns, Noise(*np.maximum((pixel, depth), least).tolist()), fit.columns)
+
+
+def preferred(fit: Fit) -> bool:
+    """Return whether the tracks prefer a fit with free poses to the claim, beyond chance, its unknowns paid for."""
+    claim = solve(fit.tracks, start_of(fit.tracks), fit.noise, poses_free=False)
+    gain = fit.tracks.sums(claim.linear.loss - fit.linear.loss)
+    unknowns = 6 * (len(fit.tracks.rows) - 1) + fit.columns.shape[1]
+    return bool(gain.sum() - unknowns > norm.isf(SIGNIFICANCE) * np.sqrt(len(gain)) * gain.std())
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """The calibration's share of a fit, poses and points eliminated.
+
+    side: float64 [SIZE], the score; information, clustered: [SIZE, SIZE], `H`, and the covariance of the score.
+    """
+
+    side: np.ndarray
+    information: np.ndarray
+    clustered: np.ndarray
+
+    def gain(self, columns: np.ndarray) -> float:
+        """Return the decrease of minus twice the log likelihood that a linear step of `columns` promises."""
+        side = columns.T @ self.side
+        return float(side @ np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True) @ side)
+
+    def covariance(self, columns: np.ndarray) -> np.ndarray:
+        """Return the robust covariance of the calibration's `columns` [SIZE, k], float64 [k, k]."""
+        inverse = np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True)
+        return np.asarray(inverse @ (columns.T @ self.clustered @ columns) @ inverse + 1e-3 * inverse)
+
+    @property
+    def as_one(self) -> float:
+        """Observations that count as one, in the mean over the directions that the corners determine."""
+        information, clustered = np.diag(self.information), np.diag(self.clustered)
+        known = information > 0
+        return max(float(np.mean(clustered[known] / information[known])) + 1e-3, 1.0) if known.any() else 1.0
+
+
+def scores(fit: Fit) -> Scores:
+    """Return the scores of the whole calibration at a fit, whatever was free there."""
+    tracks, linear = fit.tracks, fit.linear
+    reduced = reduce(tracks, linear, np.eye(SIZE), True, 0.0)
+    width = 6 * len(tracks.rows)
+    poses = np.zeros((width, SIZE))
+    poses[6:] = -np.linalg.solve(reduced.matrix[6:width, 6:width], reduced.matrix[6:width, width:])
+    points = -np.swapaxes(reduced.inverse, 1, 2) @ (reduced.coupling @ np.vstack([poses, np.eye(SIZE)]))
+    along = linear.by_theta + linear.by_point @ points[tracks.track]
+    along += linear.by_pose @ poses.reshape(-1, 6, SIZE)[tracks.frame]
+    weighted = along * linear.weight[:, :, None]
+    each = -(np.swapaxes(weighted, 1, 2) @ linear.residual[:, :, None])[:, :, 0]
+    # Second derivative of Cauchy's kernel over its weight: what the weights alone overstate of the information.
+    square = np.sum(weighted * along, 2)
+    curved = np.sum(square * (2.0 * linear.weight - 1.0)) / max(float(np.sum(square)), 1e-300)
+    information = np.tensordot(weighted, along, ((0, 1), (0, 1)))
+    clustered = _clustered(each, tracks.track) + _clustered(each, tracks.frame) - each.T @ each
+    return Scores(each.sum(0), information, clustered / max(float(curved), 0.3) ** 2)
+
+
+def _clustered(each: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """Sum of squared scores of the clusters, about their mean: what all have in common is the signal."""
+    sums = np.zeros((of.max() + 1, each.shape[1]))
+    np.add.at(sums, of, each)
+    sums -= sums.mean(0)
+    return np.asarray(sums.T @ sums)

@@ -12,6 +12,7 @@ from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA, Readou
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.verdict.thresholds import MAX_PLACE_ERROR, MAX_PLACE_ERROR_SHARE
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,7 @@ class Claim:
     def of(cls, slam: Slam) -> Self:
         """Return the claim of a state."""
         times, poses = frame_poses(slam)
+        known = slam.camera.calibrated or slam.camera.self_calibrated
         return cls(
             frames=np.array([record.frame for record in slam.frames], int),
             times=times,
@@ -50,15 +52,24 @@ class Claim:
             submaps=max(len(submaps_by_size(slam)), 1),
             started=any(np.isfinite(keyframe.points.inverse_depth).any() for keyframe in slam.keyframes),
             began_in_known_map=any(keyframe.frame < 0 for keyframe in slam.keyframes),
-            guessed=not (slam.camera.calibrated or slam.camera.self_calibrated)
-            and len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA,
+            guessed=not known and len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA,
             readout=slam.camera.readout,
         )
 
     def __len__(self) -> int:
         return len(self.frames)
 
+    def span(self, first: int, last: int) -> tuple[int, int, str]:
+        """Return the numbers of the frames in two rows, and a text with them and their times."""
+        start, end = int(self.frames[first]), int(self.frames[last])
+        return start, end, f"frames {start} to {end} ({self.times[first]:.1f} to {self.times[last]:.1f} s)"
+
 
 def extent(poses: np.ndarray) -> float:
-    """Return the RMS distance of the places from their mean, of poses world -> camera [n, 4, 4]."""
-    return float(np.sqrt(np.sum(rigid.centres(poses).var(0))))
+    """Return the RMS distance of the places from their mean, of poses world -> camera [n, 4, 4], above zero."""
+    return max(float(np.sqrt(np.sum(rigid.centres(poses).var(0)))), 1e-12)
+
+
+def max_place_error(metric: bool, poses: np.ndarray) -> float:
+    """Return the largest RMS error of these places that does not matter, in the unit of the map."""
+    return MAX_PLACE_ERROR if metric else MAX_PLACE_ERROR_SHARE * extent(poses)

@@ -14,11 +14,11 @@ the reduced system of poses and calibration is dense: at most `6 * 24 + 13` unkn
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.slam.verdict.corner_tracks import KNOTS, Tracks
 
 KERNEL = 2.0
 """Width of Cauchy's kernel, in standard deviations of the noise."""
@@ -30,8 +30,6 @@ FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e3
 """Of Levenberg and Marquardt, as a share of the diagonal."""
 LINEAR = 0.5
 """Of the decrease of the energy that a step promises: with less, the points are solved once more for its poses."""
-KNOTS = 4
-"""Of a quantity that changes with time: linear between so many moments, evenly spread over the window."""
 FOCAL = slice(0, KNOTS)
 DRIFT = slice(KNOTS, 2 * KNOTS)
 CENTRE = slice(2 * KNOTS, 2 * KNOTS + 2)
@@ -43,65 +41,6 @@ HELD = np.zeros((SIZE, 0))
 """Columns of a calibration that is not free."""
 HUGE = 1e3
 """Whitened residual of a point behind a camera."""
-
-
-@dataclass(frozen=True, eq=False)
-class Tracks:
-    """Corner tracks of a few frames, and what the run claims of these.
-
-    rows: int [f], of the run. times: float64 [f], s. poses: float64 [f, 4, 4], world -> camera. intrinsics: fx, fy, cx,
-    cy. size: width, height, pixels. frame, track: int [m], of each observation, sorted by track. pixels: float64
-    [m, 2]. depth: float64 [m], metres, NaN where it was not measured or the map is not metric. readout: float64
-    [m, 2], pixels by which a rolling shutter of one second moves the corner.
-    """
-
-    rows: np.ndarray
-    times: np.ndarray
-    poses: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple[int, int]
-    frame: np.ndarray
-    track: np.ndarray
-    pixels: np.ndarray
-    depth: np.ndarray
-    readout: np.ndarray
-
-    @cached_property
-    def first(self) -> np.ndarray:
-        """First observation of each track, int [t]."""
-        return np.flatnonzero(np.r_[True, self.track[1:] != self.track[:-1]])
-
-    @cached_property
-    def from_anchor(self) -> np.ndarray:
-        """From the camera that the run claims for the track's first frame to the world, float64 [m, 4, 4]."""
-        return rigid.invert(self.poses[self.frame[self.first]])[self.track]
-
-    @cached_property
-    def depths(self) -> np.ndarray:
-        """The number of measured depths of each observation's track, at least 1, float64 [m]."""
-        return np.maximum(self.sums(np.isfinite(self.depth).astype(np.float64)), 1.0)[self.track]
-
-    @cached_property
-    def knots(self) -> np.ndarray:
-        """Weights that interpolate between the knots, of each observation: float64 [m, KNOTS]."""
-        span = max(float(self.times[-1] - self.times[0]), 1e-9)
-        at = (self.times - self.times[0]) / span * (KNOTS - 1)
-        return np.maximum(1.0 - np.abs(at[:, None] - np.arange(KNOTS)), 0.0)[self.frame]
-
-    @property
-    def with_depth(self) -> bool:
-        """Whether any depth was measured."""
-        return bool(np.isfinite(self.depth).any())
-
-    def sums(self, values: np.ndarray) -> np.ndarray:
-        """Sum values [m, ...] over the observations of each track: [t, ...]."""
-        return np.asarray(np.add.reduceat(values, self.first, axis=0))
-
-    def subset(self, kept: np.ndarray) -> Tracks:
-        """Return the tracks of which `kept`, bool [t], is true."""
-        rows = kept[self.track]
-        parts = {name: getattr(self, name)[rows] for name in ("frame", "pixels", "depth", "readout")}
-        return replace(self, **parts, track=(np.cumsum(kept) - 1)[self.track[rows]])
 
 
 @dataclass(frozen=True)
@@ -183,16 +122,15 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
 
     measured = np.column_stack([tracks.pixels, np.log(tracks.depth)])
     known = np.isfinite(measured) & ~behind[:, None]
-    whiten = np.full((count, 3), 1.0 / noise.pixel)
     # The error of a measured depth is common to its track.
-    whiten[:, 2] = 1.0 / (noise.depth * np.sqrt(tracks.depths))
-    residual = np.where(known, (predicted - np.where(known, measured, 0.0)) * whiten, 0.0)
-    whiten = np.where(known, whiten, 0.0)[:, :, None]
+    sigma = np.column_stack([np.full((count, 2), noise.pixel), noise.depth * np.sqrt(tracks.depths)])
+    whiten = np.where(known, 1.0 / sigma, 0.0)
+    residual = (predicted - np.where(known, measured, 0.0)) * whiten
     square = np.column_stack([np.sum(residual[:, :2] ** 2, 1), residual[:, 2] ** 2]) / KERNEL**2
     square[behind, 0] = (HUGE / KERNEL) ** 2
     weight = (1.0 / (1.0 + square))[:, [0, 0, 1]]
     loss = KERNEL**2 * np.log1p(square).sum(1)
-    return Linear(residual, weight, whiten * by_pose, whiten * by_point, whiten * by_theta, loss)
+    return Linear(residual, weight, *(whiten[:, :, None] * by for by in (by_pose, by_point, by_theta)), loss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,60 +212,50 @@ def solve(
     iterations: int = ITERATIONS,
 ) -> Fit:
     """Minimise over points, poses where `poses_free`, and the calibration's `columns` (float64 [SIZE, k])."""
-    unknowns, damping = start, FIRST_DAMPING
-    linear = linearise(tracks, unknowns, noise)
+    unknowns, damping, linear = start, FIRST_DAMPING, linearise(tracks, start, noise)
     width = 6 * len(tracks.poses) * poses_free
     free = slice(6 * poses_free, None)  # the first pose fixes the gauge
     for _ in range(iterations):
         reduced = reduce(tracks, linear, columns, poses_free, damping)
         step = np.zeros(len(reduced.side))
-        if len(step[free]):
-            step[free] = np.linalg.solve(reduced.matrix[free, free], reduced.side[free])
+        step[free] = np.linalg.solve(reduced.matrix[free, free], reduced.side[free])
         poses = rigid.moved(unknowns.poses, step[:width].reshape(-1, 6)) if poses_free else unknowns.poses
-        points = unknowns.points + np.clip(reduced.points(step), -1.0, 1.0)
-        tried = Unknowns(poses, points, unknowns.theta + columns @ step[width:])
+        tried = Unknowns(poses, _moved(unknowns.points, reduced, step), unknowns.theta + columns @ step[width:])
         there = linearise(tracks, tried, noise)
         if len(step) and linear.energy - there.energy < LINEAR * reduced.gain(step):
-            tried = _with_own_points(tracks, tried, there)
+            # Points follow a long step of poses and focal length on a curve; without a step of their own the iteration
+            # creeps along it (embedded point iterations, Jeong et al. 2012).
+            own = reduce(tracks, there, HELD, False, FIRST_DAMPING)
+            tried = replace(tried, points=_moved(tried.points, own, np.zeros(0)))
             there = linearise(tracks, tried, noise)
-        if not there.energy < linear.energy:
+        if there.energy < linear.energy:
+            ended = linear.energy - there.energy < CONVERGED * linear.energy
+            unknowns, linear, damping = tried, there, max(damping / 10.0, 1e-10)
+        else:
             damping *= 10.0
-            if damping > LAST_DAMPING:
-                break
-            continue
-        ended = linear.energy - there.energy < CONVERGED * linear.energy
-        unknowns, linear, damping = tried, there, max(damping / 10.0, 1e-10)
+            ended = damping > LAST_DAMPING
         if ended:
             break
     return Fit(tracks, noise, unknowns, linear, columns)
 
 
-def _with_own_points(tracks: Tracks, unknowns: Unknowns, linear: Linear) -> Unknowns:
-    """Take a step of the points alone.
-
-    Points follow a long step of poses and focal length on a curve; without this the iteration creeps along it (embedded
-    point iterations, Jeong et al. 2012).
-    """
-    reduced = reduce(tracks, linear, HELD, False, FIRST_DAMPING)
-    return replace(unknowns, points=unknowns.points + np.clip(reduced.points(np.zeros(0)), -1.0, 1.0))
+def _moved(points: np.ndarray, reduced: Reduced, step: np.ndarray) -> np.ndarray:
+    return points + np.clip(reduced.points(step), -1.0, 1.0)
 
 
 def start_of(tracks: Tracks) -> Unknowns:
     """Triangulate points with the claimed poses, in front of the cameras."""
     relative = tracks.poses[tracks.frame] @ tracks.from_anchor
-    rays = np.column_stack(
-        [(tracks.pixels - tracks.intrinsics[2:]) / tracks.intrinsics[:2], np.ones(len(tracks.frame))]
-    )
+    rays = pinhole.rays(tracks.pixels, tracks.intrinsics)
     own = rays[tracks.first]
     turned = (relative[:, :3, :3] @ own[tracks.track][:, :, None])[:, :, 0]
-    lever = np.cross(relative[:, :3, 3], rays)
+    lever = rigid.cross(relative[:, :3, 3], rays)
     information = tracks.sums(np.sum(lever**2, 1))
-    value = tracks.sums(-np.sum(lever * np.cross(turned, rays), 1)) / np.maximum(information, 1e-12)
-    known = (value > 0) & (information > 0)
-    middle = float(np.median(value[known])) if known.any() else 1.0
+    value = tracks.sums(-np.sum(lever * rigid.cross(turned, rays), 1)) / np.maximum(information, 1e-12)
+    triangulated = np.where((value > 0) & (information > 0), value, np.nan)
     measured = 1.0 / tracks.depth[tracks.first]
-    if np.isfinite(measured).any():
-        middle = float(np.nanmedian(measured))
-    inverse = np.where(np.isfinite(measured), measured, np.where(known, value, middle))
-    inverse = np.clip(inverse, 0.02 * middle, 20.0 * middle)
+    usual = measured if np.isfinite(measured).any() else triangulated
+    middle = float(np.nanmedian(usual)) if np.isfinite(usual).any() else 1.0
+    inverse = np.where(np.isfinite(measured), measured, triangulated)
+    inverse = np.clip(np.nan_to_num(inverse, nan=middle), 0.02 * middle, 20.0 * middle)
     return Unknowns(tracks.poses, np.column_stack([own[:, :2], np.log(inverse)]), np.zeros(SIZE))

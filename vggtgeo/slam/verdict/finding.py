@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Literal, Self, get_args
-
-import numpy as np
 
 Level = Literal["good", "degraded", "failed"]
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -27,6 +26,10 @@ class Finding:
     end: int | None = None
     scale: bool = False
     local: bool = False
+
+    def concerns(self, frame: int) -> bool:
+        """Return whether the finding is about this frame."""
+        return (self.start is None or self.start <= frame) and (self.end is None or frame <= self.end)
 
 
 @dataclass(frozen=True)
@@ -116,26 +119,13 @@ def conclude(findings: Iterable[Finding], frames: Sequence[int], times: Sequence
 
 def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence[float]) -> tuple[Segment, ...]:
     """Group consecutive frames that the same findings concern."""
-    found: list[Segment] = []
-    for frame, time in zip(frames, times, strict=True):
-        here = [
-            one
-            for one in reasons
-            if (one.start is None or one.start <= frame) and (one.end is None or frame <= one.end)
-        ]
-        level, checks = worst(one.level for one in here), tuple(dict.fromkeys(one.check for one in here))
-        if found and (found[-1].level, found[-1].checks) == (level, checks):
-            found[-1] = replace(found[-1], end=int(frame), end_time=float(time))
-        else:
-            found.append(Segment(int(frame), int(frame), float(time), float(time), level, checks))
+
+    def state(row: int) -> tuple[Level, tuple[str, ...]]:
+        here = [one for one in reasons if one.concerns(frames[row])]
+        return worst(one.level for one in here), tuple(dict.fromkeys(one.check for one in here))
+
+    found = []
+    for (level, checks), group in groupby(range(len(frames)), state):
+        rows = list(group)
+        found.append(Segment(frames[rows[0]], frames[rows[-1]], times[rows[0]], times[rows[-1]], level, checks))
     return tuple(found)
-
-
-def spans(rows: np.ndarray, join: int = 1) -> list[tuple[int, int]]:
-    """Return first and last row of each run of True values of bool [n]; runs at most `join` rows apart are merged."""
-    marked = np.nonzero(rows)[0]
-    if not len(marked):
-        return []
-    cuts = np.nonzero(np.diff(marked) > join)[0]
-    firsts, lasts = np.r_[0, cuts + 1], np.r_[cuts, len(marked) - 1]
-    return [(int(marked[a]), int(marked[b])) for a, b in zip(firsts, lasts, strict=True)]
