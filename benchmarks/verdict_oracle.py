@@ -111,9 +111,9 @@ def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray)
         starts = (replace(free.unknowns, theta=theta), replace(_started(tracks, poses), theta=theta))
         fits = [solve(planted, one, free.noise, iterations=40) for one in starts]
         plain = solve(tracks, free.unknowns, free.noise, iterations=40)
-        gain = plain.linear.energy - min(fit.linear.energy for fit in fits)
+        gain = plain.energy - min(fit.energy for fit in fits)
     elif case["degradation"] == "cut":
-        gain = free.linear.energy - solve(tracks, _started(tracks, poses), free.noise).linear.energy
+        gain = free.energy - solve(tracks, _started(tracks, poses), free.noise).energy
     return Window(*errors, gain / scores(free).as_one)
 
 

@@ -1,4 +1,4 @@
-"""Gauss-Newton for a pose, a camera or a few offsets, in numpy; problems with landmarks use `vggtgeo.solve`.
+"""Gauss-Newton and Levenberg-Marquardt in numpy; maps use `vggtgeo.solve`.
 
 With the residuals `r` and their Jacobian `J` by a local step, each iteration takes `dx = -(J^T W J)^-1 J^T W r` (the
 weights `W` of a robust kernel, Huber and Ronchetti 2009, section 7.8) and halves it until the energy falls.
@@ -45,6 +45,36 @@ def gauss_newton(
         if gain < _GAIN * energy + 1e-12:
             return current
     return current
+
+
+def levenberg_marquardt(
+    start: Point,
+    energy: Callable[[Point], float],
+    stepped: Callable[[Point, float], Point],
+    *,
+    iterations: int,
+    gain: float,
+    damping: float = 1e-5,
+    max_damping: float = 1e3,
+) -> Point:
+    """Return the point to which Levenberg-Marquardt descends from `start` (Nocedal and Wright 2006, section 10.3).
+
+    energy: at a point, never negative. stepped: returns the point after a step with a damping, a share of the diagonal
+    of the Hessian. The damping falls tenfold after a decrease of the energy, and rises tenfold where there is none.
+    gain: relative decrease of the energy below which the iteration has converged.
+    """
+    for _ in range(iterations):
+        trial = stepped(start, damping)
+        before, after = energy(start), energy(trial)
+        if after < before:
+            start, damping = trial, max(damping / 10.0, 1e-10)
+            if before - after < gain * before:
+                break
+        else:
+            damping *= 10.0
+            if damping > max_damping:
+                break
+    return start
 
 
 def damped_step(hessian: np.ndarray, gradient: np.ndarray) -> np.ndarray:

@@ -43,7 +43,7 @@ def test_eliminated_points_give_the_dense_step() -> None:
     tracks, at = _perturbed()
     linear = linearise(tracks, at, NOISE)
     columns = np.eye(SIZE)[:, [0, 8, 10]]
-    reduced = reduce(tracks, linear, columns, True, 1e-3)
+    reduced = reduce(linear, columns, True, 1e-3)
     frames, count = len(tracks.poses), len(tracks.first)
     width = 6 * frames + 3
     rows = np.zeros((3 * len(tracks.frame), width + 3 * count))

@@ -119,7 +119,7 @@ def explain(tracks: Tracks) -> Explanation:
             rival = float(np.mean(theirs[tracks.track]))
             free = with_own_noise(solve(*free.part(~theirs)))
             best, added = _selected(free)
-    return Explanation(best, added, float(np.mean(free.linear.weight[:, 0] > MIN_INLIER_WEIGHT)) * (1.0 - rival), rival)
+    return Explanation(best, added, float(np.mean(free.weight[:, 0] > MIN_INLIER_WEIGHT)) * (1.0 - rival), rival)
 
 
 def _selected(fit: Fit) -> tuple[Fit, Added | None]:
@@ -137,7 +137,7 @@ def _selected(fit: Fit) -> tuple[Fit, Added | None]:
 
 def _outliers(fit: Fit) -> np.ndarray:
     """Return the tracks that a fit does not explain, bool [t]."""
-    sums = fit.tracks.sums(np.column_stack([fit.linear.weight[:, 0], np.ones(len(fit.tracks.frame))]))
+    sums = fit.tracks.sums(np.column_stack([fit.weight[:, 0], np.ones(len(fit.tracks.frame))]))
     return np.asarray(sums[:, 0] < MIN_INLIER_WEIGHT * sums[:, 1])
 
 
@@ -153,7 +153,7 @@ def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
     for start in (replace(own, poses=still), own):
         near = solve(start, start_of(start), wide, iterations=FIRST_STEPS)
         fits.append(solve(start, near.unknowns, fit.noise))
-    other = max(fits, key=lambda one: float(one.linear.weight[:, 0].sum()))
+    other = max(fits, key=lambda one: float(one.weight[:, 0].sum()))
     theirs = np.zeros(len(outliers), bool)
     theirs[np.flatnonzero(outliers)[~_outliers(other)]] = True
     confirmed = np.mean(theirs[fit.tracks.track]) >= MIN_SECOND_MOTION_SHARE and _predicts(other)
@@ -173,7 +173,7 @@ def _predicts(motion: Fit) -> bool:
 
 def with_own_noise(fit: Fit) -> Fit:
     """Repeat a fit of free poses with the noise that its residuals show."""
-    tracks, residual, count = fit.tracks, fit.linear.residual, 2 * len(fit.tracks.frame)
+    tracks, residual, count = fit.tracks, fit.residual, 2 * len(fit.tracks.frame)
     freedom = max(count - 3 * len(tracks.first) - 6 * len(tracks.rows), 0.15 * count)
     pixel = fit.noise.pixel * sigma_by_median(residual[:, :2]) * np.sqrt(count / freedom)
     known = np.isfinite(tracks.depth)
@@ -186,7 +186,7 @@ def with_own_noise(fit: Fit) -> Fit:
 def preferred(fit: Fit) -> bool:
     """Return whether the tracks prefer a fit with free poses to the claim, beyond chance, its unknowns paid for."""
     claim = solve(fit.tracks, start_of(fit.tracks), fit.noise, poses_free=False)
-    gain = fit.tracks.sums(claim.linear.loss - fit.linear.loss)
+    gain = fit.tracks.sums(claim.loss - fit.loss)
     unknowns = 6 * (len(fit.tracks.rows) - 1) + fit.columns.shape[1]
     return bool(gain.sum() - unknowns > norm.isf(SIGNIFICANCE) * np.sqrt(len(gain)) * gain.std())
 
@@ -222,19 +222,18 @@ class Scores:
 
 def scores(fit: Fit) -> Scores:
     """Return the scores of the whole calibration at a fit, whatever was free there."""
-    tracks, linear = fit.tracks, fit.linear
-    reduced = reduce(tracks, linear, np.eye(SIZE), True, 0.0)
+    tracks, reduced = fit.tracks, reduce(fit, np.eye(SIZE), True, 0.0)
     width = 6 * len(tracks.rows)
     poses = np.zeros((width, SIZE))
     poses[6:] = -np.linalg.solve(reduced.matrix[6:width, 6:width], reduced.matrix[6:width, width:])
     points = -np.swapaxes(reduced.inverse, 1, 2) @ (reduced.coupling @ np.vstack([poses, np.eye(SIZE)]))
-    along = linear.by_theta + linear.by_point @ points[tracks.track]
-    along += linear.by_pose @ poses.reshape(-1, 6, SIZE)[tracks.frame]
-    weighted = along * linear.weight[:, :, None]
-    each = -(np.swapaxes(weighted, 1, 2) @ linear.residual[:, :, None])[:, :, 0]
+    along = fit.by_theta + fit.by_point @ points[tracks.track]
+    along += fit.by_pose @ poses.reshape(-1, 6, SIZE)[tracks.frame]
+    weighted = along * fit.weight[:, :, None]
+    each = -(np.swapaxes(weighted, 1, 2) @ fit.residual[:, :, None])[:, :, 0]
     # Second derivative of Cauchy's kernel over its weight: what the weights alone overstate of the information.
     square = np.sum(weighted * along, 2)
-    curved = np.sum(square * (2.0 * linear.weight - 1.0)) / max(float(np.sum(square)), 1e-300)
+    curved = np.sum(square * (2.0 * fit.weight - 1.0)) / max(float(np.sum(square)), 1e-300)
     information = np.tensordot(weighted, along, ((0, 1), (0, 1)))
     clustered = _clustered(each, tracks.track) + _clustered(each, tracks.frame) - each.T @ each
     return Scores(each.sum(0), information, clustered / max(float(curved), 0.3) ** 2)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.gauss_newton import levenberg_marquardt
 from vggtgeo.slam.verdict.corner_tracks import KNOTS, Tracks
 
 KERNEL = 2.0
@@ -25,9 +26,9 @@ KERNEL = 2.0
 TETHER = 1e-4
 """Information on each unknown of a pose: holds the scale of a map without depth, and a frame without corners."""
 ITERATIONS, CONVERGED = 12, 5e-4
-"""At most; and the relative decrease of the energy below which the iteration ends."""
-FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e3
-"""Of Levenberg and Marquardt, as a share of the diagonal."""
+"""Maximum number, and the relative decrease of the energy below which the iteration ends."""
+DAMPING = 1e-5
+"""Of Levenberg and Marquardt at the beginning, as a share of the diagonal."""
 LINEAR = 0.5
 """Of the decrease of the energy that a step promises: with less, the points are solved once more for its poses."""
 FOCAL = slice(0, KNOTS)
@@ -61,11 +62,18 @@ class Unknowns:
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
-    """Residuals, whitened, [m, 3], robust weights [m, 3], derivatives by pose [m, 3, 6], point [m, 3, 3] and
-    calibration [m, 3, SIZE]; loss: minus twice the robust log likelihood of each corner with its depth, [m].
+class Fit:
+    """Tracks at some unknowns, those of a minimum after `solve`; the residuals there, and their derivatives.
+
+    columns: float64 [SIZE, k], what of the calibration is free. residual: [m, 3], whitened; weight: [m, 3], robust.
+    by_pose: [m, 3, 6]; by_point: [m, 3, 3]; by_theta: [m, 3, SIZE]. loss: [m], minus twice the robust log likelihood of
+    each corner with its depth.
     """
 
+    tracks: Tracks
+    noise: Noise
+    unknowns: Unknowns
+    columns: np.ndarray
     residual: np.ndarray
     weight: np.ndarray
     by_pose: np.ndarray
@@ -78,9 +86,13 @@ class Linear:
         """Sum of the loss."""
         return float(self.loss.sum())
 
+    def part(self, kept: np.ndarray) -> tuple[Tracks, Unknowns, Noise]:
+        """Return the arguments with which `solve` continues for the tracks of which `kept`, bool [t], is true."""
+        return self.tracks.subset(kept), replace(self.unknowns, points=self.unknowns.points[kept]), self.noise
 
-def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
-    """Return residuals and their derivatives at a point."""
+
+def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndarray = HELD) -> Fit:
+    """Return residuals and their derivatives at some unknowns."""
     theta, knots, count = unknowns.theta, tracks.knots, len(tracks.frame)
     relative = unknowns.poses[tracks.frame] @ tracks.from_anchor
     a, b, log_inverse = unknowns.points[tracks.track].T
@@ -98,14 +110,12 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
     focal = np.exp(knots @ theta[FOCAL])[:, None] * tracks.intrinsics[:2]
     seen = focal * (normalised * stretch + theta[CENTRE])
     depth = np.maximum(z / inverse + theta[OFFSET], 1e-3)
-    predicted = np.column_stack(
-        [seen + tracks.intrinsics[2:] + theta[READOUT] * tracks.readout, np.log(depth) + knots @ theta[DRIFT]]
-    )
+    pixels = seen + tracks.intrinsics[2:] + theta[READOUT] * tracks.readout
+    predicted = np.column_stack([pixels, np.log(depth) + knots @ theta[DRIFT]])
 
-    by_normalised = 2.0 * theta[RADIAL] * normalised[:, :, None] * normalised[:, None, :]
-    by_normalised = focal[:, :, None] * (by_normalised + stretch[:, :, None] * np.eye(2))
+    bent = 2.0 * theta[RADIAL] * normalised[:, :, None] * normalised[:, None, :]
     by_scaled, by_theta = np.zeros((count, 3, 3)), np.zeros((count, 3, SIZE))
-    by_scaled[:, :2, :2] = by_normalised / z[:, None, None]
+    by_scaled[:, :2, :2] = focal[:, :, None] * (bent + stretch[:, :, None] * np.eye(2)) / z[:, None, None]
     by_scaled[:, :2, 2] = -(by_scaled[:, :2, :2] @ normalised[:, :, None])[:, :, 0]
     by_scaled[:, 2, 2] = 1.0 / (inverse * depth)
     by_theta[:, :2, FOCAL] = seen[:, :, None] * knots[:, None]
@@ -116,9 +126,7 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
     by_theta[:, 2, OFFSET] = 1.0 / depth
     by_point = by_scaled @ np.stack([turn[:, :, 0], turn[:, :, 1], shift], 2)
     by_point[:, 2, 2] -= z / (inverse * depth)
-    zero, (x, y, _) = np.zeros(count), scaled.T
-    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
-    by_pose = np.concatenate([by_scaled * inverse[:, None, None], by_scaled @ cross], 2)
+    by_pose = np.concatenate([by_scaled * inverse[:, None, None], by_scaled @ -rigid.skew(scaled)], 2)
 
     measured = np.column_stack([tracks.pixels, np.log(tracks.depth)])
     known = np.isfinite(measured) & ~behind[:, None]
@@ -130,7 +138,8 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
     square[behind, 0] = (HUGE / KERNEL) ** 2
     weight = (1.0 / (1.0 + square))[:, [0, 0, 1]]
     loss = KERNEL**2 * np.log1p(square).sum(1)
-    return Linear(residual, weight, *(whiten[:, :, None] * by for by in (by_pose, by_point, by_theta)), loss)
+    jacobians = [whiten[:, :, None] * by for by in (by_pose, by_point, by_theta)]
+    return Fit(tracks, noise, unknowns, columns, residual, weight, *jacobians, loss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,60 +156,46 @@ class Reduced:
     point_side: np.ndarray
 
     def points(self, step: np.ndarray) -> np.ndarray:
-        """Step of the points, [t, 3], that belongs to one of the rest, [n]."""
+        """Step of the points, [t, 3], that belongs to one of the rest, [n]; at most 1, far beyond what is linear."""
         right = self.point_side - self.coupling @ step
-        return np.asarray((np.swapaxes(self.inverse, 1, 2) @ right[:, :, None])[:, :, 0])
+        return np.clip((np.swapaxes(self.inverse, 1, 2) @ right[:, :, None])[:, :, 0], -1.0, 1.0)
 
     def gain(self, step: np.ndarray) -> float:
         """Return the decrease of the energy that this step, [n], promises."""
         return float(np.sum(self.point_side**2) + self.side @ step)
 
 
-def reduce(tracks: Tracks, linear: Linear, columns: np.ndarray, poses_free: bool, damping: float) -> Reduced:
+def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> Reduced:
     """Eliminate the points. columns: float64 [SIZE, k], what of the calibration is free.
 
     The negative residual goes along as one more column: what becomes of it is the right-hand side.
     """
+    tracks = fit.tracks
     frames, count = len(tracks.poses), len(tracks.first)
-    weighted = lambda by: np.swapaxes(by * linear.weight[:, :, None], 1, 2)
-    rest = np.concatenate([linear.by_theta @ columns, -linear.residual[:, :, None]], 2)
-    point, width = weighted(linear.by_point), 6 * frames * poses_free
+    weighted = lambda by: np.swapaxes(by * fit.weight[:, :, None], 1, 2)
+    rest = np.concatenate([fit.by_theta @ columns, -fit.residual[:, :, None]], 2)
+    point, width = weighted(fit.by_point), 6 * frames * poses_free
     size = width + rest.shape[2]
     coupling, matrix = np.zeros((count, 3, size)), np.zeros((size, size))
     coupling[:, :, width:] = tracks.sums(point @ rest)
-    matrix[width:, width:] = np.tensordot(rest * linear.weight[:, :, None], rest, ((0, 1), (0, 1)))
+    matrix[width:, width:] = np.tensordot(rest * fit.weight[:, :, None], rest, ((0, 1), (0, 1)))
     if poses_free:
-        pose, each = weighted(linear.by_pose), np.arange(frames)
+        pose, each = weighted(fit.by_pose), np.arange(frames)
         of_frames = lambda values: np.tensordot(1.0 * (tracks.frame == each[:, None]), values, 1)
-        coupling[:, :, :width].reshape(count, 3, frames, 6)[tracks.track, :, tracks.frame] = point @ linear.by_pose
-        matrix[:width, :width].reshape(frames, 6, frames, 6)[each, :, each] = of_frames(pose @ linear.by_pose)
+        coupling[:, :, :width].reshape(count, 3, frames, 6)[tracks.track, :, tracks.frame] = point @ fit.by_pose
+        matrix[:width, :width].reshape(frames, 6, frames, 6)[each, :, each] = of_frames(pose @ fit.by_pose)
         matrix[:width, width:] = of_frames(pose @ rest).reshape(width, -1)
         matrix[width:, :width] = matrix[:width, width:].T
     diagonal = np.arange(size - 1)
     matrix[diagonal, diagonal] *= 1.0 + damping
     matrix[diagonal[:width], diagonal[:width]] += TETHER
-    own = tracks.sums(point @ linear.by_point)
+    own = tracks.sums(point @ fit.by_point)
     own[:, range(3), range(3)] *= 1.0 + damping
     inverse = np.linalg.inv(np.linalg.cholesky(own + 1e-6 * np.eye(3)))
     coupling = inverse @ coupling
     flat = coupling.reshape(3 * count, size)
     matrix -= flat.T @ flat
     return Reduced(matrix[:-1, :-1], matrix[:-1, -1], inverse, coupling[:, :, :-1], coupling[:, :, -1])
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A minimum: of what, with which noise, the unknowns, the linearisation there, and what was free."""
-
-    tracks: Tracks
-    noise: Noise
-    unknowns: Unknowns
-    linear: Linear
-    columns: np.ndarray
-
-    def part(self, kept: np.ndarray) -> tuple[Tracks, Unknowns, Noise]:
-        """Return the arguments with which `solve` continues for the tracks of which `kept`, bool [t], is true."""
-        return self.tracks.subset(kept), replace(self.unknowns, points=self.unknowns.points[kept]), self.noise
 
 
 def solve(
@@ -212,35 +207,26 @@ def solve(
     iterations: int = ITERATIONS,
 ) -> Fit:
     """Minimise over points, poses where `poses_free`, and the calibration's `columns` (float64 [SIZE, k])."""
-    unknowns, damping, linear = start, FIRST_DAMPING, linearise(tracks, start, noise)
     width = 6 * len(tracks.poses) * poses_free
     free = slice(6 * poses_free, None)  # the first pose fixes the gauge
-    for _ in range(iterations):
-        reduced = reduce(tracks, linear, columns, poses_free, damping)
+
+    def stepped(fit: Fit, damping: float) -> Fit:
+        reduced, old = reduce(fit, columns, poses_free, damping), fit.unknowns
         step = np.zeros(len(reduced.side))
         step[free] = np.linalg.solve(reduced.matrix[free, free], reduced.side[free])
-        poses = rigid.moved(unknowns.poses, step[:width].reshape(-1, 6)) if poses_free else unknowns.poses
-        tried = Unknowns(poses, _moved(unknowns.points, reduced, step), unknowns.theta + columns @ step[width:])
-        there = linearise(tracks, tried, noise)
-        if len(step) and linear.energy - there.energy < LINEAR * reduced.gain(step):
+        poses = rigid.moved(old.poses, step[:width].reshape(-1, 6)) if poses_free else old.poses
+        new = Unknowns(poses, old.points + reduced.points(step), old.theta + columns @ step[width:])
+        there = linearise(tracks, new, noise, columns)
+        if len(step) and fit.energy - there.energy < LINEAR * reduced.gain(step):
             # Points follow a long step of poses and focal length on a curve; without a step of their own the iteration
             # creeps along it (embedded point iterations, Jeong et al. 2012).
-            own = reduce(tracks, there, HELD, False, FIRST_DAMPING)
-            tried = replace(tried, points=_moved(tried.points, own, np.zeros(0)))
-            there = linearise(tracks, tried, noise)
-        if there.energy < linear.energy:
-            ended = linear.energy - there.energy < CONVERGED * linear.energy
-            unknowns, linear, damping = tried, there, max(damping / 10.0, 1e-10)
-        else:
-            damping *= 10.0
-            ended = damping > LAST_DAMPING
-        if ended:
-            break
-    return Fit(tracks, noise, unknowns, linear, columns)
+            own = reduce(there, HELD, False, DAMPING).points(np.zeros(0))
+            there = linearise(tracks, replace(new, points=new.points + own), noise, columns)
+        return there
 
-
-def _moved(points: np.ndarray, reduced: Reduced, step: np.ndarray) -> np.ndarray:
-    return points + np.clip(reduced.points(step), -1.0, 1.0)
+    first = linearise(tracks, start, noise, columns)
+    energy = lambda fit: fit.energy
+    return levenberg_marquardt(first, energy, stepped, iterations=iterations, gain=CONVERGED, damping=DAMPING)
 
 
 def start_of(tracks: Tracks) -> Unknowns:
@@ -250,9 +236,9 @@ def start_of(tracks: Tracks) -> Unknowns:
     own = rays[tracks.first]
     turned = (relative[:, :3, :3] @ own[tracks.track][:, :, None])[:, :, 0]
     lever = rigid.cross(relative[:, :3, 3], rays)
-    information = tracks.sums(np.sum(lever**2, 1))
-    value = tracks.sums(-np.sum(lever * rigid.cross(turned, rays), 1)) / np.maximum(information, 1e-12)
-    triangulated = np.where((value > 0) & (information > 0), value, np.nan)
+    information = np.maximum(tracks.sums(np.sum(lever**2, 1)), 1e-12)
+    value = tracks.sums(-np.sum(lever * rigid.cross(turned, rays), 1)) / information
+    triangulated = np.where(value > 0, value, np.nan)
     measured = 1.0 / tracks.depth[tracks.first]
     usual = measured if np.isfinite(measured).any() else triangulated
     middle = float(np.nanmedian(usual)) if np.isfinite(usual).any() else 1.0
