@@ -1,4 +1,4 @@
-"""Constants of robust estimation, and the inverse of an information matrix that may be singular."""
+"""Constants of robust estimation, and covariances that hold for outliers, clusters and singular matrices."""
 
 from __future__ import annotations
 
@@ -18,6 +18,23 @@ REGULARISER = 1e-9
 def sigma_by_median(residuals: np.ndarray) -> float:
     """Return the standard deviation of residuals about zero by their median absolute value, [...] not empty."""
     return MAD_SIGMA * float(np.median(np.abs(residuals)))
+
+
+def two_way_clustered(scores: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the covariance, float64 [k, k], of the sum of scores [m, k] whose errors are not independent in clusters.
+
+    `sum_first G G^T + sum_second G G^T - sum_o g_o g_o^T`, with the sum `G` of the scores of a cluster, about its mean,
+    since what all clusters have in common is the signal (two-way, Cameron, Gelbach and Miller 2011).
+    first, second: int [m], cluster of each.
+    """
+
+    def squared(of: np.ndarray) -> np.ndarray:
+        sums = np.zeros((of.max() + 1, scores.shape[1]))
+        np.add.at(sums, of, scores)
+        sums -= sums.mean(0)
+        return np.asarray(sums.T @ sums)
+
+    return squared(first) + squared(second) - scores.T @ scores
 
 
 def inverse_information(information: np.ndarray) -> np.ndarray:

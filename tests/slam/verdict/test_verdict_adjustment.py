@@ -61,7 +61,7 @@ def test_eliminated_points_give_the_dense_step() -> None:
     dense = np.linalg.solve(matrix, side)
     step = np.linalg.solve(reduced.matrix, reduced.side)
     np.testing.assert_allclose(step, dense[:width], rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(reduced.points(step).ravel(), dense[width:], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(reduced.landmarks(step).ravel(), dense[width:], rtol=1e-5, atol=1e-9)
 
 
 def test_wrong_poses_and_a_wrong_focal_length_are_brought_right() -> None:

@@ -4,19 +4,11 @@ Each alternative is the run's claim with a few more free parameters (`TABLE`). A
 camera cannot hide behind poses that make up for it. The one of which a single linear step promises most (Rao's score
 test) is solved, and taken if it is significant (Wald). Corners that another motion explains are set apart.
 
-The noise is estimated from the run itself:
-
-- A corner has the standard deviation `pixel`, a measured depth the relative one `depth`, both by the median absolute
-  deviation of the residuals with free poses, corrected for the unknowns that these residuals determine.
-- The depth errors of a track are common to it (an edge, a material): `n` depths of a track weigh as one.
-- Errors are not independent along a track, which drifts, nor within a frame. So covariances are cluster-robust, by
-  track and by frame (two-way, Cameron, Gelbach & Miller 2011): with the score `g_o` of each observation, and `H` the
-  reduced information of the parameters that are asked for,
-
-      V = H^-1 (sum_track G G' + sum_frame G G' - sum_o g_o g_o') H^-1,   G the sum of the scores of a cluster.
-
-  `V H` is the number of observations that count as one.
-
+- The noise is that of the residuals with free poses, corrected for the unknowns that these determine. The depth errors
+  of a track are common to it (an edge, a material): `n` depths of a track weigh as one.
+- Errors are not independent along a track, which drifts, nor within a frame. So covariances are cluster-robust:
+  `V = H^-1 C H^-1`, with the reduced information `H` of the parameters that are asked for, and the covariance `C` of
+  their score, two-way clustered by track and frame. `V H` is the number of observations that count as one.
 - A track that follows the wrong corner is wrong in all its frames, and free poses fit some of these. So likelihoods are
   compared track by track (Vuong 1989): the sum of the gains must exceed what their scatter makes by chance.
 """
@@ -28,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2, norm
 
-from vggtgeo.geometry.robust import sigma_by_median
+from vggtgeo.geometry.robust import sigma_by_median, two_way_clustered
 from vggtgeo.slam.verdict import corner_adjustment as theta
 from vggtgeo.slam.verdict import thresholds
 from vggtgeo.slam.verdict.corner_adjustment import SIZE, Fit, Noise, reduce, solve, start_of
@@ -43,10 +35,8 @@ WIDE, FIRST_STEPS = 20.0, 6
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """One hypothesis.
-
-    columns: float64 [SIZE, k], directions of `theta` that it frees. factor, unit: the estimate times `factor` is in
-    `unit`, for messages.
+    """One hypothesis. columns: float64 [SIZE, k], directions of `theta` that it frees. factor, unit: the estimate times
+    `factor` is in `unit`, for messages.
     """
 
     name: str
@@ -60,18 +50,15 @@ class Alternative:
         return float(chi2.isf(SIGNIFICANCE, self.columns.shape[1]))
 
 
-def _free(place: slice | int) -> np.ndarray:
-    return np.atleast_2d(np.eye(SIZE)[place]).T
-
-
+EACH = np.eye(SIZE)
 TABLE = (
-    Alternative("focal length", _free(theta.FOCAL).sum(1, keepdims=True), 100, "%"),
-    Alternative("focal length", _free(theta.FOCAL), 100, "% (at four moments)"),
-    Alternative("principal point", _free(theta.CENTRE), 100, "% of the focal length (right, down)"),
-    Alternative("distortion", _free(theta.RADIAL), 1, "(k1)"),
-    Alternative("rolling shutter", _free(theta.READOUT), 1000, "ms"),
-    Alternative("depth", _free(theta.DRIFT)[:, 1:], 100, "% (later against the first moment)"),
-    Alternative("depth", _free(theta.OFFSET), 100, "cm"),
+    Alternative("focal length", EACH[:, theta.FOCAL].sum(1, keepdims=True), 100, "%"),
+    Alternative("focal length", EACH[:, theta.FOCAL], 100, "% (at four moments)"),
+    Alternative("principal point", EACH[:, theta.CENTRE], 100, "% of the focal length (right, down)"),
+    Alternative("distortion", EACH[:, [theta.RADIAL]], 1, "(k1)"),
+    Alternative("rolling shutter", EACH[:, [theta.READOUT]], 1000, "ms"),
+    Alternative("depth", EACH[:, theta.DRIFT][:, 1:], 100, "% (later against the first moment)"),
+    Alternative("depth", EACH[:, [theta.OFFSET]], 100, "cm"),
 )
 """A focal length that is wrong, or changes; a factor of the depth that changes, or an offset; these two promise nothing
 where no depth was measured. With poses alone and a second motion these are seven explanations."""
@@ -85,19 +72,12 @@ class Added:
     estimate: np.ndarray
     covariance: np.ndarray
 
-    @property
-    def significant(self) -> bool:
-        """Whether the estimate is significant by its robust covariance (Wald)."""
-        wald = float(self.estimate @ np.linalg.pinv(self.covariance, hermitian=True) @ self.estimate)
-        return wald > self.alternative.chance
-
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What the corners of a window prefer.
-
-    best: fit with free poses and what was added, without the corners of the second motion. added: None where no
-    alternative is significant. share, rival: of the observations, explained by the first motion and by the second.
+    """What the corners of a window prefer. best: fit with free poses and what was added, without the corners of the
+    second motion. added: None where no alternative is significant. share, rival: of the observations, explained by the
+    first motion and by the second.
     """
 
     best: Fit
@@ -123,29 +103,25 @@ def explain(tracks: Tracks) -> Explanation:
 
 
 def _selected(fit: Fit) -> tuple[Fit, Added | None]:
-    """Return the fit with the significant alternative, and that alternative; else the same fit and None."""
     around = scores(fit)
     one = max(TABLE, key=lambda one: around.gain(one.columns) / around.as_one - one.chance)
     # Before the solution, as if all observations were independent: a linear step is not exact enough for more.
     if around.gain(one.columns) < one.chance:
         return fit, None
     tried = solve(fit.tracks, fit.unknowns, fit.noise, one.columns)
-    estimate = np.linalg.pinv(one.columns) @ tried.unknowns.theta
-    added = Added(one, estimate, scores(tried).covariance(one.columns))
-    return (with_own_noise(tried), added) if added.significant else (fit, None)
+    estimate, covariance = np.linalg.pinv(one.columns) @ tried.unknowns.theta, scores(tried).covariance(one.columns)
+    if estimate @ np.linalg.pinv(covariance, hermitian=True) @ estimate <= one.chance:
+        return fit, None
+    return with_own_noise(tried), Added(one, estimate, covariance)
 
 
 def _outliers(fit: Fit) -> np.ndarray:
-    """Return the tracks that a fit does not explain, bool [t]."""
-    sums = fit.tracks.sums(np.column_stack([fit.weight[:, 0], np.ones(len(fit.tracks.frame))]))
-    return np.asarray(sums[:, 0] < MIN_INLIER_WEIGHT * sums[:, 1])
+    return fit.tracks.sums(fit.weight[:, 0] - MIN_INLIER_WEIGHT) < 0.0
 
 
 def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
-    """Return the tracks, bool [t], of those that contradict the first motion, that one other motion explains.
-
-    All false if there is no such motion. Depth is ignored: it may be that of either motion.
-    """
+    """Return which of the tracks that contradict the first motion one other motion explains, bool [t], if there is one."""
+    # Without depth, which may be that of either motion.
     own = replace(fit.tracks, depth=np.full(len(fit.tracks.depth), np.nan)).subset(outliers)
     still = np.tile(own.poses[:1], (len(own.poses), 1, 1))
     wide = Noise(WIDE * fit.noise.pixel, WIDE * fit.noise.depth)
@@ -161,10 +137,7 @@ def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
 
 
 def _predicts(motion: Fit) -> bool:
-    """Return whether the motion, fitted to one half of the tracks, explains most of the other half.
-
-    Free poses fit few tracks in any case.
-    """
+    # Free poses fit few tracks in any case: the motion of one half of them must explain most of the other half.
     first = solve(*motion.part(motion.tracks.even))
     tracks, start, noise = motion.part(~motion.tracks.even)
     second = solve(tracks, replace(start, poses=first.unknowns.poses), noise, poses_free=False)
@@ -193,9 +166,8 @@ def preferred(fit: Fit) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """The calibration's share of a fit, poses and points eliminated.
-
-    side: float64 [SIZE], the score; information, clustered: [SIZE, SIZE], `H`, and the covariance of the score.
+    """The calibration's share of a fit, poses and points eliminated. side: float64 [SIZE], the score; information,
+    clustered: [SIZE, SIZE], `H`, and the covariance `C` of the score.
     """
 
     side: np.ndarray
@@ -222,11 +194,10 @@ class Scores:
 
 def scores(fit: Fit) -> Scores:
     """Return the scores of the whole calibration at a fit, whatever was free there."""
-    tracks, reduced = fit.tracks, reduce(fit, np.eye(SIZE), True, 0.0)
-    width = 6 * len(tracks.rows)
+    tracks, reduced, width = fit.tracks, reduce(fit, EACH, True, 0.0), 6 * len(fit.tracks.rows)
     poses = np.zeros((width, SIZE))
     poses[6:] = -np.linalg.solve(reduced.matrix[6:width, 6:width], reduced.matrix[6:width, width:])
-    points = -np.swapaxes(reduced.inverse, 1, 2) @ (reduced.coupling @ np.vstack([poses, np.eye(SIZE)]))
+    points = -np.swapaxes(reduced.inverse, 1, 2) @ (reduced.coupling @ np.vstack([poses, EACH]))
     along = fit.by_theta + fit.by_point @ points[tracks.track]
     along += fit.by_pose @ poses.reshape(-1, 6, SIZE)[tracks.frame]
     weighted = along * fit.weight[:, :, None]
@@ -235,13 +206,5 @@ def scores(fit: Fit) -> Scores:
     square = np.sum(weighted * along, 2)
     curved = np.sum(square * (2.0 * fit.weight - 1.0)) / max(float(np.sum(square)), 1e-300)
     information = np.tensordot(weighted, along, ((0, 1), (0, 1)))
-    clustered = _clustered(each, tracks.track) + _clustered(each, tracks.frame) - each.T @ each
-    return Scores(each.sum(0), information, clustered / max(float(curved), 0.3) ** 2)
-
-
-def _clustered(each: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """Sum of squared scores of the clusters, about their mean: what all have in common is the signal."""
-    sums = np.zeros((of.max() + 1, each.shape[1]))
-    np.add.at(sums, of, each)
-    sums -= sums.mean(0)
-    return np.asarray(sums.T @ sums)
+    clustered = two_way_clustered(each, tracks.track, tracks.frame) / max(float(curved), 0.3) ** 2
+    return Scores(each.sum(0), information, clustered)

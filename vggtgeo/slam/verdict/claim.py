@@ -17,12 +17,10 @@ from vggtgeo.slam.verdict.thresholds import MAX_PLACE_ERROR, MAX_PLACE_ERROR_SHA
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """The claim of a run.
-
-    frames: int [n]. times: float64 [n], s. poses: float64 [n, 4, 4], world -> camera. tracked: bool [n]. intrinsics:
-    fx, fy, cx, cy, pixels. metric: lengths are metres. submaps: their number. started: there was a map.
-    began_in_known_map: the run began in the map of an earlier one. guessed: the camera is unknown, and too little was
-    seen to estimate it. readout: of the rolling shutter that the last adjustment found.
+    """The claim of a run. frames: int [n]. times: float64 [n], s. poses: float64 [n, 4, 4], world -> camera. tracked:
+    bool [n]. intrinsics: fx, fy, cx, cy, pixels. metric: lengths are metres. submaps: their number. started: there was
+    a map. began_in_known_map: the run began in the map of an earlier one. guessed: the camera is unknown, and too
+    little was seen to estimate it. readout: of the rolling shutter that the last adjustment found.
     """
 
     frames: np.ndarray

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
-from vggtgeo.geometry.gauss_newton import levenberg_marquardt
+from vggtgeo.geometry.gauss_newton import SchurComplement, levenberg_marquardt
 from vggtgeo.slam.verdict.corner_tracks import KNOTS, Tracks
 
 KERNEL = 2.0
@@ -63,11 +63,10 @@ class Unknowns:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Tracks at some unknowns, those of a minimum after `solve`; the residuals there, and their derivatives.
-
-    columns: float64 [SIZE, k], what of the calibration is free. residual: [m, 3], whitened; weight: [m, 3], robust.
-    by_pose: [m, 3, 6]; by_point: [m, 3, 3]; by_theta: [m, 3, SIZE]. loss: [m], minus twice the robust log likelihood of
-    each corner with its depth.
+    """Tracks at some unknowns, those of a minimum after `solve`; the residuals there, and their derivatives. columns:
+    float64 [SIZE, k], what of the calibration is free. residual: [m, 3], whitened; weight: [m, 3], robust. by_pose:
+    [m, 3, 6]; by_point: [m, 3, 3]; by_theta: [m, 3, SIZE]. loss: [m], minus twice the robust log likelihood of each
+    corner with its depth.
     """
 
     tracks: Tracks
@@ -142,30 +141,7 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
     return Fit(tracks, noise, unknowns, columns, residual, weight, *jacobians, loss)
 
 
-@dataclass(frozen=True, eq=False)
-class Reduced:
-    """Normal equations after the points are eliminated: matrix [n, n] and right-hand side [n] of poses, then
-    calibration; and what gives the points back, with the Cholesky factor `L` of their blocks: inverse `L^-1`
-    [t, 3, 3], and `L^-1` times their coupling with the rest [t, 3, n] and their own right-hand side [t, 3].
-    """
-
-    matrix: np.ndarray
-    side: np.ndarray
-    inverse: np.ndarray
-    coupling: np.ndarray
-    point_side: np.ndarray
-
-    def points(self, step: np.ndarray) -> np.ndarray:
-        """Step of the points, [t, 3], that belongs to one of the rest, [n]; at most 1, far beyond what is linear."""
-        right = self.point_side - self.coupling @ step
-        return np.clip((np.swapaxes(self.inverse, 1, 2) @ right[:, :, None])[:, :, 0], -1.0, 1.0)
-
-    def gain(self, step: np.ndarray) -> float:
-        """Return the decrease of the energy that this step, [n], promises."""
-        return float(np.sum(self.point_side**2) + self.side @ step)
-
-
-def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> Reduced:
+def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> SchurComplement:
     """Eliminate the points. columns: float64 [SIZE, k], what of the calibration is free.
 
     The negative residual goes along as one more column: what becomes of it is the right-hand side.
@@ -189,13 +165,9 @@ def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> R
     diagonal = np.arange(size - 1)
     matrix[diagonal, diagonal] *= 1.0 + damping
     matrix[diagonal[:width], diagonal[:width]] += TETHER
-    own = tracks.sums(point @ fit.by_point)
-    own[:, range(3), range(3)] *= 1.0 + damping
-    inverse = np.linalg.inv(np.linalg.cholesky(own + 1e-6 * np.eye(3)))
-    coupling = inverse @ coupling
-    flat = coupling.reshape(3 * count, size)
-    matrix -= flat.T @ flat
-    return Reduced(matrix[:-1, :-1], matrix[:-1, -1], inverse, coupling[:, :, :-1], coupling[:, :, -1])
+    blocks = tracks.sums(point @ fit.by_point)
+    blocks[:, range(3), range(3)] *= 1.0 + damping
+    return SchurComplement.of(matrix, coupling, blocks + 1e-6 * np.eye(3))
 
 
 def solve(
@@ -215,13 +187,14 @@ def solve(
         step = np.zeros(len(reduced.side))
         step[free] = np.linalg.solve(reduced.matrix[free, free], reduced.side[free])
         poses = rigid.moved(old.poses, step[:width].reshape(-1, 6)) if poses_free else old.poses
-        new = Unknowns(poses, old.points + reduced.points(step), old.theta + columns @ step[width:])
+        points = old.points + np.clip(reduced.landmarks(step), -1.0, 1.0)
+        new = Unknowns(poses, points, old.theta + columns @ step[width:])
         there = linearise(tracks, new, noise, columns)
         if len(step) and fit.energy - there.energy < LINEAR * reduced.gain(step):
             # Points follow a long step of poses and focal length on a curve; without a step of their own the iteration
             # creeps along it (embedded point iterations, Jeong et al. 2012).
-            own = reduce(there, HELD, False, DAMPING).points(np.zeros(0))
-            there = linearise(tracks, replace(new, points=new.points + own), noise, columns)
+            own = reduce(there, HELD, False, DAMPING).landmarks(np.zeros(0))
+            there = linearise(tracks, replace(new, points=points + np.clip(own, -1.0, 1.0)), noise, columns)
         return there
 
     first = linearise(tracks, start, noise, columns)

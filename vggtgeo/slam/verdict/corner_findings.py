@@ -43,10 +43,8 @@ CAUSES: dict[str, tuple[str, str, bool]] = {
 
 @dataclass(frozen=True)
 class Consequence:
-    """How far the motion that the corners of a window prefer is from the claim, RMS over frames, and the standard
-    deviations of the same.
-
-    places: after alignment, in the unit of the map. turn: from frame to frame, rad.
+    """RMS difference of a motion from the claim, in places after alignment, in the unit of the map, and in turns from
+    frame to frame, rad; and the standard deviations of both.
     """
 
     places: float
@@ -55,18 +53,12 @@ class Consequence:
     turn_sigma: float = 0.0
 
 
-def difference(fit: Fit) -> Consequence:
-    """Return the difference of a fit from the claim, noise included."""
-    return Consequence(*(float(np.sqrt(_mean_product(one, one))) for one in _differences(fit)))
-
-
 def confirmed(best: Fit) -> Consequence:
     """Return the difference from the claim that two halves of the tracks confirm.
 
-    Each half is fitted by itself with what is free in `best`. Errors of tracks, mistracked corners among them, are
-    independent between the halves: the mean product of what both differ from the claim by is free of their noise, and
-    half of what they differ from each other by is the standard deviation of their mean. Both begin at the claimed
-    poses, not at one wrong minimum.
+    Errors of tracks, mistracked corners among them, are independent between the halves: the mean product of what both
+    differ from the claim by is free of their noise, and half of what they differ from each other by is the standard
+    deviation of their mean. Both begin at the claimed poses, not at one wrong minimum.
     """
     fits = []
     for kept in (best.tracks.even, ~best.tracks.even):
@@ -95,8 +87,8 @@ def _mean_product(one: np.ndarray, other: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Contradiction:
-    """A window whose explanation contradicts the run. cause: its name in `CAUSES`. size: of the consequence, over its
-    limit; below 1 it does not matter.
+    """A window that contradicts the run. cause: a key of `CAUSES`. size: of the consequence, over its limit; below 1 it
+    does not matter.
     """
 
     window: Explanation
@@ -106,17 +98,13 @@ class Contradiction:
 
 
 def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contradiction | None:
-    """Return how the explanation of a window contradicts the run; None if it does not.
-
-    stated: standard deviation of the places that the run itself states, as a share of their extent.
+    """Return how the explanation of a window contradicts the run; None if it does not. stated: standard deviation of
+    the places that the run itself states, as a share of their extent.
     """
-    tracks, cause = one.best.tracks, None
-    if one.rival > 0:
-        cause = "second motion"
-    elif tracks.with_depth and one.best.noise.depth > MAX_DEPTH_NOISE:
-        cause = "depth"
+    tracks, noise = one.best.tracks, one.best.noise
+    cause = "second motion" if one.rival > 0 else "depth" if noise.depth > MAX_DEPTH_NOISE else None
     limits = np.array([max_place_error(metric, tracks.poses), MAX_TURN_ERROR])
-    found, size = difference(one.best), 0.0
+    found, size = Consequence(*(float(np.sqrt(_mean_product(off, off))) for off in _differences(one.best))), 0.0
     if cause or found.places >= limits[0] or found.turn >= limits[1]:  # else small even with its noise
         found = confirmed(one.best)
         values = np.array([found.places, found.turn])
@@ -132,10 +120,7 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
 
 
 def findings(claim: Claim, explanations: Sequence[Explanation], stated: float = 0.0) -> list[Finding]:
-    """Return one finding a cause, the largest consequence first; then those of no consequence, of level "good".
-
-    stated: as in `contradiction`.
-    """
+    """Return one finding a cause, the largest consequence first; then those of no consequence, of level "good"."""
     found = [what for one in explanations if (what := contradiction(one, claim.metric, stated))]
     groups: dict[tuple[bool, str], list[Contradiction]] = {}
     for one in found:

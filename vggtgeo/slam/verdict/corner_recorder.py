@@ -1,7 +1,6 @@
 """Recorder of the corner tracks with which the verdict tests a run, and of the measured depth at them.
 
-The tracks (Lucas & Kanade, 1981, on images of 320 pixels) are independent of the map, its features and its poses. About
-4 ms a frame (640 x 480), 4 kB a frame.
+The tracks are independent of the map, its features and its poses. About 4 ms and 4 kB a frame (640 x 480).
 """
 
 from __future__ import annotations
@@ -30,10 +29,9 @@ MAX_QUEUED_FRAMES = 4
 
 @dataclass(frozen=True, eq=False)
 class FrameEvidence:
-    """The corners of one frame.
-
-    ids: int32 [m], a track's number, the same in each frame that saw it. pixels: float32 [m, 2], of the ideal pinhole
-    image. depth: float32 [m], measured, metres; NaN where there is none, or the image repeats that of another picture.
+    """The corners of one frame. ids: int32 [m], a track's number, the same in each frame that saw it. pixels: float32
+    [m, 2], of the ideal pinhole image. depth: float32 [m], measured, metres; NaN where there is none, or the image
+    repeats that of another picture.
     """
 
     frame: int

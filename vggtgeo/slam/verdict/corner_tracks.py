@@ -23,12 +23,11 @@ KNOTS = 4
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Corner tracks of a few frames, and what the run claims of these.
-
-    rows: int [f], of the run. times: float64 [f], s. poses: float64 [f, 4, 4], world -> camera. intrinsics: fx, fy, cx,
-    cy. size: width, height, pixels. frame, track: int [m], of each observation, sorted by track. pixels: float64
-    [m, 2]. depth: float64 [m], metres, NaN where it was not measured or the map is not metric. readout: float64
-    [m, 2], pixels by which a rolling shutter of one second moves the corner.
+    """Corner tracks of a few frames, and what the run claims of these. rows: int [f], of the run. times: float64 [f],
+    s. poses: float64 [f, 4, 4], world -> camera. intrinsics: fx, fy, cx, cy. size: width, height, pixels. frame, track:
+    int [m], of each observation, sorted by track. pixels: float64 [m, 2]. depth: float64 [m], metres, NaN where it was
+    not measured or the map is not metric. readout: float64 [m, 2], pixels by which a rolling shutter of one second
+    moves the corner.
     """
 
     rows: np.ndarray
@@ -120,36 +119,25 @@ def tracks_of_windows(claim: Claim, evidence: CornerTracks, size: tuple[int, int
 
 
 def tracks_of(claim: Claim, evidence: CornerTracks, rows: np.ndarray, size: tuple[int, int]) -> Tracks | None:
-    """Return the tracks that at least `MIN_VIEWS` of these frames see; None without any.
-
-    rows: int [f], increasing, of tracked frames.
-    """
+    """Return the tracks that at least `MIN_VIEWS` of these frames, int [f], increasing, see; None without any."""
     seen = [evidence[row] for row in rows]
     ids, pixels, depth = (np.concatenate([getattr(one, name) for one in seen]) for name in ("ids", "pixels", "depth"))
     frame = np.repeat(np.arange(len(rows)), [len(one.ids) for one in seen])
     velocity = np.concatenate([_velocities(evidence, int(row)) for row in rows])
     _, track, views = np.unique(ids, return_inverse=True, return_counts=True)
-    kept = np.flatnonzero(views[track] >= MIN_VIEWS)
+    order = np.argsort(ids, kind="stable")  # by track, then by frame
+    kept = order[views[track[order]] >= MIN_VIEWS]
     if not len(kept):
         return None
-    kept = kept[np.lexsort((frame[kept], ids[kept]))]
     pixels, depth = pixels[kept].astype(np.float64), depth[kept].astype(np.float64)
     axis = 0 if claim.readout is not None and claim.readout.columns else 1
     readout = (pixels[:, [axis]] / size[axis] - 0.5) * velocity[kept]
     if claim.readout is not None:
         pixels = pixels - claim.readout.seconds * readout
-    return Tracks(
-        rows=rows,
-        times=claim.times[rows],
-        poses=claim.poses[rows],
-        intrinsics=np.asarray(claim.intrinsics, np.float64),
-        size=size,
-        frame=frame[kept],
-        track=np.unique(ids[kept], return_inverse=True)[1],
-        pixels=pixels,
-        depth=np.where((depth > 0) & claim.metric, depth, np.nan),
-        readout=readout,
-    )
+    depth = np.where((depth > 0) & claim.metric, depth, np.nan)
+    track = np.unique(ids[kept], return_inverse=True)[1]
+    times, poses, intrinsics = claim.times[rows], claim.poses[rows], np.asarray(claim.intrinsics, np.float64)
+    return Tracks(rows, times, poses, intrinsics, size, frame[kept], track, pixels, depth, readout)
 
 
 def _velocities(evidence: CornerTracks, row: int) -> np.ndarray:

@@ -13,10 +13,9 @@ LEVELS: tuple[Level, ...] = get_args(Level)
 
 @dataclass(frozen=True)
 class Finding:
-    """One reason not to trust a result.
-
-    check: its name. level: of the run. text: a sentence with the numbers. start, end: first and last frame concerned;
-    None: the whole run. scale: it puts the unit of length in doubt. local: it marks the segment, not the run.
+    """One reason not to trust a result. check: its name. level: of the run. text: a sentence with the numbers. start,
+    end: first and last frame concerned; None: the whole run. scale: it puts the unit of length in doubt. local: it
+    marks the segment, not the run.
     """
 
     check: str
@@ -42,21 +41,6 @@ class Segment:
     end_time: float
     level: Level
     checks: tuple[str, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-        return {
-            "frames": [self.start, self.end],
-            "seconds": [round(self.start_time, 6), round(self.end_time, 6)],
-            "level": self.level,
-            "checks": list(self.checks),
-        }
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Invert `to_dict`."""
-        (start, end), (begin, stop) = values["frames"], values["seconds"]
-        return cls(start, end, begin, stop, values["level"], tuple(values["checks"]))
 
 
 @dataclass(frozen=True)
@@ -85,17 +69,18 @@ class Verdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as in `summary.json`."""
-        return {
-            "level": self.level,
-            "reasons": list(self.reasons),
-            "segments": [segment.to_dict() for segment in self.segments],
-            "noted": list(self.noted),
-        }
+        segments = []
+        for one in self.segments:
+            frames, seconds = [one.start, one.end], [round(one.start_time, 6), round(one.end_time, 6)]
+            segments.append({"frames": frames, "seconds": seconds, "level": one.level, "checks": list(one.checks)})
+        return {"level": self.level, "reasons": list(self.reasons), "segments": segments, "noted": list(self.noted)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], metric: bool = True) -> Self:
         """Invert `to_dict`."""
-        segments = tuple(Segment.from_dict(segment) for segment in values["segments"])
+        segments = tuple(
+            Segment(*one["frames"], *one["seconds"], one["level"], tuple(one["checks"])) for one in values["segments"]
+        )
         return cls(values["level"], tuple(values["reasons"]), segments, metric, tuple(values.get("noted", ())))
 
 
@@ -106,14 +91,15 @@ def worst(levels: Iterable[Level]) -> Level:
 
 def conclude(findings: Iterable[Finding], frames: Sequence[int], times: Sequence[float], metric: bool) -> Verdict:
     """Combine the findings on a run with these frame numbers and times."""
-    findings = list(findings)
-    reasons = sorted((one for one in findings if one.level != "good"), key=lambda one: -LEVELS.index(one.level))
+    ordered = sorted(findings, key=lambda one: -LEVELS.index(one.level))
+    reasons = [one for one in ordered if one.level != "good"]
+    of_run = [one for one in reasons if not one.local]
     return Verdict(
-        worst(one.level for one in reasons if not one.local),
-        tuple(one.text for one in reasons if not one.local),
+        worst(one.level for one in of_run),
+        tuple(one.text for one in of_run),
         _segments(reasons, frames, times),
         metric and not any(one.scale for one in reasons),
-        tuple(one.text for one in findings if one.level == "good"),
+        tuple(one.text for one in ordered if one.level == "good"),
     )
 
 

@@ -20,11 +20,8 @@ from vggtgeo.slam.verdict.run_findings import check_extent, check_frozen, check_
 def judge(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
     """Judge the state after the last adjustment.
 
-    Args:
-        slam: the state.
-        evidence: of all frames, from an `EvidenceRecorder`; without it only the run's own record counts.
-        input_findings: what is known of the input already.
-
+    evidence: of all frames, from an `EvidenceRecorder`; without it only the run's own record counts. input_findings:
+    what is known of the input already.
     """
     claim = Claim.of(slam)
     known = stated_share(claim, frame_uncertainty(slam) if slam.keyframes else None)

@@ -27,17 +27,13 @@ from vggtgeo.slam.verdict.finding import Finding, Level
 
 def check_refusals(refusals: Mapping[str, Refusals]) -> tuple[Finding, ...]:
     """Check for roles whose network gave invalid answers, or none."""
-    return tuple(
-        Finding(
-            "network",
-            "degraded",
-            f"the network of {role} gave no valid answer {counts.without} of {counts.asked} times"
-            + (f", and {counts.refused} of {counts.values} values were out of bounds" if counts.values else "")
-            + ": ignored",
-        )
-        for role, counts in refusals.items()
-        if counts.share > thresholds.MAX_LOST
-    )
+    found = []
+    for role, counts in refusals.items():
+        bounds = f", and {counts.refused} of {counts.values} values were out of bounds" if counts.values else ""
+        text = f"the network of {role} gave no valid answer {counts.without} of {counts.asked} times{bounds}: ignored"
+        if counts.share > thresholds.MAX_LOST:
+            found.append(Finding("network", "degraded", text))
+    return tuple(found)
 
 
 def check_input(warned: Iterable[Warning | str], frames: int) -> tuple[Finding, ...]:
@@ -67,8 +63,18 @@ def check_record(claim: Claim) -> list[Finding]:
     """Check for lost frames, unconnected submaps, and a run that never started."""
     if not len(claim):
         return []
-    if not claim.started or (len(claim) > 2 and np.count_nonzero(claim.tracked) <= 1):
-        return [Finding("start", "failed", _never_started(claim))]
+    tracked = np.count_nonzero(claim.tracked)
+    if not claim.started or (len(claim) > 2 and tracked <= 1):
+        text = (
+            "the poses are meaningless: the map was never started, for lack of sideways motion or of texture; begin "
+            "with sideways motion, or skip frames with `--start`"
+        )
+        if claim.began_in_known_map:
+            text = (
+                f"{tracked} of {len(claim)} frames were found in the known map: they show another place, or the same "
+                "one from elsewhere or in another light; there is no trajectory to use"
+            )
+        return [Finding("start", "failed", text)]
     found = []
     if len(claim) == 1 and not claim.began_in_known_map:
         found.append(Finding("start", "degraded", "the run has one frame: nothing can confirm its pose and its map"))
@@ -86,39 +92,22 @@ def check_record(claim: Claim) -> list[Finding]:
     return found
 
 
-def _never_started(claim: Claim) -> str:
-    if not claim.began_in_known_map:
-        return (
-            "the poses are meaningless: the map was never started, for lack of sideways motion or of texture; begin "
-            "with sideways motion, or skip frames with `--start`"
-        )
-    return (
-        f"{np.count_nonzero(claim.tracked)} of {len(claim)} frames were found in the known map: they show another "
-        "place, or the same one from elsewhere or in another light; there is no trajectory to use"
-    )
-
-
 def _lost(claim: Claim) -> list[Finding]:
-    named = [claim.span(*rows)[:2] for rows in stretches(~claim.tracked)]
-    found = [Finding("lost", "degraded", f"frames {a} to {b} were lost", a, b, local=True) for a, b in named]
+    found, squares, parts, newest = [], 0.0, stretches(~claim.tracked), len(claim) - 1
+    for first, last in parts:
+        start, end, _ = claim.span(first, last)
+        found.append(Finding("lost", "degraded", f"frames {start} to {end} were lost", start, end, local=True))
+        seconds = float(claim.times[min(last + 1, newest)] - claim.times[max(first - 1, 0)])
+        error = thresholds.ACCELERATION * seconds**2 / (2 if first == 0 or last == newest else 8)
+        squares += (last - first + 1) * error**2 / 2
     count = len(claim) - np.count_nonzero(claim.tracked)
-    if count > thresholds.MAX_LOST * len(claim) or bridging_error(claim) > thresholds.MAX_PLACE_ERROR:
-        start, end = max(named, key=lambda ends: ends[1] - ends[0])
-        times = "once" if len(named) == 1 else f"{len(named)} times, longest"
+    if count > thresholds.MAX_LOST * len(claim) or np.sqrt(squares / len(claim)) > thresholds.MAX_PLACE_ERROR:
+        start, end, _ = claim.span(*max(parts, key=lambda rows: claim.frames[rows[1]] - claim.frames[rows[0]]))
+        times = "once" if len(found) == 1 else f"{len(found)} times, longest"
         text = f"{count} of {len(claim)} frames were lost and have no pose, {times} from frame {start} to {end}"
         level: Level = "failed" if len(claim) - count < thresholds.MIN_TRACKED * len(claim) else "degraded"
         found.append(Finding("lost", level, text, start, end))
     return found
-
-
-def bridging_error(claim: Claim) -> float:
-    """Return the error that lost frames may have, metres, RMS over all frames."""
-    squares, end = 0.0, len(claim) - 1
-    for first, last in stretches(~claim.tracked):
-        seconds = float(claim.times[min(last + 1, end)] - claim.times[max(first - 1, 0)])
-        error = thresholds.ACCELERATION * seconds**2 / (2 if first == 0 or last == end else 8)
-        squares += (last - first + 1) * error**2 / 2
-    return float(np.sqrt(squares / len(claim)))
 
 
 def stated_share(claim: Claim, known: PoseUncertainty | None) -> float:
