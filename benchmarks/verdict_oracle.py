@@ -29,7 +29,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.verdict.alternatives import START, explain, scores, with_own_noise
-from vggtgeo.slam.verdict.claim import Claim, extent
+from vggtgeo.slam.verdict.claim import KNOTS, Claim, Tracks, extent, tracks_of_windows
 from vggtgeo.slam.verdict.corner_adjustment import (
     DRIFT,
     FOCAL,
@@ -40,7 +40,6 @@ from vggtgeo.slam.verdict.corner_adjustment import (
     solve,
     start_of,
 )
-from vggtgeo.slam.verdict.corner_tracks import KNOTS, Tracks, tracks_of_windows
 from vggtgeo.slam.verdict.judge import aligned
 
 Truth = tuple[np.ndarray, np.ndarray]

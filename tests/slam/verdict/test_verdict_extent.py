@@ -14,7 +14,7 @@ from reported import pattern
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
-from vggtgeo.slam.verdict.run_findings import check_extent, stated_share
+from vggtgeo.slam.verdict.judge import check_extent, stated_share
 
 
 def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) -> None:

@@ -23,8 +23,8 @@ from scipy.stats import chi2, norm
 from vggtgeo.geometry.robust import sigma_by_median, two_way_clustered
 from vggtgeo.slam.verdict import corner_adjustment as theta
 from vggtgeo.slam.verdict import thresholds
+from vggtgeo.slam.verdict.claim import Tracks
 from vggtgeo.slam.verdict.corner_adjustment import SIZE, Fit, Noise, reduce, solve, start_of
-from vggtgeo.slam.verdict.corner_tracks import Tracks
 from vggtgeo.slam.verdict.thresholds import MIN_INLIER_WEIGHT, MIN_SECOND_MOTION_SHARE, SIGNIFICANCE
 
 START = Noise(0.6, 0.03)
@@ -120,7 +120,7 @@ def _outliers(fit: Fit) -> np.ndarray:
 
 
 def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
-    """Return which of the tracks that contradict the first motion one other motion explains, bool [t], if there is one."""
+    """Return which of the tracks that contradict the first motion one other motion explains, bool [t], if any."""
     # Without depth, which may be that of either motion.
     own = replace(fit.tracks, depth=np.full(len(fit.tracks.depth), np.nan)).subset(outliers)
     still = np.tile(own.poses[:1], (len(own.poses), 1, 1))

@@ -19,7 +19,7 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.gauss_newton import SchurComplement, levenberg_marquardt
-from vggtgeo.slam.verdict.corner_tracks import KNOTS, Tracks
+from vggtgeo.slam.verdict.claim import KNOTS, Tracks
 
 KERNEL = 2.0
 """Width of Cauchy's kernel, in standard deviations of the noise."""
@@ -82,7 +82,6 @@ class Fit:
 
     @property
     def energy(self) -> float:
-        """Sum of the loss."""
         return float(self.loss.sum())
 
     def part(self, kept: np.ndarray) -> tuple[Tracks, Unknowns, Noise]:
@@ -96,11 +95,10 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
     relative = unknowns.poses[tracks.frame] @ tracks.from_anchor
     a, b, log_inverse = unknowns.points[tracks.track].T
     inverse = np.exp(log_inverse)
-    turn, shift = relative[:, :3, :3], relative[:, :3, 3] * inverse[:, None]
     # The point in the camera times its inverse depth `rho`: finite for points at infinity.
-    scaled = turn[:, :, 0] * a[:, None] + turn[:, :, 1] * b[:, None] + turn[:, :, 2] + shift
+    scaled = (relative[:, :3] @ np.stack([a, b, np.ones(count), inverse], 1)[:, :, None])[:, :, 0]
     behind = scaled[:, 2] < 1e-3
-    scaled = np.where(behind[:, None], [0.0, 0.0, 1.0], scaled)
+    scaled[behind] = 0.0, 0.0, 1.0
 
     z = scaled[:, 2]
     normalised = scaled[:, :2] / z[:, None]
@@ -123,7 +121,8 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
     by_theta[:, :2, READOUT] = tracks.readout
     by_theta[:, 2, DRIFT] = knots
     by_theta[:, 2, OFFSET] = 1.0 / depth
-    by_point = by_scaled @ np.stack([turn[:, :, 0], turn[:, :, 1], shift], 2)
+    by_point = by_scaled @ relative[:, :3, [0, 1, 3]]
+    by_point[:, :, 2] *= inverse[:, None]
     by_point[:, 2, 2] -= z / (inverse * depth)
     by_pose = np.concatenate([by_scaled * inverse[:, None, None], by_scaled @ -rigid.skew(scaled)], 2)
 

@@ -41,20 +41,10 @@ CAUSES: dict[str, tuple[str, str, bool]] = {
 """Of each cause: what it is, what to do, and whether it puts the unit of length in doubt."""
 
 
-@dataclass(frozen=True)
-class Consequence:
-    """RMS difference of a motion from the claim, in places after alignment, in the unit of the map, and in turns from
-    frame to frame, rad; and the standard deviations of both.
-    """
+def confirmed(best: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return the difference from the claim that two halves of the tracks confirm, and its standard deviations.
 
-    places: float
-    turn: float
-    places_sigma: float = 0.0
-    turn_sigma: float = 0.0
-
-
-def confirmed(best: Fit) -> Consequence:
-    """Return the difference from the claim that two halves of the tracks confirm.
+    float64 [2] each, RMS over frames: places after alignment, in the unit of the map; turns from frame to frame, rad.
 
     Errors of tracks, mistracked corners among them, are independent between the halves: the mean product of what both
     differ from the claim by is free of their noise, and half of what they differ from each other by is the standard
@@ -68,7 +58,7 @@ def confirmed(best: Fit) -> Consequence:
     pairs = list(zip(*map(_differences, fits), strict=True))
     common = [max(_mean_product(one, other), 0.0) for one, other in pairs]
     apart = [0.25 * _mean_product(one - other, one - other) for one, other in pairs]
-    return Consequence(*np.sqrt([*common, *apart]).tolist())
+    return np.sqrt(common), np.sqrt(apart)
 
 
 def _differences(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -87,12 +77,13 @@ def _mean_product(one: np.ndarray, other: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Contradiction:
-    """A window that contradicts the run. cause: a key of `CAUSES`. size: of the consequence, over its limit; below 1 it
-    does not matter.
+    """A window that contradicts the run. off, sigma: as `confirmed` returns them. cause: a key of `CAUSES`. size: of
+    the difference, over its limit; below 1 it does not matter.
     """
 
     window: Explanation
-    consequence: Consequence
+    off: np.ndarray
+    sigma: np.ndarray
     cause: str
     size: float
 
@@ -104,19 +95,18 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
     tracks, noise = one.best.tracks, one.best.noise
     cause = "second motion" if one.rival > 0 else "depth" if noise.depth > MAX_DEPTH_NOISE else None
     limits = np.array([max_place_error(metric, tracks.poses), MAX_TURN_ERROR])
-    found, size = Consequence(*(float(np.sqrt(_mean_product(off, off))) for off in _differences(one.best))), 0.0
-    if cause or found.places >= limits[0] or found.turn >= limits[1]:  # else small even with its noise
-        found = confirmed(one.best)
-        values = np.array([found.places, found.turn])
-        sigmas = np.array([np.hypot(found.places_sigma, stated * extent(tracks.poses)), found.turn_sigma])
-        size = float(np.max(values / limits, where=values > SIGMAS * sigmas, initial=0.0))
+    off, sigma, size = np.sqrt([_mean_product(off, off) for off in _differences(one.best)]), np.zeros(2), 0.0
+    if cause or np.any(off >= limits):  # else small even with its noise
+        off, sigma = confirmed(one.best)
+        doubt = np.hypot(sigma, [stated * extent(tracks.poses), 0.0])
+        size = float(np.max(off / limits, where=off > SIGMAS * doubt, initial=0.0))
         if size >= 1.0 and not preferred(one.best):
             size = 0.0
     if cause:
-        return Contradiction(one, found, cause, max(size, 1.0))
+        return Contradiction(one, off, sigma, cause, max(size, 1.0))
     if size < 1.0 and not one.added:
         return None
-    return Contradiction(one, found, one.added.alternative.name if one.added else "poses", size)
+    return Contradiction(one, off, sigma, one.added.alternative.name if one.added else "poses", size)
 
 
 def findings(claim: Claim, explanations: Sequence[Explanation], stated: float = 0.0) -> list[Finding]:
@@ -134,15 +124,15 @@ def _finding(claim: Claim, ones: Sequence[Contradiction]) -> Finding:
     rows = np.concatenate([one.window.best.tracks.rows for one in ones])
     start, end, where = claim.span(int(rows.min()), int(rows.max()))
     worst = max(ones, key=lambda one: one.size)
-    window, found, (what, advice, scale) = worst.window, worst.consequence, CAUSES[worst.cause]
+    window, (what, advice, scale) = worst.window, CAUSES[worst.cause]
     around, unit = 1.0, "cm"
     if not claim.metric:
         around, unit = extent(window.best.tracks.poses), "% of the extent of the path there"
-    rival = window.rival / max(window.rival + window.share, 1e-12)
+    off, sigma = 100 * worst.off[0] / around, 100 * worst.sigma[0] / around
+    rival = 100 * window.rival / max(window.rival + window.share, 1e-12)
     text = (
-        f"{where}: the camera positions may be wrong by {100 * found.places / around:.0f} +- "
-        f"{100 * found.places_sigma / around:.0f} {unit}, turns from frame to frame by "
-        f"{np.degrees(found.turn):.1f} degrees; {what.format(rival=100 * rival, noise=100 * window.best.noise.depth)}"
+        f"{where}: the camera positions may be wrong by {off:.0f} +- {sigma:.0f} {unit}, turns from frame to frame by "
+        f"{np.degrees(worst.off[1]):.1f} degrees; {what.format(rival=rival, noise=100 * window.best.noise.depth)}"
     )
     if window.added and window.added.alternative.name == worst.cause:
         text += _estimate(window.added)

@@ -76,7 +76,7 @@ class EvidenceRecorder(Callback):
         self._owned = True
 
     def leave_out(self, still: np.ndarray) -> None:
-        """Mask `still`, bool [H, W], the static part of the picture."""
+        """Follow no corners on `still`, bool [H, W], the static part of the picture."""
         self._mask = small_mask(still)
 
     @property
@@ -93,13 +93,11 @@ class EvidenceRecorder(Callback):
         self._waiting.append(self._pool.submit(self._add, frame))
 
     def so_far(self) -> tuple[object, ...]:
-        """Return the state to resume from."""
         frames = tuple(self.frames)  # first: it waits for the corners of the last one
         image, *tracks = self._corners
         return frames, image, self._depth, *tracks
 
     def on_resume(self, so_far: Any, slam: Slam) -> None:
-        """Continue after the last of these frames."""
         frames, image, self._depth, *tracks = so_far
         self._frames, self._corners = list(frames), FollowedCorners(image, *tracks)
         self._owned = self._depth is None or bool(np.isfinite(frames[-1].depth).any())

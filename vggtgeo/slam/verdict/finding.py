@@ -27,7 +27,6 @@ class Finding:
     local: bool = False
 
     def concerns(self, frame: int) -> bool:
-        """Return whether the finding is about this frame."""
         return (self.start is None or self.start <= frame) and (self.end is None or frame <= self.end)
 
 
