@@ -97,7 +97,7 @@ def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray)
     best = explain(tracks).best
     start = replace(START, pixel=START.pixel * max(tracks.size) / 320.0)
     free = with_own_noise(solve(tracks, start_of(tracks), start))
-    there, metric = rigid.centres(tracks.poses), tracks.with_depth
+    there, metric = rigid.centres(tracks.poses), bool(np.isfinite(tracks.depth).any())
     fitted = umeyama(true[:, :3, 3], there, not metric)
     poses = rigid.invert(fitted.trajectory(Trajectory(tracks.times, true)).poses)
     unit = 0.01 if metric else 0.01 * extent(tracks.poses)
@@ -108,8 +108,8 @@ def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray)
         own = {one.name: getattr(tracks, one.name) for one in fields(tracks)}
         planted = WithTruth(**own, shares=shares)
         starts = (replace(free.unknowns, theta=theta), replace(_started(tracks, poses), theta=theta))
-        fits = [solve(planted, one, free.noise, iterations=40) for one in starts]
-        plain = solve(tracks, free.unknowns, free.noise, iterations=40)
+        fits = [solve(planted, one, free.noise, steps=40) for one in starts]
+        plain = solve(tracks, free.unknowns, free.noise, steps=40)
         gain = plain.energy - min(fit.energy for fit in fits)
     elif case["degradation"] == "cut":
         gain = free.energy - solve(tracks, _started(tracks, poses), free.noise).energy

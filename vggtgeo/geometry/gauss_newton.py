@@ -15,6 +15,8 @@ import numpy as np
 Point = TypeVar("Point")
 _GAIN = 1e-7
 """Relative decrease of the energy below which the iteration has converged."""
+FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e3
+"""Of Levenberg-Marquardt, as a share of the diagonal of the Hessian: at the beginning, and where it gives up."""
 
 
 def gauss_newton(
@@ -53,10 +55,8 @@ def levenberg_marquardt(
     energy: Callable[[Point], float],
     stepped: Callable[[Point, float], Point],
     *,
-    iterations: int,
+    steps: int,
     gain: float,
-    damping: float = 1e-5,
-    max_damping: float = 1e3,
 ) -> Point:
     """Return the point to which Levenberg-Marquardt descends from `start` (Nocedal and Wright 2006, section 10.3).
 
@@ -64,7 +64,8 @@ def levenberg_marquardt(
     of the Hessian. The damping falls tenfold after a decrease of the energy, and rises tenfold where there is none.
     gain: relative decrease of the energy below which the iteration has converged.
     """
-    for _ in range(iterations):
+    damping = FIRST_DAMPING
+    for _ in range(steps):
         trial = stepped(start, damping)
         before, after = energy(start), energy(trial)
         if after < before:
@@ -73,7 +74,7 @@ def levenberg_marquardt(
                 break
         else:
             damping *= 10.0
-            if damping > max_damping:
+            if damping > LAST_DAMPING:
                 break
     return start
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.stats import chi2
 
@@ -18,6 +20,35 @@ REGULARISER = 1e-9
 def sigma_by_median(residuals: np.ndarray) -> float:
     """Return the standard deviation of residuals about zero by their median absolute value, [...] not empty."""
     return MAD_SIGMA * float(np.median(np.abs(residuals)))
+
+
+@dataclass(frozen=True, eq=False)
+class ClusteredScore:
+    """The score of k parameters at a fit, whose covariance is not their information, as errors are not independent.
+
+    score: float64 [k]. information: [k, k]. clustered: [k, k], covariance of the score, as of `two_way_clustered`.
+    """
+
+    score: np.ndarray
+    information: np.ndarray
+    clustered: np.ndarray
+
+    def gain(self, columns: np.ndarray) -> float:
+        """Return the decrease of minus twice the log likelihood that a step along `columns`, [k, c], promises (Rao)."""
+        side = columns.T @ self.score
+        return float(side @ np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True) @ side)
+
+    def covariance(self, columns: np.ndarray) -> np.ndarray:
+        """Return the covariance of the parameters along `columns`, [k, c], float64 [c, c]: `H^-1 C H^-1`."""
+        inverse = np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True)
+        return np.asarray(inverse @ (columns.T @ self.clustered @ columns) @ inverse + 1e-3 * inverse)
+
+    @property
+    def as_one(self) -> float:
+        """Number of observations that count as one, in the mean over the parameters with information."""
+        information, clustered = np.diag(self.information), np.diag(self.clustered)
+        known = information > 0
+        return max(float(np.mean(clustered[known] / information[known])) + 1e-3, 1.0) if known.any() else 1.0
 
 
 def two_way_clustered(scores: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -72,7 +72,7 @@ def test_wrong_poses_and_a_wrong_focal_length_are_brought_right() -> None:
     moved = rng.standard_normal((12, 6)) * [0.03] * 6 * np.array([1, 1, 1, 0.6, 0.6, 0.6])
     moved[0] = 0
     tracks = here.tracks(replace(claim, poses=rigid.moved(claim.poses, moved)))
-    fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, iterations=25)
+    fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, steps=25)
     off = rigid.invert(fit.unknowns.poses)[:, :3, 3] - rigid.centres(here.claim.poses)
     assert np.abs(off).max() < 0.01
     np.testing.assert_allclose(fit.unknowns.theta[FOCAL], -np.log(1.25), atol=5e-3)
@@ -93,7 +93,7 @@ def test_false_alarms_are_as_frequent_as_their_level() -> None:
     runs, alarms, level = 120, 0, 0.05
     for seed in range(runs):
         tracks = walk(8, seed=seed, density=40).tracks()
-        fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, iterations=6)
+        fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, steps=6)
         variance = scores(fit).covariance(FOCAL_LENGTH)[0, 0]
         value = fit.unknowns.theta[FOCAL].mean()
         alarms += bool(value**2 / variance > chi2.isf(level, 1))

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2, norm
 
-from vggtgeo.geometry.robust import sigma_by_median, two_way_clustered
+from vggtgeo.geometry.robust import ClusteredScore, sigma_by_median, two_way_clustered
 from vggtgeo.slam.verdict import corner_adjustment as theta
 from vggtgeo.slam.verdict import thresholds
 from vggtgeo.slam.verdict.claim import Tracks
@@ -44,11 +44,6 @@ class Alternative:
     factor: float
     unit: str
 
-    @property
-    def chance(self) -> float:
-        """What minus twice the log likelihood ratio exceeds by chance at the level of `SIGNIFICANCE`."""
-        return float(chi2.isf(SIGNIFICANCE, self.columns.shape[1]))
-
 
 EACH = np.eye(SIZE)
 TABLE = (
@@ -60,8 +55,7 @@ TABLE = (
     Alternative("depth", EACH[:, theta.DRIFT][:, 1:], 100, "% (later against the first moment)"),
     Alternative("depth", EACH[:, [theta.OFFSET]], 100, "cm"),
 )
-"""A focal length that is wrong, or changes; a factor of the depth that changes, or an offset; these two promise nothing
-where no depth was measured. With poses alone and a second motion these are seven explanations."""
+"""Those of depth promise nothing where none was measured. Poses alone and a second motion are explanations, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,28 +83,28 @@ class Explanation:
 def explain(tracks: Tracks) -> Explanation:
     """Return the preferred explanation of the tracks of a window."""
     noise = replace(START, pixel=START.pixel * max(tracks.size) / 320.0)
-    held = solve(tracks, start_of(tracks), noise, poses_free=False, iterations=4)
+    held = solve(tracks, start_of(tracks), noise, poses_free=False, steps=4)
     free = with_own_noise(solve(tracks, held.unknowns, noise))
-    best, added = _selected(free)
-    rival = 0.0
+    (best, added), theirs = _selected(free), np.zeros(len(tracks.first), bool)
     if np.mean(_outliers(best)[tracks.track]) > MIN_SECOND_MOTION_SHARE:
         theirs = second_motion(free, _outliers(free))
-        if theirs.any():
-            rival = float(np.mean(theirs[tracks.track]))
-            free = with_own_noise(solve(*free.part(~theirs)))
-            best, added = _selected(free)
+    if theirs.any():
+        free = with_own_noise(solve(*free.part(~theirs)))
+        best, added = _selected(free)
+    rival = float(np.mean(theirs[tracks.track]))
     return Explanation(best, added, float(np.mean(free.weight[:, 0] > MIN_INLIER_WEIGHT)) * (1.0 - rival), rival)
 
 
 def _selected(fit: Fit) -> tuple[Fit, Added | None]:
     around = scores(fit)
-    one = max(TABLE, key=lambda one: around.gain(one.columns) / around.as_one - one.chance)
+    chance = lambda one: float(chi2.isf(SIGNIFICANCE, one.columns.shape[1]))
+    one = max(TABLE, key=lambda one: around.gain(one.columns) / around.as_one - chance(one))
     # Before the solution, as if all observations were independent: a linear step is not exact enough for more.
-    if around.gain(one.columns) < one.chance:
+    if around.gain(one.columns) < chance(one):
         return fit, None
     tried = solve(fit.tracks, fit.unknowns, fit.noise, one.columns)
     estimate, covariance = np.linalg.pinv(one.columns) @ tried.unknowns.theta, scores(tried).covariance(one.columns)
-    if estimate @ np.linalg.pinv(covariance, hermitian=True) @ estimate <= one.chance:
+    if estimate @ np.linalg.pinv(covariance, hermitian=True) @ estimate <= chance(one):
         return fit, None
     return with_own_noise(tried), Added(one, estimate, covariance)
 
@@ -127,7 +121,7 @@ def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
     wide = Noise(WIDE * fit.noise.pixel, WIDE * fit.noise.depth)
     fits = []
     for start in (replace(own, poses=still), own):
-        near = solve(start, start_of(start), wide, iterations=FIRST_STEPS)
+        near = solve(start, start_of(start), wide, steps=FIRST_STEPS)
         fits.append(solve(start, near.unknowns, fit.noise))
     other = max(fits, key=lambda one: float(one.weight[:, 0].sum()))
     theirs = np.zeros(len(outliers), bool)
@@ -138,8 +132,9 @@ def second_motion(fit: Fit, outliers: np.ndarray) -> np.ndarray:
 
 def _predicts(motion: Fit) -> bool:
     # Free poses fit few tracks in any case: the motion of one half of them must explain most of the other half.
-    first = solve(*motion.part(motion.tracks.even))
-    tracks, start, noise = motion.part(~motion.tracks.even)
+    even = np.arange(len(motion.tracks.first)) % 2 == 0
+    first = solve(*motion.part(even))
+    tracks, start, noise = motion.part(~even)
     second = solve(tracks, replace(start, poses=first.unknowns.poses), noise, poses_free=False)
     return float(np.mean(_outliers(second))) < thresholds.MAX_UNPREDICTED
 
@@ -164,36 +159,8 @@ def preferred(fit: Fit) -> bool:
     return bool(gain.sum() - unknowns > norm.isf(SIGNIFICANCE) * np.sqrt(len(gain)) * gain.std())
 
 
-@dataclass(frozen=True, eq=False)
-class Scores:
-    """The calibration's share of a fit, poses and points eliminated. side: float64 [SIZE], the score; information,
-    clustered: [SIZE, SIZE], `H`, and the covariance `C` of the score.
-    """
-
-    side: np.ndarray
-    information: np.ndarray
-    clustered: np.ndarray
-
-    def gain(self, columns: np.ndarray) -> float:
-        """Return the decrease of minus twice the log likelihood that a linear step of `columns` promises."""
-        side = columns.T @ self.side
-        return float(side @ np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True) @ side)
-
-    def covariance(self, columns: np.ndarray) -> np.ndarray:
-        """Return the robust covariance of the calibration's `columns` [SIZE, k], float64 [k, k]."""
-        inverse = np.linalg.pinv(columns.T @ self.information @ columns, hermitian=True)
-        return np.asarray(inverse @ (columns.T @ self.clustered @ columns) @ inverse + 1e-3 * inverse)
-
-    @property
-    def as_one(self) -> float:
-        """Observations that count as one, in the mean over the directions that the corners determine."""
-        information, clustered = np.diag(self.information), np.diag(self.clustered)
-        known = information > 0
-        return max(float(np.mean(clustered[known] / information[known])) + 1e-3, 1.0) if known.any() else 1.0
-
-
-def scores(fit: Fit) -> Scores:
-    """Return the scores of the whole calibration at a fit, whatever was free there."""
+def scores(fit: Fit) -> ClusteredScore:
+    """Return the score of the whole calibration at a fit, whatever was free there, with poses and points eliminated."""
     tracks, reduced, width = fit.tracks, reduce(fit, EACH, True, 0.0), 6 * len(fit.tracks.rows)
     poses = np.zeros((width, SIZE))
     poses[6:] = -np.linalg.solve(reduced.matrix[6:width, 6:width], reduced.matrix[6:width, width:])
@@ -207,4 +174,4 @@ def scores(fit: Fit) -> Scores:
     curved = np.sum(square * (2.0 * fit.weight - 1.0)) / max(float(np.sum(square)), 1e-300)
     information = np.tensordot(weighted, along, ((0, 1), (0, 1)))
     clustered = two_way_clustered(each, tracks.track, tracks.frame) / max(float(curved), 0.3) ** 2
-    return Scores(each.sum(0), information, clustered)
+    return ClusteredScore(each.sum(0), information, clustered)

@@ -124,15 +124,6 @@ class Tracks:
         at = (self.times - self.times[0]) / span * (KNOTS - 1)
         return np.maximum(1.0 - np.abs(at[:, None] - np.arange(KNOTS)), 0.0)[self.frame]
 
-    @property
-    def with_depth(self) -> bool:
-        return bool(np.isfinite(self.depth).any())
-
-    @property
-    def even(self) -> np.ndarray:
-        """Every other track, bool [t]: one half of them."""
-        return np.arange(len(self.first)) % 2 == 0
-
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Sum values [m, ...] over the observations of each track: [t, ...]."""
         return np.asarray(np.add.reduceat(values, self.first, axis=0))
@@ -190,10 +181,10 @@ def tracks_of(claim: Claim, evidence: CornerTracks, rows: np.ndarray, size: tupl
     if not len(kept):
         return None
     pixels, depth = pixels[kept].astype(np.float64), depth[kept].astype(np.float64)
-    axis = 0 if claim.readout is not None and claim.readout.columns else 1
+    rolling = claim.readout or Readout(0.0, columns=False, shift=0.0)
+    axis = 0 if rolling.columns else 1
     readout = (pixels[:, [axis]] / size[axis] - 0.5) * velocity[kept]
-    if claim.readout is not None:
-        pixels = pixels - claim.readout.seconds * readout
+    pixels = pixels - rolling.seconds * readout
     depth = np.where((depth > 0) & claim.metric, depth, np.nan)
     track = np.unique(ids[kept], return_inverse=True)[1]
     times, poses, intrinsics = claim.times[rows], claim.poses[rows], np.asarray(claim.intrinsics, np.float64)
@@ -204,10 +195,8 @@ def _velocities(evidence: CornerTracks, row: int) -> np.ndarray:
     """Return the velocity of a frame's corners from the frames before and after, pixels a second."""
     here = evidence[row]
     moved, seconds = np.zeros(here.pixels.shape), np.zeros(len(here.ids))
-    for other, sign in ((row - 1, -1.0), (row + 1, 1.0)):
-        if 0 <= other < len(evidence):
-            there = evidence[other]
-            own, theirs = here.common(there)
-            moved[own] += sign * (there.pixels[theirs] - here.pixels[own])
-            seconds[own] += abs(there.timestamp - here.timestamp)
+    for sign, there in ((-1.0, evidence[max(row - 1, 0)]), (1.0, evidence[min(row + 1, len(evidence) - 1)])):
+        own, theirs = here.common(there)
+        moved[own] += sign * (there.pixels[theirs] - here.pixels[own])
+        seconds[own] += abs(there.timestamp - here.timestamp)
     return np.asarray(moved / np.maximum(seconds, 1e-6)[:, None])

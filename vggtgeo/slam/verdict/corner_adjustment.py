@@ -18,17 +18,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
-from vggtgeo.geometry.gauss_newton import SchurComplement, levenberg_marquardt
+from vggtgeo.geometry.gauss_newton import FIRST_DAMPING, SchurComplement, levenberg_marquardt
 from vggtgeo.slam.verdict.claim import KNOTS, Tracks
 
-KERNEL = 2.0
-"""Width of Cauchy's kernel, in standard deviations of the noise."""
+KERNEL, BEHIND = 2.0, 1e3
+"""Width of Cauchy's kernel, and residual of a point behind a camera, in standard deviations of the noise."""
 TETHER = 1e-4
 """Information on each unknown of a pose: holds the scale of a map without depth, and a frame without corners."""
-ITERATIONS, CONVERGED = 12, 5e-4
-"""Maximum number, and the relative decrease of the energy below which the iteration ends."""
-DAMPING = 1e-5
-"""Of Levenberg and Marquardt at the beginning, as a share of the diagonal."""
+CONVERGED = 5e-4
+"""Relative decrease of the energy below which the iteration ends."""
 LINEAR = 0.5
 """Of the decrease of the energy that a step promises: with less, the points are solved once more for its poses."""
 FOCAL = slice(0, KNOTS)
@@ -40,8 +38,6 @@ SIZE = 2 * KNOTS + 5
 focal length; radial distortion k1; time from the first row to the last, s; metres added to the depth."""
 HELD = np.zeros((SIZE, 0))
 """Columns of a calibration that is not free."""
-HUGE = 1e3
-"""Whitened residual of a point behind a camera."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +91,9 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
     relative = unknowns.poses[tracks.frame] @ tracks.from_anchor
     a, b, log_inverse = unknowns.points[tracks.track].T
     inverse = np.exp(log_inverse)
+    turn, shift = relative[:, :3, :3], relative[:, :3, 3] * inverse[:, None]
     # The point in the camera times its inverse depth `rho`: finite for points at infinity.
-    scaled = (relative[:, :3] @ np.stack([a, b, np.ones(count), inverse], 1)[:, :, None])[:, :, 0]
+    scaled = turn[:, :, 0] * a[:, None] + turn[:, :, 1] * b[:, None] + turn[:, :, 2] + shift
     behind = scaled[:, 2] < 1e-3
     scaled[behind] = 0.0, 0.0, 1.0
 
@@ -121,8 +118,7 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
     by_theta[:, :2, READOUT] = tracks.readout
     by_theta[:, 2, DRIFT] = knots
     by_theta[:, 2, OFFSET] = 1.0 / depth
-    by_point = by_scaled @ relative[:, :3, [0, 1, 3]]
-    by_point[:, :, 2] *= inverse[:, None]
+    by_point = by_scaled @ np.stack([turn[:, :, 0], turn[:, :, 1], shift], 2)
     by_point[:, 2, 2] -= z / (inverse * depth)
     by_pose = np.concatenate([by_scaled * inverse[:, None, None], by_scaled @ -rigid.skew(scaled)], 2)
 
@@ -133,7 +129,7 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
     whiten = np.where(known, 1.0 / sigma, 0.0)
     residual = (predicted - np.where(known, measured, 0.0)) * whiten
     square = np.column_stack([np.sum(residual[:, :2] ** 2, 1), residual[:, 2] ** 2]) / KERNEL**2
-    square[behind, 0] = (HUGE / KERNEL) ** 2
+    square[behind, 0] = (BEHIND / KERNEL) ** 2
     weight = (1.0 / (1.0 + square))[:, [0, 0, 1]]
     loss = KERNEL**2 * np.log1p(square).sum(1)
     jacobians = [whiten[:, :, None] * by for by in (by_pose, by_point, by_theta)]
@@ -141,10 +137,8 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
 
 
 def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> SchurComplement:
-    """Eliminate the points. columns: float64 [SIZE, k], what of the calibration is free.
-
-    The negative residual goes along as one more column: what becomes of it is the right-hand side.
-    """
+    """Eliminate the points. columns: float64 [SIZE, k], what of the calibration is free."""
+    # The negative residual goes along as one more column: what becomes of it is the right-hand side.
     tracks = fit.tracks
     frames, count = len(tracks.poses), len(tracks.first)
     weighted = lambda by: np.swapaxes(by * fit.weight[:, :, None], 1, 2)
@@ -170,12 +164,7 @@ def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> S
 
 
 def solve(
-    tracks: Tracks,
-    start: Unknowns,
-    noise: Noise,
-    columns: np.ndarray = HELD,
-    poses_free: bool = True,
-    iterations: int = ITERATIONS,
+    tracks: Tracks, start: Unknowns, noise: Noise, columns: np.ndarray = HELD, poses_free: bool = True, steps: int = 12
 ) -> Fit:
     """Minimise over points, poses where `poses_free`, and the calibration's `columns` (float64 [SIZE, k])."""
     width = 6 * len(tracks.poses) * poses_free
@@ -192,13 +181,13 @@ def solve(
         if len(step) and fit.energy - there.energy < LINEAR * reduced.gain(step):
             # Points follow a long step of poses and focal length on a curve; without a step of their own the iteration
             # creeps along it (embedded point iterations, Jeong et al. 2012).
-            own = reduce(there, HELD, False, DAMPING).landmarks(np.zeros(0))
+            own = reduce(there, HELD, False, FIRST_DAMPING).landmarks(np.zeros(0))
             there = linearise(tracks, replace(new, points=points + np.clip(own, -1.0, 1.0)), noise, columns)
         return there
 
     first = linearise(tracks, start, noise, columns)
     energy = lambda fit: fit.energy
-    return levenberg_marquardt(first, energy, stepped, iterations=iterations, gain=CONVERGED, damping=DAMPING)
+    return levenberg_marquardt(first, energy, stepped, steps=steps, gain=CONVERGED)
 
 
 def start_of(tracks: Tracks) -> Unknowns:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.verdict.alternatives import Added, Explanation, preferred
+from vggtgeo.slam.verdict.alternatives import Explanation, preferred
 from vggtgeo.slam.verdict.claim import Claim, extent, max_place_error
 from vggtgeo.slam.verdict.corner_adjustment import Fit, solve, start_of
 from vggtgeo.slam.verdict.finding import Finding
@@ -51,8 +51,8 @@ def confirmed(best: Fit) -> tuple[np.ndarray, np.ndarray]:
     deviation of their mean. Both begin at the claimed poses, not at one wrong minimum.
     """
     fits = []
-    for kept in (best.tracks.even, ~best.tracks.even):
-        half = best.tracks.subset(kept)
+    for remainder in (0, 1):
+        half = best.tracks.subset(np.arange(len(best.tracks.first)) % 2 == remainder)
         start = replace(start_of(half), theta=best.unknowns.theta)
         fits.append(solve(half, start, best.noise, best.columns))
     pairs = list(zip(*map(_differences, fits), strict=True))
@@ -65,7 +65,7 @@ def _differences(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Return the differences from the claim: places after alignment [f, 3], turns between frames, rad [f - 1, 3]."""
     poses, claimed = fit.unknowns.poses, fit.tracks.poses
     places, theirs = rigid.centres(poses), rigid.centres(claimed)
-    fitted = umeyama(places, theirs, not fit.tracks.with_depth)
+    fitted = umeyama(places, theirs, not np.isfinite(fit.tracks.depth).any())
     step = lambda poses: poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)
     turns = Rotation.from_matrix(step(poses) @ np.swapaxes(step(claimed), 1, 2)).as_rotvec()
     return fitted.points(places) - theirs, np.asarray(turns)
@@ -135,13 +135,10 @@ def _finding(claim: Claim, ones: Sequence[Contradiction]) -> Finding:
         f"{np.degrees(worst.off[1]):.1f} degrees; {what.format(rival=rival, noise=100 * window.best.noise.depth)}"
     )
     if window.added and window.added.alternative.name == worst.cause:
-        text += _estimate(window.added)
+        factor, sigmas = window.added.alternative.factor, np.sqrt(np.diag(window.added.covariance))
+        each = zip(factor * window.added.estimate, factor * sigmas, strict=True)
+        estimate = ", ".join(f"{value:.2g} +- {sigma:.1g}" for value, sigma in each)
+        text += f", by {estimate} {window.added.alternative.unit}"
     if worst.size < 1.0:
         return Finding(worst.cause, "good", text, start, end)
     return Finding(worst.cause, "degraded", f"{text}. {advice}", start, end, scale=scale and claim.metric)
-
-
-def _estimate(added: Added) -> str:
-    factor, sigmas = added.alternative.factor, np.sqrt(np.diag(added.covariance))
-    each = zip(factor * added.estimate, factor * sigmas, strict=True)
-    return f", by {', '.join(f'{value:.2g} +- {sigma:.1g}' for value, sigma in each)} {added.alternative.unit}"

@@ -83,23 +83,19 @@ class Verdict:
         return cls(values["level"], tuple(values["reasons"]), segments, metric, tuple(values.get("noted", ())))
 
 
-def worst(levels: Iterable[Level]) -> Level:
-    """Return the worst of some levels; "good" if there are none."""
-    return max(levels, key=LEVELS.index, default="good")
-
-
 def conclude(findings: Iterable[Finding], frames: Sequence[int], times: Sequence[float], metric: bool) -> Verdict:
     """Combine the findings on a run with these frame numbers and times."""
-    ordered = sorted(findings, key=lambda one: -LEVELS.index(one.level))
+    ordered = sorted(findings, key=lambda one: LEVELS.index(one.level), reverse=True)
     reasons = [one for one in ordered if one.level != "good"]
+    noted = tuple(one.text for one in ordered if one.level == "good")
     of_run = [one for one in reasons if not one.local]
-    return Verdict(
-        worst(one.level for one in of_run),
-        tuple(one.text for one in of_run),
-        _segments(reasons, frames, times),
-        metric and not any(one.scale for one in reasons),
-        tuple(one.text for one in ordered if one.level == "good"),
-    )
+    metric = metric and not any(one.scale for one in reasons)
+    texts, segments = tuple(one.text for one in of_run), _segments(reasons, frames, times)
+    return Verdict(_level(of_run), texts, segments, metric, noted)
+
+
+def _level(worst_first: Sequence[Finding]) -> Level:
+    return worst_first[0].level if worst_first else "good"
 
 
 def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence[float]) -> tuple[Segment, ...]:
@@ -107,7 +103,7 @@ def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence
 
     def state(row: int) -> tuple[Level, tuple[str, ...]]:
         here = [one for one in reasons if one.concerns(frames[row])]
-        return worst(one.level for one in here), tuple(dict.fromkeys(one.check for one in here))
+        return _level(here), tuple(dict.fromkeys(one.check for one in here))
 
     found = []
     for (level, checks), group in groupby(range(len(frames)), state):

@@ -1,9 +1,4 @@
-"""The verdict of a run: what the tracker lost, what is not determined, and what the corners explain better.
-
-A lost stretch of `T` seconds is bridged by assuming a smooth motion. A hand-held camera's acceleration has a standard
-deviation of about `ACCELERATION`, so the middle of a bridge is off by `a T^2 / 8`, the end of a run that is not
-relocalized by `a T^2 / 2`. The RMS over all frames is the effect on the trajectory error.
-"""
+"""The verdict of a run: what the tracker lost, what is not determined, and what the corners explain better."""
 
 from __future__ import annotations
 
@@ -52,8 +47,7 @@ def judge_or_report(slam: Slam, evidence: CornerTracks = (), input_findings: tup
         return judge(slam, evidence, input_findings)
     except Exception as error:  # noqa: BLE001 - of any kind: the result exists, and is worth more than its verdict
         text = f"the verdict ended in an error ({type(error).__name__}: {error}): the result is unchecked"
-        claim = Claim.of(slam)
-        found = [*input_findings, Finding("verdict", "degraded", text)]
+        claim, found = Claim.of(slam), [*input_findings, Finding("verdict", "degraded", text)]
         return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
 
 
@@ -136,6 +130,8 @@ def check_record(claim: Claim) -> list[Finding]:
 
 
 def _lost(claim: Claim) -> list[Finding]:
+    # A stretch of T seconds is bridged by assuming a smooth motion. With the acceleration `a` of a hand-held camera its
+    # middle is off by `a T^2 / 8`, the end of a run that is not relocalized by `a T^2 / 2`; RMS over all frames.
     found, squares, parts, newest = [], 0.0, stretches(~claim.tracked), len(claim) - 1
     for first, last in parts:
         start, end, _ = claim.span(first, last)
