@@ -84,7 +84,7 @@ def test_a_planted_fault_is_named_and_measured(name: str) -> None:
     first = found.added
     off = first.estimate - np.asarray(truth)
     sigma = np.sqrt(np.diag(first.covariance))
-    assert first.alternative.name == NAMES.get(name, name)
+    assert first.name == NAMES.get(name, name)
     assert len(first.estimate) == len(truth)
     assert np.all(np.abs(off) < 4 * sigma + 0.01 * np.abs(truth)), (off, sigma)
 

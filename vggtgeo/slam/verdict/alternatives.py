@@ -15,7 +15,7 @@ test) is solved, and taken if it is significant (Wald). Corners that another mot
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2, norm
@@ -36,13 +36,15 @@ WIDE, FIRST_STEPS = 20.0, 6
 @dataclass(frozen=True, eq=False)
 class Alternative:
     """One hypothesis. columns: float64 [SIZE, k], directions of `theta` that it frees. factor, unit: the estimate times
-    `factor` is in `unit`, for messages.
+    `factor` is in `unit`, for messages. estimate: float64 [k], covariance: [k, k], of a fit.
     """
 
     name: str
     columns: np.ndarray
     factor: float
     unit: str
+    estimate: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 EACH = np.eye(SIZE)
@@ -59,15 +61,6 @@ TABLE = (
 
 
 @dataclass(frozen=True, eq=False)
-class Added:
-    """An alternative in an explanation. estimate: float64 [k], of its columns; covariance: [k, k]."""
-
-    alternative: Alternative
-    estimate: np.ndarray
-    covariance: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Explanation:
     """What the corners of a window prefer. best: fit with free poses and what was added, without the corners of the
     second motion. added: None where no alternative is significant. share, rival: of the observations, explained by the
@@ -75,7 +68,7 @@ class Explanation:
     """
 
     best: Fit
-    added: Added | None
+    added: Alternative | None
     share: float
     rival: float
 
@@ -95,7 +88,7 @@ def explain(tracks: Tracks) -> Explanation:
     return Explanation(best, added, float(np.mean(free.weight[:, 0] > MIN_INLIER_WEIGHT)) * (1.0 - rival), rival)
 
 
-def _selected(fit: Fit) -> tuple[Fit, Added | None]:
+def _selected(fit: Fit) -> tuple[Fit, Alternative | None]:
     around = scores(fit)
     chance = lambda one: float(chi2.isf(SIGNIFICANCE, one.columns.shape[1]))
     one = max(TABLE, key=lambda one: around.gain(one.columns) / around.as_one - chance(one))
@@ -106,7 +99,7 @@ def _selected(fit: Fit) -> tuple[Fit, Added | None]:
     estimate, covariance = np.linalg.pinv(one.columns) @ tried.unknowns.theta, scores(tried).covariance(one.columns)
     if estimate @ np.linalg.pinv(covariance, hermitian=True) @ estimate <= chance(one):
         return fit, None
-    return with_own_noise(tried), Added(one, estimate, covariance)
+    return with_own_noise(tried), replace(one, estimate=estimate, covariance=covariance)
 
 
 def _outliers(fit: Fit) -> np.ndarray:
@@ -147,8 +140,8 @@ def with_own_noise(fit: Fit) -> Fit:
     known = np.isfinite(tracks.depth)
     shared = residual[known, 2] * np.sqrt(tracks.depths[known])  # the error of a depth is common to its track
     depth = fit.noise.depth * (sigma_by_median(shared) if known.any() else 1.0)
-    least = thresholds.MIN_PIXEL_NOISE, thresholds.MIN_RELATIVE_DEPTH_NOISE
-    return solve(tracks, fit.unknowns, Noise(*np.maximum((pixel, depth), least).tolist()), fit.columns)
+    noise = Noise(max(float(pixel), thresholds.MIN_PIXEL_NOISE), max(depth, thresholds.MIN_RELATIVE_DEPTH_NOISE))
+    return solve(tracks, fit.unknowns, noise, fit.columns)
 
 
 def preferred(fit: Fit) -> bool:

@@ -17,10 +17,8 @@ from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.thresholds import MAX_PLACE_ERROR, MAX_PLACE_ERROR_SHARE, MIN_COMMON, MIN_VIEWS
 
-WINDOW = 24
-"""Frames that are adjusted together."""
-SHARED, MAX_STEP = 0.5, 3
-"""The next frame of a window is the farthest one that still shows this share of the corners, at most so many on."""
+WINDOW, SHARED, MAX_STEP = 24, 0.5, 3
+"""Frames that are adjusted together; the next is the farthest that shows this share of the corners, at most so many on."""
 KNOTS = 4
 """Of a quantity that changes with time: linear between so many moments, evenly spread over the window."""
 
@@ -138,7 +136,7 @@ class Tracks:
 def linked(evidence: CornerTracks, tracked: np.ndarray) -> list[np.ndarray]:
     """Split tracked frames into stretches, each linked to the next frame by corners: rows, increasing."""
     rows = np.flatnonzero(tracked)
-    apart = [len(evidence[row].common(evidence[after])[0]) < MIN_COMMON for row, after in pairwise(rows)]
+    apart = [len(evidence[row].common(evidence[after])[0]) < MIN_COMMON for row, after in pairwise(rows.tolist())]
     return np.split(rows, np.flatnonzero(apart) + 1) if len(rows) else []
 
 

@@ -25,10 +25,9 @@ KERNEL, BEHIND = 2.0, 1e3
 """Width of Cauchy's kernel, and residual of a point behind a camera, in standard deviations of the noise."""
 TETHER = 1e-4
 """Information on each unknown of a pose: holds the scale of a map without depth, and a frame without corners."""
-CONVERGED = 5e-4
-"""Relative decrease of the energy below which the iteration ends."""
-LINEAR = 0.5
-"""Of the decrease of the energy that a step promises: with less, the points are solved once more for its poses."""
+CONVERGED, LINEAR = 5e-4, 0.5
+"""Relative decrease of the energy below which the iteration ends; share of the decrease that a step promises, below
+which the points are solved once more for its poses."""
 FOCAL = slice(0, KNOTS)
 DRIFT = slice(KNOTS, 2 * KNOTS)
 CENTRE = slice(2 * KNOTS, 2 * KNOTS + 2)
@@ -132,8 +131,8 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
     square[behind, 0] = (BEHIND / KERNEL) ** 2
     weight = (1.0 / (1.0 + square))[:, [0, 0, 1]]
     loss = KERNEL**2 * np.log1p(square).sum(1)
-    jacobians = [whiten[:, :, None] * by for by in (by_pose, by_point, by_theta)]
-    return Fit(tracks, noise, unknowns, columns, residual, weight, *jacobians, loss)
+    by_pose, by_point, by_theta = (whiten[:, :, None] * by for by in (by_pose, by_point, by_theta))
+    return Fit(tracks, noise, unknowns, columns, residual, weight, by_pose, by_point, by_theta, loss)
 
 
 def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> SchurComplement:
@@ -186,8 +185,7 @@ def solve(
         return there
 
     first = linearise(tracks, start, noise, columns)
-    energy = lambda fit: fit.energy
-    return levenberg_marquardt(first, energy, stepped, steps=steps, gain=CONVERGED)
+    return levenberg_marquardt(first, lambda fit: fit.energy, stepped, steps=steps, gain=CONVERGED)
 
 
 def start_of(tracks: Tracks) -> Unknowns:

@@ -24,7 +24,6 @@ from vggtgeo.slam.verdict.thresholds import MAX_DEPTH_NOISE, MAX_REASONS, MAX_TU
 CALIBRATE = "Calibrate the camera, or let the run estimate it (leave out `--intrinsics`)"
 FILM_AGAIN = "Film this part again, slower, or do not use it"
 MOVE_SLOWER = "Move slower, or use a camera mode with a shorter readout"
-CHECK_DEPTH = "Check the depth camera, or leave its depth out (`--rgb-only`)"
 MOVING = (
     "{rival:.0f} % of the corners followed in the images move by themselves (an overlay, or something large that moves)"
 )
@@ -36,7 +35,7 @@ CAUSES: dict[str, tuple[str, str, bool]] = {
     "principal point": ("corners followed in the images contradict the principal point", CALIBRATE, False),
     "distortion": ("corners followed in the images show a lens distortion that the camera lacks", CALIBRATE, False),
     "rolling shutter": ("corners followed in the images show a rolling shutter", MOVE_SLOWER, False),
-    "depth": (SCATTERS, CHECK_DEPTH, True),
+    "depth": (SCATTERS, "Check the depth camera, or leave its depth out (`--rgb-only`)", True),
 }
 """Of each cause: what it is, what to do, and whether it puts the unit of length in doubt."""
 
@@ -45,7 +44,6 @@ def confirmed(best: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Return the difference from the claim that two halves of the tracks confirm, and its standard deviations.
 
     float64 [2] each, RMS over frames: places after alignment, in the unit of the map; turns from frame to frame, rad.
-
     Errors of tracks, mistracked corners among them, are independent between the halves: the mean product of what both
     differ from the claim by is free of their noise, and half of what they differ from each other by is the standard
     deviation of their mean. Both begin at the claimed poses, not at one wrong minimum.
@@ -55,24 +53,23 @@ def confirmed(best: Fit) -> tuple[np.ndarray, np.ndarray]:
         half = best.tracks.subset(np.arange(len(best.tracks.first)) % 2 == remainder)
         start = replace(start_of(half), theta=best.unknowns.theta)
         fits.append(solve(half, start, best.noise, best.columns))
-    pairs = list(zip(*map(_differences, fits), strict=True))
-    common = [max(_mean_product(one, other), 0.0) for one, other in pairs]
-    apart = [0.25 * _mean_product(one - other, one - other) for one, other in pairs]
-    return np.sqrt(common), np.sqrt(apart)
+    first, second = map(_differences, fits)
+    apart = [one - other for one, other in zip(first, second, strict=True)]
+    return np.sqrt(np.maximum(_mean_products(first, second), 0.0)), np.sqrt(0.25 * _mean_products(apart, apart))
 
 
-def _differences(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+def _differences(fit: Fit) -> list[np.ndarray]:
     """Return the differences from the claim: places after alignment [f, 3], turns between frames, rad [f - 1, 3]."""
     poses, claimed = fit.unknowns.poses, fit.tracks.poses
     places, theirs = rigid.centres(poses), rigid.centres(claimed)
     fitted = umeyama(places, theirs, not np.isfinite(fit.tracks.depth).any())
     step = lambda poses: poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)
     turns = Rotation.from_matrix(step(poses) @ np.swapaxes(step(claimed), 1, 2)).as_rotvec()
-    return fitted.points(places) - theirs, np.asarray(turns)
+    return [fitted.points(places) - theirs, turns]
 
 
-def _mean_product(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.mean(np.sum(one * other, 1)))
+def _mean_products(ones: list[np.ndarray], others: list[np.ndarray]) -> np.ndarray:
+    return np.array([np.mean(np.sum(one * other, 1)) for one, other in zip(ones, others, strict=True)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +92,8 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
     tracks, noise = one.best.tracks, one.best.noise
     cause = "second motion" if one.rival > 0 else "depth" if noise.depth > MAX_DEPTH_NOISE else None
     limits = np.array([max_place_error(metric, tracks.poses), MAX_TURN_ERROR])
-    off, sigma, size = np.sqrt([_mean_product(off, off) for off in _differences(one.best)]), np.zeros(2), 0.0
+    whole = _differences(one.best)
+    off, sigma, size = np.sqrt(_mean_products(whole, whole)), np.zeros(2), 0.0
     if cause or np.any(off >= limits):  # else small even with its noise
         off, sigma = confirmed(one.best)
         doubt = np.hypot(sigma, [stated * extent(tracks.poses), 0.0])
@@ -106,7 +104,7 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
         return Contradiction(one, off, sigma, cause, max(size, 1.0))
     if size < 1.0 and not one.added:
         return None
-    return Contradiction(one, off, sigma, one.added.alternative.name if one.added else "poses", size)
+    return Contradiction(one, off, sigma, one.added.name if one.added else "poses", size)
 
 
 def findings(claim: Claim, explanations: Sequence[Explanation], stated: float = 0.0) -> list[Finding]:
@@ -124,21 +122,17 @@ def _finding(claim: Claim, ones: Sequence[Contradiction]) -> Finding:
     rows = np.concatenate([one.window.best.tracks.rows for one in ones])
     start, end, where = claim.span(int(rows.min()), int(rows.max()))
     worst = max(ones, key=lambda one: one.size)
-    window, (what, advice, scale) = worst.window, CAUSES[worst.cause]
-    around, unit = 1.0, "cm"
-    if not claim.metric:
-        around, unit = extent(window.best.tracks.poses), "% of the extent of the path there"
+    window, best, (what, advice, scale) = worst.window, worst.window.best, CAUSES[worst.cause]
+    around, unit = (1.0, "cm") if claim.metric else (extent(best.tracks.poses), "% of the extent of the path there")
     off, sigma = 100 * worst.off[0] / around, 100 * worst.sigma[0] / around
     rival = 100 * window.rival / max(window.rival + window.share, 1e-12)
     text = (
         f"{where}: the camera positions may be wrong by {off:.0f} +- {sigma:.0f} {unit}, turns from frame to frame by "
-        f"{np.degrees(worst.off[1]):.1f} degrees; {what.format(rival=rival, noise=100 * window.best.noise.depth)}"
+        f"{np.degrees(worst.off[1]):.1f} degrees; {what.format(rival=rival, noise=100 * best.noise.depth)}"
     )
-    if window.added and window.added.alternative.name == worst.cause:
-        factor, sigmas = window.added.alternative.factor, np.sqrt(np.diag(window.added.covariance))
-        each = zip(factor * window.added.estimate, factor * sigmas, strict=True)
-        estimate = ", ".join(f"{value:.2g} +- {sigma:.1g}" for value, sigma in each)
-        text += f", by {estimate} {window.added.alternative.unit}"
+    if (added := window.added) and added.name == worst.cause:
+        each = zip(added.factor * added.estimate, added.factor * np.sqrt(np.diag(added.covariance)), strict=True)
+        text += f", by {', '.join(f'{value:.2g} +- {sigma:.1g}' for value, sigma in each)} {added.unit}"
     if worst.size < 1.0:
         return Finding(worst.cause, "good", text, start, end)
     return Finding(worst.cause, "degraded", f"{text}. {advice}", start, end, scale=scale and claim.metric)

@@ -21,8 +21,8 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.perception.followed_corners import WIDTH, FollowedCorners, small_grey, small_mask
 from vggtgeo.slam.state import Slam
 
-STRIDE = 8
-"""Pixels between the depths that are kept of the last frame."""
+SOME = slice(4, None, 8)
+"""Rows and columns of the depth that is kept of the last frame."""
 MAX_QUEUED_FRAMES = 4
 """Maximum number of frames that wait for the recorder's thread; they hold their images."""
 
@@ -118,10 +118,9 @@ class EvidenceRecorder(Callback):
 
     def _depth_at(self, pixels: np.ndarray, depth: np.ndarray | None, same_picture: bool) -> np.ndarray:
         """Return depths at pixels; NaN if the image repeats that of another picture: the run does not use it either."""
-        some = slice(STRIDE // 2, None, STRIDE)
-        before, self._depth = self._depth, None if depth is None else depth[some, some].copy()
-        same_depth = before is not None and depth is not None and np.array_equal(before, self._depth, equal_nan=True)
-        self._owned = not same_depth or (self._owned and same_picture)
+        before, now = self._depth, None if depth is None else depth[SOME, SOME].copy()
+        same_depth = before is not None and now is not None and np.array_equal(before, now, equal_nan=True)
+        self._depth, self._owned = now, not same_depth or (self._owned and same_picture)
         if depth is None or not self._owned:
             return np.full(len(pixels), np.nan, np.float32)
         return pinhole.at_pixels(depth, pixels).astype(np.float32)

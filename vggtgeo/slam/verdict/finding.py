@@ -77,9 +77,8 @@ class Verdict:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], metric: bool = True) -> Self:
         """Invert `to_dict`."""
-        segments = tuple(
-            Segment(*one["frames"], *one["seconds"], one["level"], tuple(one["checks"])) for one in values["segments"]
-        )
+        parts = ((*one["frames"], *one["seconds"], one["level"], tuple(one["checks"])) for one in values["segments"])
+        segments = tuple(Segment(*part) for part in parts)
         return cls(values["level"], tuple(values["reasons"]), segments, metric, tuple(values.get("noted", ())))
 
 
@@ -91,11 +90,7 @@ def conclude(findings: Iterable[Finding], frames: Sequence[int], times: Sequence
     of_run = [one for one in reasons if not one.local]
     metric = metric and not any(one.scale for one in reasons)
     texts, segments = tuple(one.text for one in of_run), _segments(reasons, frames, times)
-    return Verdict(_level(of_run), texts, segments, metric, noted)
-
-
-def _level(worst_first: Sequence[Finding]) -> Level:
-    return worst_first[0].level if worst_first else "good"
+    return Verdict(of_run[0].level if of_run else "good", texts, segments, metric, noted)
 
 
 def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence[float]) -> tuple[Segment, ...]:
@@ -103,7 +98,7 @@ def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence
 
     def state(row: int) -> tuple[Level, tuple[str, ...]]:
         here = [one for one in reasons if one.concerns(frames[row])]
-        return _level(here), tuple(dict.fromkeys(one.check for one in here))
+        return here[0].level if here else "good", tuple(dict.fromkeys(one.check for one in here))
 
     found = []
     for (level, checks), group in groupby(range(len(frames)), state):

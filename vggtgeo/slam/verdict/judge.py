@@ -25,10 +25,8 @@ from vggtgeo.slam.verdict.finding import Finding, Level, Verdict, conclude
 
 
 def judge(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
-    """Judge the state after the last adjustment.
-
-    evidence: of all frames, from an `EvidenceRecorder`; without it only the run's own record counts. input_findings:
-    what is known of the input already.
+    """Judge the state after the last adjustment. evidence: of all frames, from an `EvidenceRecorder`; without it only
+    the run's own record counts. input_findings: what is known of the input already.
     """
     claim = Claim.of(slam)
     known = stated_share(claim, frame_uncertainty(slam) if slam.keyframes else None)
@@ -185,12 +183,10 @@ def check_unit(claim: Claim, corners: CornerTracks) -> list[Finding]:
 
 
 def check_frozen(claim: Claim, corners: CornerTracks) -> list[Finding]:
-    """Check for pictures that were repeated while the camera moved on, at its usual speed.
-
-    Where a camera is at rest, the noise of a new picture still moves its corners a little: all of them in the very
-    same place have no likelihood but that of the same picture.
+    """Check for pictures that were repeated while the camera moved on, at its usual speed. Where it is at rest, the
+    noise of a new picture still moves its corners a little: all of them in the very same place are of the same picture.
     """
-    repeated = np.array([False, *(_same(*pair) for pair in pairwise(corners))], bool)
+    repeated = np.array([False, *(_same_picture(*pair) for pair in pairwise(corners))], bool)
     parts = stretches(repeated & claim.tracked)
     if not parts or repeated[1:].all():
         return []
@@ -207,8 +203,7 @@ def check_frozen(claim: Claim, corners: CornerTracks) -> list[Finding]:
     return [Finding("frozen", "degraded", text, start, end)]
 
 
-def _same(before: FrameEvidence, after: FrameEvidence) -> bool:
-    """Return whether two frames show one picture: most of their corners did not move at all."""
+def _same_picture(before: FrameEvidence, after: FrameEvidence) -> bool:
     first, second = before.common(after)
     moved = np.abs(before.pixels[first] - after.pixels[second]).max(1, initial=0.0)
     return len(first) >= thresholds.MIN_COMMON and bool(np.median(moved) < thresholds.MAX_UNMOVED)

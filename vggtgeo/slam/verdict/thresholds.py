@@ -1,7 +1,6 @@
-"""Thresholds of the verdict; numbers of methods (windows, iterations) are in the files that use them.
+"""Thresholds of the verdict, set on simulated runs and measured on those of `benchmarks/verdict_bank.py`.
 
-They were set on simulated runs, and are measured on those of `benchmarks/verdict_bank.py`. The range of plausible
-depths is that of `vggtgeo data check` (`PLAUSIBLE` in `datasets/check.py`).
+Numbers of methods (windows, steps) are in the files that use them, plausible depths of rooms in `datasets/check.py`.
 """
 
 import numpy as np
@@ -9,8 +8,8 @@ import numpy as np
 SIGNIFICANCE = 1e-6
 """Significance level of an alternative; seven are tried in each window."""
 SIGMAS = 2.0
-"""Standard deviations that a difference from the run must exceed: with two, four fifths of the squared mean of both
-halves of the tracks is common to them."""
+"""Standard deviations that a difference from the run must exceed: at 2, four fifths of the squared mean of both halves
+of the tracks is common to them."""
 MAX_PLACE_ERROR, MAX_PLACE_ERROR_SHARE = 0.05, 0.06
 """Largest error of places that does not matter, RMS over a window, or over the run where frames were lost or repeat a
 picture: metres, and share of the path's extent for a map that is not metric."""
