@@ -28,7 +28,7 @@ from vggtgeo.slam.verdict.corner_adjustment import SIZE, Fit, Noise, reduce, sol
 from vggtgeo.slam.verdict.thresholds import MIN_INLIER_WEIGHT, MIN_SECOND_MOTION_SHARE, SIGNIFICANCE
 
 START = Noise(0.6, 0.03)
-"""Pixels of an image of 320, relative: until residuals say more."""
+"""Pixels of an image of 320, relative: until residuals say more, which they do not where no depth was measured."""
 WIDE, FIRST_STEPS = 20.0, 6
 """Times the noise in the first steps towards a second motion, which begin far from it, and their number."""
 
