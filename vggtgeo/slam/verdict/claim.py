@@ -18,7 +18,8 @@ from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.thresholds import MAX_PLACE_ERROR, MAX_PLACE_ERROR_SHARE, MIN_COMMON, MIN_VIEWS
 
 WINDOW, SHARED, MAX_STEP = 24, 0.5, 3
-"""Frames that are adjusted together; the next is the farthest that shows this share of the corners, at most so many on."""
+"""Frames that are adjusted together. The next frame of a window is the farthest one that still shows this share of the
+corners, at most so many on."""
 KNOTS = 4
 """Of a quantity that changes with time: linear between so many moments, evenly spread over the window."""
 
