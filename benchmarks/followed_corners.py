@@ -73,7 +73,7 @@ def _steps(recording: Recording) -> tuple[list[np.ndarray], list[float]]:
 def _off(
     first: FrameEvidence, before: np.ndarray, second: FrameEvidence, after: np.ndarray, inner: np.ndarray
 ) -> np.ndarray:
-    _, rows, others = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+    rows, others = first.common(second)
     points = rigid.unproject(first.pixels[rows].astype(np.float64), 1.0 / first.depth[rows], before, inner)
     return np.asarray(np.linalg.norm(rigid.project(points, after, inner) - second.pixels[others], axis=1))
 

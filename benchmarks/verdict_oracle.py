@@ -28,22 +28,19 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.slam.precision import in_double_precision
-from vggtgeo.slam.verdict.alternatives import START, explain
-from vggtgeo.slam.verdict.claim import Claim, extent
+from vggtgeo.slam.verdict.alternatives import START, explain, scores, with_own_noise
+from vggtgeo.slam.verdict.claim import KNOTS, Claim, Tracks, extent, tracks_of_windows
 from vggtgeo.slam.verdict.corner_adjustment import (
     DRIFT,
     FOCAL,
-    KNOTS,
     OFFSET,
     RADIAL,
     SIZE,
-    Tracks,
     Unknowns,
     solve,
     start_of,
 )
-from vggtgeo.slam.verdict.judge import aligned, tracks_of_windows
-from vggtgeo.slam.verdict.noise import scores, with_own_noise
+from vggtgeo.slam.verdict.judge import aligned
 
 Truth = tuple[np.ndarray, np.ndarray]
 """Weights of the knots, [m, KNOTS], in place of those linear in time, and `theta`."""
@@ -100,7 +97,7 @@ def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray)
     best = explain(tracks).best
     start = replace(START, pixel=START.pixel * max(tracks.size) / 320.0)
     free = with_own_noise(solve(tracks, start_of(tracks), start))
-    there, metric = rigid.centres(tracks.poses), tracks.with_depth
+    there, metric = rigid.centres(tracks.poses), bool(np.isfinite(tracks.depth).any())
     fitted = umeyama(true[:, :3, 3], there, not metric)
     poses = rigid.invert(fitted.trajectory(Trajectory(tracks.times, true)).poses)
     unit = 0.01 if metric else 0.01 * extent(tracks.poses)
@@ -111,11 +108,11 @@ def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray)
         own = {one.name: getattr(tracks, one.name) for one in fields(tracks)}
         planted = WithTruth(**own, shares=shares)
         starts = (replace(free.unknowns, theta=theta), replace(_started(tracks, poses), theta=theta))
-        fits = [solve(planted, one, free.noise, iterations=40) for one in starts]
-        plain = solve(tracks, free.unknowns, free.noise, iterations=40)
-        gain = plain.linear.energy - min(fit.linear.energy for fit in fits)
+        fits = [solve(planted, one, free.noise, steps=40) for one in starts]
+        plain = solve(tracks, free.unknowns, free.noise, steps=40)
+        gain = plain.energy - min(fit.energy for fit in fits)
     elif case["degradation"] == "cut":
-        gain = free.linear.energy - solve(tracks, _started(tracks, poses), free.noise).linear.energy
+        gain = free.energy - solve(tracks, _started(tracks, poses), free.noise).energy
     return Window(*errors, gain / scores(free).as_one)
 
 
@@ -145,7 +142,8 @@ def row(name: str, out: Path) -> str:
     if corners is not None:
         row_of = {int(frame): place for place, frame in enumerate(truth["frames"])}
         true = truth["poses"][[row_of[int(frame)] for frame in claim.frames]]
-        for tracks in tracks_of_windows(slam, claim, corners):
+        height, width = slam.keyframes[0].size
+        for tracks in tracks_of_windows(claim, corners, (width, height)):
             found.append(window(case, tracks, claim, true[tracks.rows]))
     cells = [f"{max(getattr(each, field) for each in found):.3g}" for field in ("run", "corners", "gain") if found]
     return f"| {name} | {case['outcome']} | {100 * case['ate']:.1f} | {' | '.join(cells or ['-'] * 3)} |"

@@ -10,10 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.alternatives import Explanation, explain
-from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.corner_adjustment import Tracks
+from vggtgeo.slam.verdict.claim import Claim, Tracks, tracks_of
 from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
-from vggtgeo.slam.verdict.windows import tracks_of
 
 K = np.array([500.0, 500.0, 319.5, 239.5])
 SIZE = (640, 480)

@@ -25,7 +25,7 @@ from vggtgeo.models.onnx.session import NetworkValueError, open_session
 from vggtgeo.models.onnx.vggt import decode_cameras
 from vggtgeo.models.roles import DepthEstimate, Features, Segments
 
-from vggtgeo.slam.verdict.input_findings import check_refusals
+from vggtgeo.slam.verdict.judge import check_refusals
 
 SIZE = (48, 64)
 IMAGE = np.random.default_rng(0).integers(0, 255, (*SIZE, 3)).astype(np.uint8)

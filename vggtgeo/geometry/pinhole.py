@@ -71,6 +71,12 @@ def visible(
     return inside, y[inside].astype(int), x[inside].astype(int)
 
 
+def at_pixels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the values [m, ...] of an image [h, w, ...] at the pixels nearest to `pixels` [m, 2], inside or not."""
+    column, row = np.clip(np.rint(pixels), 0, np.array(image.shape[1::-1]) - 1).astype(int).T
+    return np.asarray(image[row, column])
+
+
 def coarser(intrinsics: IntrinsicsLike, factor: int) -> np.ndarray:
     """Return the intrinsics, float64 [4], of an image whose pixels are blocks of `factor` x `factor` pixels."""
     fx, fy, cx, cy = (float(value) for value in intrinsics)

@@ -86,6 +86,13 @@ def cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], -1)
 
 
+def skew(vectors: np.ndarray) -> np.ndarray:
+    """Return the matrices `[v]x`, [..., 3, 3], of vectors [..., 3]: `[v]x w = v x w`."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    none = np.zeros_like(x)
+    return np.stack([none, -z, y, z, none, -x, -y, x, none], -1).reshape(*x.shape, 3, 3)
+
+
 def orthonormal(pose: np.ndarray) -> np.ndarray:
     """Return the nearest rigid motion: products of many poses lose orthonormal rotations."""
     result = pose.copy()
@@ -134,10 +141,8 @@ def moved(poses: np.ndarray, tangents: np.ndarray) -> np.ndarray:
 
 def adjoint(pose: np.ndarray) -> np.ndarray:
     """Return `Ad(T)` of rigid motions [..., 4, 4], float64 [..., 6, 6]; tangents have translation first."""
-    x, y, z = np.moveaxis(pose[..., :3, 3], -1, 0)
-    none, rotation = np.zeros_like(x), pose[..., :3, :3]
-    skew = np.stack([none, -z, y, z, none, -x, -y, x, none], -1).reshape(rotation.shape)
+    rotation = pose[..., :3, :3]
     found = np.zeros((*pose.shape[:-2], 6, 6))
     found[..., :3, :3] = found[..., 3:, 3:] = rotation
-    found[..., :3, 3:] = skew @ rotation
+    found[..., :3, 3:] = skew(pose[..., :3, 3]) @ rotation
     return found

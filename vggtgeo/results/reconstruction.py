@@ -51,8 +51,7 @@ from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Finding, Verdict
-from vggtgeo.slam.verdict.input_findings import check_input, check_refusals, check_static_overlay
-from vggtgeo.slam.verdict.judge import judge_or_report
+from vggtgeo.slam.verdict.judge import check_input, check_refusals, check_static_overlay, judge_or_report
 from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
 
 FREE_MAP = (

@@ -20,6 +20,10 @@ def submaps_by_size(slam: Slam) -> tuple[tuple[int, ...], ...]:
 
 def lost_stretches(slam: Slam) -> tuple[tuple[int, int], ...]:
     """Return the first and last row of `slam.frames` of each stretch of frames without a pose."""
-    lost = np.array([False, *(not record.tracked for record in slam.frames), False])
-    first, past = np.flatnonzero(np.diff(lost)).reshape(-1, 2).T
+    return stretches(np.array([not record.tracked for record in slam.frames], bool))
+
+
+def stretches(marked: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """Return the first and last row of each run of True values of bool [n]."""
+    first, past = np.flatnonzero(np.diff(np.r_[False, marked, False])).reshape(-1, 2).T
     return tuple((int(i), int(j) - 1) for i, j in zip(first, past, strict=True))

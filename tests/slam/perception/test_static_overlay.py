@@ -21,7 +21,7 @@ from vggtgeo.slam.perception.static_overlay import StaticOverlay, find_static_ov
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
-from vggtgeo.slam.verdict.input_findings import check_static_overlay
+from vggtgeo.slam.verdict.judge import check_static_overlay
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = vg.Camera((300.0, 300.0, 159.5, 119.5), WIDTH, HEIGHT)

@@ -9,9 +9,8 @@ from corner_walk import walk
 from scipy.stats import binom, chi2
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.verdict.alternatives import TABLE
+from vggtgeo.slam.verdict.alternatives import TABLE, scores, with_own_noise
 from vggtgeo.slam.verdict.corner_adjustment import FOCAL, SIZE, Noise, Unknowns, linearise, reduce, solve, start_of
-from vggtgeo.slam.verdict.noise import scores, with_own_noise
 
 NOISE = Noise(0.3, 0.01)
 FOCAL_LENGTH = TABLE[0].columns
@@ -44,7 +43,7 @@ def test_eliminated_points_give_the_dense_step() -> None:
     tracks, at = _perturbed()
     linear = linearise(tracks, at, NOISE)
     columns = np.eye(SIZE)[:, [0, 8, 10]]
-    reduced = reduce(tracks, linear, columns, True, 1e-3)
+    reduced = reduce(linear, columns, True, 1e-3)
     frames, count = len(tracks.poses), len(tracks.first)
     width = 6 * frames + 3
     rows = np.zeros((3 * len(tracks.frame), width + 3 * count))
@@ -62,7 +61,7 @@ def test_eliminated_points_give_the_dense_step() -> None:
     dense = np.linalg.solve(matrix, side)
     step = np.linalg.solve(reduced.matrix, reduced.side)
     np.testing.assert_allclose(step, dense[:width], rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(reduced.points(step).ravel(), dense[width:], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(reduced.landmarks(step).ravel(), dense[width:], rtol=1e-5, atol=1e-9)
 
 
 def test_wrong_poses_and_a_wrong_focal_length_are_brought_right() -> None:
@@ -73,7 +72,7 @@ def test_wrong_poses_and_a_wrong_focal_length_are_brought_right() -> None:
     moved = rng.standard_normal((12, 6)) * [0.03] * 6 * np.array([1, 1, 1, 0.6, 0.6, 0.6])
     moved[0] = 0
     tracks = here.tracks(replace(claim, poses=rigid.moved(claim.poses, moved)))
-    fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, iterations=25)
+    fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, steps=25)
     off = rigid.invert(fit.unknowns.poses)[:, :3, 3] - rigid.centres(here.claim.poses)
     assert np.abs(off).max() < 0.01
     np.testing.assert_allclose(fit.unknowns.theta[FOCAL], -np.log(1.25), atol=5e-3)
@@ -94,7 +93,7 @@ def test_false_alarms_are_as_frequent_as_their_level() -> None:
     runs, alarms, level = 120, 0, 0.05
     for seed in range(runs):
         tracks = walk(8, seed=seed, density=40).tracks()
-        fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, iterations=6)
+        fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, steps=6)
         variance = scores(fit).covariance(FOCAL_LENGTH)[0, 0]
         value = fit.unknowns.theta[FOCAL].mean()
         alarms += bool(value**2 / variance > chi2.isf(level, 1))

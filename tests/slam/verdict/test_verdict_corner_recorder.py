@@ -57,7 +57,7 @@ def off_truth(recorder: EvidenceRecorder, later: int) -> np.ndarray:
     """Pixels by which the first frame's corners are not where the true poses carry them in a later one."""
     run = recorded_run()
     first, last = recorder.frames[0], recorder.frames[later]
-    _, rows, others = np.intersect1d(first.ids, last.ids, assume_unique=True, return_indices=True)
+    rows, others = first.common(last)
     k = np.array(run.sequence.camera.intrinsics)
     inverse = 1 / first.depth[rows].astype(float)
     points = rigid.unproject(first.pixels[rows].astype(float), inverse, run.sequence.pose(0), k)

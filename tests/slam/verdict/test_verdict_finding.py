@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 import vggtgeo as vg
+from vggtgeo.slam.submaps import stretches
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.finding import Finding, conclude, spans
+from vggtgeo.slam.verdict.finding import Finding, conclude
 
 
 def test_the_verdict_covers_the_run_without_gaps() -> None:
@@ -29,12 +30,11 @@ def test_the_verdict_covers_the_run_without_gaps() -> None:
     ]
 
 
-def test_spans_are_joined_across_short_gaps() -> None:
+def test_stretches_are_runs_of_marked_rows() -> None:
     """Runs of marked rows; oracle: by hand."""
     marked = np.array([0, 1, 1, 0, 1, 0, 0, 0, 1], bool)
-    assert spans(marked) == [(1, 2), (4, 4), (8, 8)]
-    assert spans(marked, join=2) == [(1, 4), (8, 8)]
-    assert spans(np.zeros(3, bool)) == []
+    assert stretches(marked) == ((1, 2), (4, 4), (8, 8))
+    assert stretches(np.zeros(3, bool)) == ()
 
 
 def test_a_lost_frame_keeps_its_place_in_the_claim() -> None:

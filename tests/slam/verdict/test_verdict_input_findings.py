@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vggtgeo.io.errors import LeftOutWarning
-from vggtgeo.slam.verdict.input_findings import check_input
+from vggtgeo.slam.verdict.judge import check_input
 
 
 def test_frames_left_out_are_told() -> None:

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.results.result import Result
 from vggtgeo.slam.verdict import judge as judge_module
+from vggtgeo.slam.verdict.claim import WINDOW, linked, thinned, windows
 from vggtgeo.slam.verdict.corner_adjustment import Noise, solve, start_of
 from vggtgeo.slam.verdict.corner_findings import findings
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
 from vggtgeo.slam.verdict.judge import check_unit, judge, judge_or_report
 from vggtgeo.slam.verdict.thresholds import MAX_REASONS
-from vggtgeo.slam.verdict.windows import WINDOW, linked, thinned, windows
 
 
 def _turn(degrees: float) -> np.ndarray:

@@ -13,7 +13,7 @@ import pytest
 from corner_walk import Walk, walk
 from reported import pattern
 
-from vggtgeo.slam.verdict.tracking_findings import check_frozen, check_record
+from vggtgeo.slam.verdict.judge import check_frozen, check_record
 
 
 def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:

@@ -5,8 +5,12 @@ About 4 ms a frame (640 x 480).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
+
+from vggtgeo.geometry import pinhole
 
 WIDTH = 320
 """Pixels of the longer side of the images that corners are followed in."""
@@ -37,6 +41,36 @@ _FLOW = {
     "maxLevel": 4,
     "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),
 }
+
+
+class FollowedCorners(NamedTuple):
+    """Corners of an image and their tracks.
+
+    image: uint8 [h, w], of `small_grey`; None before the first one. ids: int32 [m], number of each corner's track, in
+    the order of their beginning. pixels: float32 [m, 2]. next_id: number of the next track.
+    """
+
+    image: np.ndarray | None = None
+    ids: np.ndarray = np.zeros(0, np.int32)
+    pixels: np.ndarray = np.zeros((0, 2), np.float32)
+    next_id: int = 0
+
+    def into(self, grey: np.ndarray, mask: np.ndarray | None) -> FollowedCorners:
+        """Follow the corners into the next image, and detect new ones where there are none.
+
+        mask: bool [h, w], of `small_mask`: no corner is followed there.
+        """
+        outside = lambda at: np.ones(len(at), bool) if mask is None else ~pinhole.at_pixels(mask, at)
+        ids, pixels = self.ids, self.pixels
+        if self.image is not None and len(ids):
+            pixels, kept = follow_through_bands(self.image, grey, pixels)
+            kept &= outside(pixels)
+            ids, pixels = one_a_cell(ids[kept], pixels[kept])
+        fresh = new_corners(grey, pixels)
+        fresh = fresh[outside(fresh)]
+        next_id = self.next_id + len(fresh)
+        ids = np.concatenate([ids, np.arange(self.next_id, next_id, dtype=np.int32)])
+        return FollowedCorners(grey, ids, np.concatenate([pixels, fresh]), next_id)
 
 
 def follow(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -103,6 +137,12 @@ def small_size(shape: tuple[int, ...]) -> tuple[int, int]:
     scale = max(shape) / WIDTH
     height, width = (max(round(side / scale), 2 * CELL) for side in shape)
     return width, height
+
+
+def small_mask(mask: np.ndarray) -> np.ndarray:
+    """Return a mask, bool [H, W], for the image that corners are followed in, wider by the patch around a corner."""
+    small = cv2.resize(mask.astype(np.uint8), small_size(mask.shape), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.dilate(small, np.ones(PATCH, np.uint8)) > 0)
 
 
 def small_grey(image: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features, Segments
 
@@ -93,7 +94,7 @@ class StaticOverlay:
         vectors = getattr(descriptors, "vectors", None)
         if vectors is None or len(vectors) != len(features):
             return features
-        keep = ~_at(self.mask, features.pixels)
+        keep = ~pinhole.at_pixels(self.mask, features.pixels)
         if keep.all():
             return features
         return Features(features.pixels[keep], features.scores[keep], replace(descriptors, vectors=vectors[keep]))
@@ -101,7 +102,7 @@ class StaticOverlay:
     def without_segments(self, segments: Segments) -> Segments:
         """Return the segments with neither their middle nor a quarter point on the mask."""
         ends = segments.endpoints
-        along = [_at(self.mask, (1 - t) * ends[:, 0] + t * ends[:, 1]) for t in (0.25, 0.5, 0.75)]
+        along = [pinhole.at_pixels(self.mask, (1 - t) * ends[:, 0] + t * ends[:, 1]) for t in (0.25, 0.5, 0.75)]
         keep = ~np.logical_or.reduce(along)
         return Segments(ends[keep], segments.scores[keep])
 
@@ -210,8 +211,3 @@ def _bar(still: np.ndarray, structured: np.ndarray) -> int:
         return 0
     edge = still[full[0] : full[0] + _THICK].any(axis=0)
     return int(full[0]) + _THICK if edge.mean() > _EDGE else 0
-
-
-def _at(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    column, row = np.clip(np.rint(pixels), 0, np.array(mask.shape[::-1]) - 1).astype(int).T
-    return np.asarray(mask[row, column])

@@ -24,7 +24,7 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
-from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
+from vggtgeo.geometry.robust import TUKEY, sigma_by_median
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
 from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
@@ -213,7 +213,7 @@ def _without_chance(hessian: np.ndarray, by_chance: np.ndarray) -> np.ndarray:
 def _weights(residual: np.ndarray) -> np.ndarray:
     """Return Tukey's weights; larger residuals than expected widen the kernel and lower all weights."""
     finite = np.isfinite(residual)
-    scale = max(MAD_SIGMA * float(np.median(np.abs(residual[finite]))), 1.0) if finite.any() else 1.0
+    scale = max(sigma_by_median(residual[finite]), 1.0) if finite.any() else 1.0
     inside = np.where(finite, residual / (TUKEY * scale), 1.0)
     return np.maximum(1.0 - inside**2, 0.0) ** 2 / scale**2
 

@@ -14,24 +14,20 @@ the reduced system of poses and calibration is dense: at most `6 * 24 + 13` unkn
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.gauss_newton import FIRST_DAMPING, SchurComplement, levenberg_marquardt
+from vggtgeo.slam.verdict.claim import KNOTS, Tracks
 
-KERNEL = 2.0
-"""Width of Cauchy's kernel, in standard deviations of the noise."""
+KERNEL, BEHIND = 2.0, 1e3
+"""Width of Cauchy's kernel, and residual of a point behind a camera, in standard deviations of the noise."""
 TETHER = 1e-4
 """Information on each unknown of a pose: holds the scale of a map without depth, and a frame without corners."""
-ITERATIONS, CONVERGED = 12, 5e-4
-"""At most; and the relative decrease of the energy below which the iteration ends."""
-FIRST_DAMPING, LAST_DAMPING = 1e-5, 1e3
-"""Of Levenberg and Marquardt, as a share of the diagonal."""
-LINEAR = 0.5
-"""Of the decrease of the energy that a step promises: with less, the points are solved once more for its poses."""
-KNOTS = 4
-"""Of a quantity that changes with time: linear between so many moments, evenly spread over the window."""
+CONVERGED, LINEAR = 5e-4, 0.5
+"""Relative decrease of the energy below which the iteration ends; share of the decrease that a step promises, below
+which the points are solved once more for its poses."""
 FOCAL = slice(0, KNOTS)
 DRIFT = slice(KNOTS, 2 * KNOTS)
 CENTRE = slice(2 * KNOTS, 2 * KNOTS + 2)
@@ -41,67 +37,6 @@ SIZE = 2 * KNOTS + 5
 focal length; radial distortion k1; time from the first row to the last, s; metres added to the depth."""
 HELD = np.zeros((SIZE, 0))
 """Columns of a calibration that is not free."""
-HUGE = 1e3
-"""Whitened residual of a point behind a camera."""
-
-
-@dataclass(frozen=True, eq=False)
-class Tracks:
-    """Corner tracks of a few frames, and what the run claims of these.
-
-    rows: int [f], of the run. times: float64 [f], s. poses: float64 [f, 4, 4], world -> camera. intrinsics: fx, fy, cx,
-    cy. size: width, height, pixels. frame, track: int [m], of each observation, sorted by track. pixels: float64
-    [m, 2]. depth: float64 [m], metres, NaN where it was not measured or the map is not metric. readout: float64
-    [m, 2], pixels by which a rolling shutter of one second moves the corner.
-    """
-
-    rows: np.ndarray
-    times: np.ndarray
-    poses: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple[int, int]
-    frame: np.ndarray
-    track: np.ndarray
-    pixels: np.ndarray
-    depth: np.ndarray
-    readout: np.ndarray
-
-    @cached_property
-    def first(self) -> np.ndarray:
-        """First observation of each track, int [t]."""
-        return np.flatnonzero(np.r_[True, self.track[1:] != self.track[:-1]])
-
-    @cached_property
-    def from_anchor(self) -> np.ndarray:
-        """From the camera that the run claims for the track's first frame to the world, float64 [m, 4, 4]."""
-        return rigid.invert(self.poses[self.frame[self.first]])[self.track]
-
-    @cached_property
-    def depths(self) -> np.ndarray:
-        """The number of measured depths of each observation's track, at least 1, float64 [m]."""
-        return np.maximum(self.sums(np.isfinite(self.depth).astype(np.float64)), 1.0)[self.track]
-
-    @cached_property
-    def knots(self) -> np.ndarray:
-        """Weights that interpolate between the knots, of each observation: float64 [m, KNOTS]."""
-        span = max(float(self.times[-1] - self.times[0]), 1e-9)
-        at = (self.times - self.times[0]) / span * (KNOTS - 1)
-        return np.maximum(1.0 - np.abs(at[:, None] - np.arange(KNOTS)), 0.0)[self.frame]
-
-    @property
-    def with_depth(self) -> bool:
-        """Whether any depth was measured."""
-        return bool(np.isfinite(self.depth).any())
-
-    def sums(self, values: np.ndarray) -> np.ndarray:
-        """Sum values [m, ...] over the observations of each track: [t, ...]."""
-        return np.asarray(np.add.reduceat(values, self.first, axis=0))
-
-    def subset(self, kept: np.ndarray) -> Tracks:
-        """Return the tracks of which `kept`, bool [t], is true."""
-        rows = kept[self.track]
-        parts = {name: getattr(self, name)[rows] for name in ("frame", "pixels", "depth", "readout")}
-        return replace(self, **parts, track=(np.cumsum(kept) - 1)[self.track[rows]])
 
 
 @dataclass(frozen=True)
@@ -122,11 +57,17 @@ class Unknowns:
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
-    """Residuals, whitened, [m, 3], robust weights [m, 3], derivatives by pose [m, 3, 6], point [m, 3, 3] and
-    calibration [m, 3, SIZE]; loss: minus twice the robust log likelihood of each corner with its depth, [m].
+class Fit:
+    """Tracks at some unknowns, those of a minimum after `solve`; the residuals there, and their derivatives. columns:
+    float64 [SIZE, k], what of the calibration is free. residual: [m, 3], whitened; weight: [m, 3], robust. by_pose:
+    [m, 3, 6]; by_point: [m, 3, 3]; by_theta: [m, 3, SIZE]. loss: [m], minus twice the robust log likelihood of each
+    corner with its depth.
     """
 
+    tracks: Tracks
+    noise: Noise
+    unknowns: Unknowns
+    columns: np.ndarray
     residual: np.ndarray
     weight: np.ndarray
     by_pose: np.ndarray
@@ -136,12 +77,15 @@ class Linear:
 
     @property
     def energy(self) -> float:
-        """Sum of the loss."""
         return float(self.loss.sum())
 
+    def part(self, kept: np.ndarray) -> tuple[Tracks, Unknowns, Noise]:
+        """Return the arguments with which `solve` continues for the tracks of which `kept`, bool [t], is true."""
+        return self.tracks.subset(kept), replace(self.unknowns, points=self.unknowns.points[kept]), self.noise
 
-def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
-    """Return residuals and their derivatives at a point."""
+
+def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndarray = HELD) -> Fit:
+    """Return residuals and their derivatives at some unknowns."""
     theta, knots, count = unknowns.theta, tracks.knots, len(tracks.frame)
     relative = unknowns.poses[tracks.frame] @ tracks.from_anchor
     a, b, log_inverse = unknowns.points[tracks.track].T
@@ -150,7 +94,7 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
     # The point in the camera times its inverse depth `rho`: finite for points at infinity.
     scaled = turn[:, :, 0] * a[:, None] + turn[:, :, 1] * b[:, None] + turn[:, :, 2] + shift
     behind = scaled[:, 2] < 1e-3
-    scaled = np.where(behind[:, None], [0.0, 0.0, 1.0], scaled)
+    scaled[behind] = 0.0, 0.0, 1.0
 
     z = scaled[:, 2]
     normalised = scaled[:, :2] / z[:, None]
@@ -159,14 +103,12 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
     focal = np.exp(knots @ theta[FOCAL])[:, None] * tracks.intrinsics[:2]
     seen = focal * (normalised * stretch + theta[CENTRE])
     depth = np.maximum(z / inverse + theta[OFFSET], 1e-3)
-    predicted = np.column_stack(
-        [seen + tracks.intrinsics[2:] + theta[READOUT] * tracks.readout, np.log(depth) + knots @ theta[DRIFT]]
-    )
+    pixels = seen + tracks.intrinsics[2:] + theta[READOUT] * tracks.readout
+    predicted = np.column_stack([pixels, np.log(depth) + knots @ theta[DRIFT]])
 
-    by_normalised = 2.0 * theta[RADIAL] * normalised[:, :, None] * normalised[:, None, :]
-    by_normalised = focal[:, :, None] * (by_normalised + stretch[:, :, None] * np.eye(2))
+    bent = 2.0 * theta[RADIAL] * normalised[:, :, None] * normalised[:, None, :]
     by_scaled, by_theta = np.zeros((count, 3, 3)), np.zeros((count, 3, SIZE))
-    by_scaled[:, :2, :2] = by_normalised / z[:, None, None]
+    by_scaled[:, :2, :2] = focal[:, :, None] * (bent + stretch[:, :, None] * np.eye(2)) / z[:, None, None]
     by_scaled[:, :2, 2] = -(by_scaled[:, :2, :2] @ normalised[:, :, None])[:, :, 0]
     by_scaled[:, 2, 2] = 1.0 / (inverse * depth)
     by_theta[:, :2, FOCAL] = seen[:, :, None] * knots[:, None]
@@ -177,157 +119,88 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise) -> Linear:
     by_theta[:, 2, OFFSET] = 1.0 / depth
     by_point = by_scaled @ np.stack([turn[:, :, 0], turn[:, :, 1], shift], 2)
     by_point[:, 2, 2] -= z / (inverse * depth)
-    zero, (x, y, _) = np.zeros(count), scaled.T
-    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
-    by_pose = np.concatenate([by_scaled * inverse[:, None, None], by_scaled @ cross], 2)
+    by_pose = np.concatenate([by_scaled * inverse[:, None, None], by_scaled @ -rigid.skew(scaled)], 2)
 
     measured = np.column_stack([tracks.pixels, np.log(tracks.depth)])
     known = np.isfinite(measured) & ~behind[:, None]
-    whiten = np.full((count, 3), 1.0 / noise.pixel)
     # The error of a measured depth is common to its track.
-    whiten[:, 2] = 1.0 / (noise.depth * np.sqrt(tracks.depths))
-    residual = np.where(known, (predicted - np.where(known, measured, 0.0)) * whiten, 0.0)
-    whiten = np.where(known, whiten, 0.0)[:, :, None]
+    sigma = np.column_stack([np.full((count, 2), noise.pixel), noise.depth * np.sqrt(tracks.depths)])
+    whiten = np.where(known, 1.0 / sigma, 0.0)
+    residual = (predicted - np.where(known, measured, 0.0)) * whiten
     square = np.column_stack([np.sum(residual[:, :2] ** 2, 1), residual[:, 2] ** 2]) / KERNEL**2
-    square[behind, 0] = (HUGE / KERNEL) ** 2
+    square[behind, 0] = (BEHIND / KERNEL) ** 2
     weight = (1.0 / (1.0 + square))[:, [0, 0, 1]]
     loss = KERNEL**2 * np.log1p(square).sum(1)
-    return Linear(residual, weight, whiten * by_pose, whiten * by_point, whiten * by_theta, loss)
+    by_pose, by_point, by_theta = (whiten[:, :, None] * by for by in (by_pose, by_point, by_theta))
+    return Fit(tracks, noise, unknowns, columns, residual, weight, by_pose, by_point, by_theta, loss)
 
 
-@dataclass(frozen=True, eq=False)
-class Reduced:
-    """Normal equations after the points are eliminated: matrix [n, n] and right-hand side [n] of poses, then
-    calibration; and what gives the points back, with the Cholesky factor `L` of their blocks: inverse `L^-1`
-    [t, 3, 3], and `L^-1` times their coupling with the rest [t, 3, n] and their own right-hand side [t, 3].
-    """
-
-    matrix: np.ndarray
-    side: np.ndarray
-    inverse: np.ndarray
-    coupling: np.ndarray
-    point_side: np.ndarray
-
-    def points(self, step: np.ndarray) -> np.ndarray:
-        """Step of the points, [t, 3], that belongs to one of the rest, [n]."""
-        right = self.point_side - self.coupling @ step
-        return np.asarray((np.swapaxes(self.inverse, 1, 2) @ right[:, :, None])[:, :, 0])
-
-    def gain(self, step: np.ndarray) -> float:
-        """Return the decrease of the energy that this step, [n], promises."""
-        return float(np.sum(self.point_side**2) + self.side @ step)
-
-
-def reduce(tracks: Tracks, linear: Linear, columns: np.ndarray, poses_free: bool, damping: float) -> Reduced:
-    """Eliminate the points. columns: float64 [SIZE, k], what of the calibration is free.
-
-    The negative residual goes along as one more column: what becomes of it is the right-hand side.
-    """
+def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> SchurComplement:
+    """Eliminate the points. columns: float64 [SIZE, k], what of the calibration is free."""
+    # The negative residual goes along as one more column: what becomes of it is the right-hand side.
+    tracks = fit.tracks
     frames, count = len(tracks.poses), len(tracks.first)
-    weighted = lambda by: np.swapaxes(by * linear.weight[:, :, None], 1, 2)
-    rest = np.concatenate([linear.by_theta @ columns, -linear.residual[:, :, None]], 2)
-    point, width = weighted(linear.by_point), 6 * frames * poses_free
+    weighted = lambda by: np.swapaxes(by * fit.weight[:, :, None], 1, 2)
+    rest = np.concatenate([fit.by_theta @ columns, -fit.residual[:, :, None]], 2)
+    point, width = weighted(fit.by_point), 6 * frames * poses_free
     size = width + rest.shape[2]
     coupling, matrix = np.zeros((count, 3, size)), np.zeros((size, size))
     coupling[:, :, width:] = tracks.sums(point @ rest)
-    matrix[width:, width:] = np.tensordot(rest * linear.weight[:, :, None], rest, ((0, 1), (0, 1)))
+    matrix[width:, width:] = np.tensordot(rest * fit.weight[:, :, None], rest, ((0, 1), (0, 1)))
     if poses_free:
-        pose, each = weighted(linear.by_pose), np.arange(frames)
+        pose, each = weighted(fit.by_pose), np.arange(frames)
         of_frames = lambda values: np.tensordot(1.0 * (tracks.frame == each[:, None]), values, 1)
-        coupling[:, :, :width].reshape(count, 3, frames, 6)[tracks.track, :, tracks.frame] = point @ linear.by_pose
-        matrix[:width, :width].reshape(frames, 6, frames, 6)[each, :, each] = of_frames(pose @ linear.by_pose)
+        coupling[:, :, :width].reshape(count, 3, frames, 6)[tracks.track, :, tracks.frame] = point @ fit.by_pose
+        matrix[:width, :width].reshape(frames, 6, frames, 6)[each, :, each] = of_frames(pose @ fit.by_pose)
         matrix[:width, width:] = of_frames(pose @ rest).reshape(width, -1)
         matrix[width:, :width] = matrix[:width, width:].T
     diagonal = np.arange(size - 1)
     matrix[diagonal, diagonal] *= 1.0 + damping
     matrix[diagonal[:width], diagonal[:width]] += TETHER
-    own = tracks.sums(point @ linear.by_point)
-    own[:, range(3), range(3)] *= 1.0 + damping
-    inverse = np.linalg.inv(np.linalg.cholesky(own + 1e-6 * np.eye(3)))
-    coupling = inverse @ coupling
-    flat = coupling.reshape(3 * count, size)
-    matrix -= flat.T @ flat
-    return Reduced(matrix[:-1, :-1], matrix[:-1, -1], inverse, coupling[:, :, :-1], coupling[:, :, -1])
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A minimum: of what, with which noise, the unknowns, the linearisation there, and what was free."""
-
-    tracks: Tracks
-    noise: Noise
-    unknowns: Unknowns
-    linear: Linear
-    columns: np.ndarray
-
-    def part(self, kept: np.ndarray) -> tuple[Tracks, Unknowns, Noise]:
-        """Return the arguments with which `solve` continues for the tracks of which `kept`, bool [t], is true."""
-        return self.tracks.subset(kept), replace(self.unknowns, points=self.unknowns.points[kept]), self.noise
+    blocks = tracks.sums(point @ fit.by_point)
+    blocks[:, range(3), range(3)] *= 1.0 + damping
+    return SchurComplement.of(matrix, coupling, blocks + 1e-6 * np.eye(3))
 
 
 def solve(
-    tracks: Tracks,
-    start: Unknowns,
-    noise: Noise,
-    columns: np.ndarray = HELD,
-    poses_free: bool = True,
-    iterations: int = ITERATIONS,
+    tracks: Tracks, start: Unknowns, noise: Noise, columns: np.ndarray = HELD, poses_free: bool = True, steps: int = 12
 ) -> Fit:
     """Minimise over points, poses where `poses_free`, and the calibration's `columns` (float64 [SIZE, k])."""
-    unknowns, damping = start, FIRST_DAMPING
-    linear = linearise(tracks, unknowns, noise)
     width = 6 * len(tracks.poses) * poses_free
     free = slice(6 * poses_free, None)  # the first pose fixes the gauge
-    for _ in range(iterations):
-        reduced = reduce(tracks, linear, columns, poses_free, damping)
+
+    def stepped(fit: Fit, damping: float) -> Fit:
+        reduced, old = reduce(fit, columns, poses_free, damping), fit.unknowns
         step = np.zeros(len(reduced.side))
-        if len(step[free]):
-            step[free] = np.linalg.solve(reduced.matrix[free, free], reduced.side[free])
-        poses = rigid.moved(unknowns.poses, step[:width].reshape(-1, 6)) if poses_free else unknowns.poses
-        points = unknowns.points + np.clip(reduced.points(step), -1.0, 1.0)
-        tried = Unknowns(poses, points, unknowns.theta + columns @ step[width:])
-        there = linearise(tracks, tried, noise)
-        if len(step) and linear.energy - there.energy < LINEAR * reduced.gain(step):
-            tried = _with_own_points(tracks, tried, there)
-            there = linearise(tracks, tried, noise)
-        if not there.energy < linear.energy:
-            damping *= 10.0
-            if damping > LAST_DAMPING:
-                break
-            continue
-        ended = linear.energy - there.energy < CONVERGED * linear.energy
-        unknowns, linear, damping = tried, there, max(damping / 10.0, 1e-10)
-        if ended:
-            break
-    return Fit(tracks, noise, unknowns, linear, columns)
+        step[free] = np.linalg.solve(reduced.matrix[free, free], reduced.side[free])
+        poses = rigid.moved(old.poses, step[:width].reshape(-1, 6)) if poses_free else old.poses
+        points = old.points + np.clip(reduced.landmarks(step), -1.0, 1.0)
+        new = Unknowns(poses, points, old.theta + columns @ step[width:])
+        there = linearise(tracks, new, noise, columns)
+        if len(step) and fit.energy - there.energy < LINEAR * reduced.gain(step):
+            # Points follow a long step of poses and focal length on a curve; without a step of their own the iteration
+            # creeps along it (embedded point iterations, Jeong et al. 2012).
+            own = reduce(there, HELD, False, FIRST_DAMPING).landmarks(np.zeros(0))
+            there = linearise(tracks, replace(new, points=points + np.clip(own, -1.0, 1.0)), noise, columns)
+        return there
 
-
-def _with_own_points(tracks: Tracks, unknowns: Unknowns, linear: Linear) -> Unknowns:
-    """Take a step of the points alone.
-
-    Points follow a long step of poses and focal length on a curve; without this the iteration creeps along it (embedded
-    point iterations, Jeong et al. 2012).
-    """
-    reduced = reduce(tracks, linear, HELD, False, FIRST_DAMPING)
-    return replace(unknowns, points=unknowns.points + np.clip(reduced.points(np.zeros(0)), -1.0, 1.0))
+    first = linearise(tracks, start, noise, columns)
+    return levenberg_marquardt(first, lambda fit: fit.energy, stepped, steps=steps, gain=CONVERGED)
 
 
 def start_of(tracks: Tracks) -> Unknowns:
     """Triangulate points with the claimed poses, in front of the cameras."""
     relative = tracks.poses[tracks.frame] @ tracks.from_anchor
-    rays = np.column_stack(
-        [(tracks.pixels - tracks.intrinsics[2:]) / tracks.intrinsics[:2], np.ones(len(tracks.frame))]
-    )
+    rays = pinhole.rays(tracks.pixels, tracks.intrinsics)
     own = rays[tracks.first]
     turned = (relative[:, :3, :3] @ own[tracks.track][:, :, None])[:, :, 0]
-    lever = np.cross(relative[:, :3, 3], rays)
-    information = tracks.sums(np.sum(lever**2, 1))
-    value = tracks.sums(-np.sum(lever * np.cross(turned, rays), 1)) / np.maximum(information, 1e-12)
-    known = (value > 0) & (information > 0)
-    middle = float(np.median(value[known])) if known.any() else 1.0
+    lever = rigid.cross(relative[:, :3, 3], rays)
+    information = np.maximum(tracks.sums(np.sum(lever**2, 1)), 1e-12)
+    value = tracks.sums(-np.sum(lever * rigid.cross(turned, rays), 1)) / information
+    triangulated = np.where(value > 0, value, np.nan)
     measured = 1.0 / tracks.depth[tracks.first]
-    if np.isfinite(measured).any():
-        middle = float(np.nanmedian(measured))
-    inverse = np.where(np.isfinite(measured), measured, np.where(known, value, middle))
-    inverse = np.clip(inverse, 0.02 * middle, 20.0 * middle)
+    usual = measured if np.isfinite(measured).any() else triangulated
+    middle = float(np.nanmedian(usual)) if np.isfinite(usual).any() else 1.0
+    inverse = np.where(np.isfinite(measured), measured, triangulated)
+    inverse = np.clip(np.nan_to_num(inverse, nan=middle), 0.02 * middle, 20.0 * middle)
     return Unknowns(tracks.poses, np.column_stack([own[:, :2], np.log(inverse)]), np.zeros(SIZE))

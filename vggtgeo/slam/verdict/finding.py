@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Literal, Self, get_args
-
-import numpy as np
 
 Level = Literal["good", "degraded", "failed"]
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -14,10 +13,9 @@ LEVELS: tuple[Level, ...] = get_args(Level)
 
 @dataclass(frozen=True)
 class Finding:
-    """One reason not to trust a result.
-
-    check: its name. level: of the run. text: a sentence with the numbers. start, end: first and last frame concerned;
-    None: the whole run. scale: it puts the unit of length in doubt. local: it marks the segment, not the run.
+    """One reason not to trust a result. check: its name. level: of the run. text: a sentence with the numbers. start,
+    end: first and last frame concerned; None: the whole run. scale: it puts the unit of length in doubt. local: it
+    marks the segment, not the run.
     """
 
     check: str
@@ -27,6 +25,9 @@ class Finding:
     end: int | None = None
     scale: bool = False
     local: bool = False
+
+    def concerns(self, frame: int) -> bool:
+        return (self.start is None or self.start <= frame) and (self.end is None or frame <= self.end)
 
 
 @dataclass(frozen=True)
@@ -39,21 +40,6 @@ class Segment:
     end_time: float
     level: Level
     checks: tuple[str, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-        return {
-            "frames": [self.start, self.end],
-            "seconds": [round(self.start_time, 6), round(self.end_time, 6)],
-            "level": self.level,
-            "checks": list(self.checks),
-        }
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Invert `to_dict`."""
-        (start, end), (begin, stop) = values["frames"], values["seconds"]
-        return cls(start, end, begin, stop, values["level"], tuple(values["checks"]))
 
 
 @dataclass(frozen=True)
@@ -82,60 +68,40 @@ class Verdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as in `summary.json`."""
-        return {
-            "level": self.level,
-            "reasons": list(self.reasons),
-            "segments": [segment.to_dict() for segment in self.segments],
-            "noted": list(self.noted),
-        }
+        segments = []
+        for one in self.segments:
+            frames, seconds = [one.start, one.end], [round(one.start_time, 6), round(one.end_time, 6)]
+            segments.append({"frames": frames, "seconds": seconds, "level": one.level, "checks": list(one.checks)})
+        return {"level": self.level, "reasons": list(self.reasons), "segments": segments, "noted": list(self.noted)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], metric: bool = True) -> Self:
         """Invert `to_dict`."""
-        segments = tuple(Segment.from_dict(segment) for segment in values["segments"])
+        parts = ((*one["frames"], *one["seconds"], one["level"], tuple(one["checks"])) for one in values["segments"])
+        segments = tuple(Segment(*part) for part in parts)
         return cls(values["level"], tuple(values["reasons"]), segments, metric, tuple(values.get("noted", ())))
-
-
-def worst(levels: Iterable[Level]) -> Level:
-    """Return the worst of some levels; "good" if there are none."""
-    return max(levels, key=LEVELS.index, default="good")
 
 
 def conclude(findings: Iterable[Finding], frames: Sequence[int], times: Sequence[float], metric: bool) -> Verdict:
     """Combine the findings on a run with these frame numbers and times."""
-    findings = list(findings)
-    reasons = sorted((one for one in findings if one.level != "good"), key=lambda one: -LEVELS.index(one.level))
-    return Verdict(
-        worst(one.level for one in reasons if not one.local),
-        tuple(one.text for one in reasons if not one.local),
-        _segments(reasons, frames, times),
-        metric and not any(one.scale for one in reasons),
-        tuple(one.text for one in findings if one.level == "good"),
-    )
+    ordered = sorted(findings, key=lambda one: LEVELS.index(one.level), reverse=True)
+    reasons = [one for one in ordered if one.level != "good"]
+    noted = tuple(one.text for one in ordered if one.level == "good")
+    of_run = [one for one in reasons if not one.local]
+    metric = metric and not any(one.scale for one in reasons)
+    texts, segments = tuple(one.text for one in of_run), _segments(reasons, frames, times)
+    return Verdict(of_run[0].level if of_run else "good", texts, segments, metric, noted)
 
 
 def _segments(reasons: Sequence[Finding], frames: Sequence[int], times: Sequence[float]) -> tuple[Segment, ...]:
     """Group consecutive frames that the same findings concern."""
-    found: list[Segment] = []
-    for frame, time in zip(frames, times, strict=True):
-        here = [
-            one
-            for one in reasons
-            if (one.start is None or one.start <= frame) and (one.end is None or frame <= one.end)
-        ]
-        level, checks = worst(one.level for one in here), tuple(dict.fromkeys(one.check for one in here))
-        if found and (found[-1].level, found[-1].checks) == (level, checks):
-            found[-1] = replace(found[-1], end=int(frame), end_time=float(time))
-        else:
-            found.append(Segment(int(frame), int(frame), float(time), float(time), level, checks))
+
+    def state(row: int) -> tuple[Level, tuple[str, ...]]:
+        here = [one for one in reasons if one.concerns(frames[row])]
+        return here[0].level if here else "good", tuple(dict.fromkeys(one.check for one in here))
+
+    found = []
+    for (level, checks), group in groupby(range(len(frames)), state):
+        rows = list(group)
+        found.append(Segment(frames[rows[0]], frames[rows[-1]], times[rows[0]], times[rows[-1]], level, checks))
     return tuple(found)
-
-
-def spans(rows: np.ndarray, join: int = 1) -> list[tuple[int, int]]:
-    """Return first and last row of each run of True values of bool [n]; runs at most `join` rows apart are merged."""
-    marked = np.nonzero(rows)[0]
-    if not len(marked):
-        return []
-    cuts = np.nonzero(np.diff(marked) > join)[0]
-    firsts, lasts = np.r_[0, cuts + 1], np.r_[cuts, len(marked) - 1]
-    return [(int(marked[a]), int(marked[b])) for a, b in zip(firsts, lasts, strict=True)]
