@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from vggtgeo.geometry import pinhole
-from vggtgeo.geometry.gauss_newton import damped_step, gauss_newton
+from vggtgeo.geometry.gauss_newton import SchurComplement, damped_step, gauss_newton, levenberg_marquardt
 from vggtgeo.geometry.rigid import exponential
 
 INTRINSICS = np.array([300.0, 310.0, 160.0, 120.0])
@@ -53,3 +53,41 @@ def test_an_undefined_energy_is_no_step() -> None:
     evaluate = lambda x: (energy(x), lambda: np.array([-(1 - 1 / x[0]) * 20 * x[0] ** 2]))
     found = gauss_newton(np.array([4.0]), evaluate, lambda x, step: x + step, steps=200, trials=12)
     assert found[0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_levenberg_marquardt_follows_a_curved_valley() -> None:
+    """From the far end of Rosenbrock's valley it reaches the bottom, where whole steps leave it. Oracle: (1, 1)."""
+    residuals = lambda x: np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+    def stepped(x: np.ndarray, damping: float) -> np.ndarray:
+        jacobian = np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+        hessian = jacobian.T @ jacobian
+        return x - np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), jacobian.T @ residuals(x))
+
+    energy = lambda x: float((residuals(x) ** 2).sum())
+    start = np.array([-1.9, 2.0])
+    assert energy(stepped(start, 0.0)) > energy(start)
+    found = levenberg_marquardt(start, energy, stepped, steps=100, gain=1e-12)
+    np.testing.assert_allclose(found, [1.0, 1.0], atol=1e-6)
+
+
+def test_the_schur_complement_solves_the_whole_system() -> None:
+    """Parameters and landmarks get the steps of the dense normal equations. Oracle: numpy's solver."""
+    rng = np.random.default_rng(1)
+    parameters, landmarks, of_each = 4, 3, 2
+    count = parameters + landmarks * of_each
+    rows = rng.normal(size=(40, count))
+    # A row is of one landmark.
+    rows[:, parameters:] *= np.repeat(np.arange(40)[:, None] % landmarks == np.arange(landmarks), of_each, axis=1)
+    hessian, side = rows.T @ rows, rng.normal(size=count)
+    expected = np.linalg.solve(hessian, side)
+    whole = np.column_stack([hessian, side])
+    top = np.zeros((parameters + 1, parameters + 1))
+    top[:-1], top[-1, :-1] = whole[:parameters][:, [*range(parameters), -1]], side[:parameters]
+    coupling = whole[parameters:][:, [*range(parameters), -1]].reshape(landmarks, of_each, -1)
+    places = np.arange(landmarks * of_each).reshape(landmarks, of_each) + parameters
+    blocks = hessian[places[:, :, None], places[:, None, :]]
+    reduced = SchurComplement.of(top, coupling, blocks)
+    step = np.linalg.solve(reduced.matrix, reduced.side)
+    np.testing.assert_allclose(step, expected[:parameters], rtol=1e-9)
+    np.testing.assert_allclose(reduced.landmarks(step).ravel(), expected[parameters:], rtol=1e-9)
