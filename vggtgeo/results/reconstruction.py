@@ -44,7 +44,7 @@ from vggtgeo.slam.perception.static_overlay import (
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
-from vggtgeo.slam.self_calibration import MAX_PASSES, self_calibrate
+from vggtgeo.slam.self_calibration import CALIBRATION_FRAMES, MAX_PASSES, self_calibrate
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
@@ -253,7 +253,7 @@ def _calibrate(
     Warnings and refusals are restored: the run itself reports them.
     """
     start, _, stride = selection
-    count = min(source.count(*selection) or 0, settings.camera.calibration_frames)
+    count = min(source.count(*selection) or 0, CALIBRATION_FRAMES)
     if source.camera.known or not count or not settings.refinement.global_adjustment:
         return None
     end = start + count * stride
