@@ -15,6 +15,7 @@ import numpy as np
 
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence, without_depth
 from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.image_files import is_there
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.evaluation import nearest_in_time
 from vggtgeo.geometry import rigid
@@ -53,21 +54,14 @@ def find_sequences(path: str, folders: Iterable[Path]) -> list[Path]:
     """Return all existing `folder / path`, also with up to two folders in between, the preferred one first."""
     wanted = Path(path).expanduser()
     if wanted.is_absolute():
-        return [wanted.resolve()] if _is_there(wanted) else []
+        return [wanted.resolve()] if is_there(wanted) else []
     parents = (
         parent
         for folder in folders
         for level in _LEVELS
         for parent in ([folder] if not level else sorted(folder.glob(level)))
     )
-    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if _is_there(parent / wanted)))
-
-
-def _is_there(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # for example a name that is too long
-        return False
+    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if is_there(parent / wanted)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ import numpy as np
 
 from vggtgeo.datasets.depth_files import metres_of_floats, read_depth
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, file_content, image_in
+from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, image_in
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, record3d_intrinsics
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
@@ -37,6 +37,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError, InputWarning, install_hint
 from vggtgeo.io.text_files import MAX_BYTES as MAX_TEXT
+from vggtgeo.io.text_files import content_of
 
 SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"
@@ -148,7 +149,7 @@ class Record3d(FolderSequence):
     def _content(self, path: Path, most: int = MAX_BYTES) -> bytes:
         """Return the content of a file in the folder or archive; at most `most` bytes."""
         if self.folder.is_dir():
-            return file_content(path, most)
+            return content_of(path, most)
         try:
             part = self._archive.getinfo(path.relative_to(self.folder).as_posix())
             return self._archive.read(part)

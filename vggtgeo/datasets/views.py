@@ -64,11 +64,9 @@ class SequenceView:
         return self.source.ground_truth() if self.has_truth else None
 
 
-def with_intrinsics(
-    sequence: Sequence, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
-) -> Sequence:
+def with_intrinsics(sequence: Sequence, intrinsics: tuple[float, float, float, float]) -> Sequence:
     """Return the sequence with known intrinsics (pixels), replacing those of its folder."""
-    camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height, distortion)
+    camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height)
     check_plausible("`intrinsics`", camera)
     source = replace(sequence, camera=camera) if isinstance(sequence, RosBag) else sequence  # depth is registered to it
     return SequenceView(source, camera, sequence.has_depth)
