@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.results.pose_prior import with_pose_prior
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.run_options import RunOptions
-from vggtgeo.results.source import Source, open_source
+from vggtgeo.results.source import Source, open_source, with_pose_prior
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings

@@ -13,7 +13,7 @@ from vggtgeo.benchmark.table import Row, select
 from vggtgeo.benchmark.worker import LOG, RECORDING
 from vggtgeo.io.files import write_text
 from vggtgeo.report.figures import svg
-from vggtgeo.report.templates import style, template
+from vggtgeo.report.viewer import style, template
 
 
 def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> None:
