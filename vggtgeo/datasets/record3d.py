@@ -29,7 +29,7 @@ from vggtgeo.datasets.depth_files import metres_of_floats, read_depth
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, image_in
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
-from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, record3d_intrinsics
+from vggtgeo.datasets.intrinsics import camera_of_record3d, guess_with_warning
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.datasets.pose_files import json_in, parsing, poses_of, same_size, trajectory_of
 from vggtgeo.geometry.camera import Camera
@@ -237,6 +237,4 @@ def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -
         return None
     if not {"K", "perFrameIntrinsicCoeffs"} & metadata.keys():
         return None
-    camera = Camera(record3d_intrinsics(where, metadata), width, height)
-    check_plausible(f"`{where}`", camera)
-    return camera
+    return camera_of_record3d(where, metadata, width, height)

@@ -3,10 +3,9 @@
 from vggtgeo.evaluation.absolute import AbsoluteError, ErrorStatistics, absolute_error
 from vggtgeo.evaluation.alignment import ALIGNMENTS, Alignment, Similarity, align, heading, umeyama
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, nearest_in_time
-from vggtgeo.evaluation.clouds import CloudError, cloud_error, surface_points
 from vggtgeo.evaluation.comparability import Comparability, comparability
 from vggtgeo.evaluation.consistency import Consistency, consistency, pose_consistency
-from vggtgeo.evaluation.depth import DepthError, depth_error
+from vggtgeo.evaluation.maps import CloudError, DepthError, cloud_error, depth_error, surface_points
 from vggtgeo.evaluation.offsets import Offsets, estimate_offsets, shifted
 from vggtgeo.evaluation.relative import UNITS, RelativeError, Unit, relative_error, rotation_angle
 from vggtgeo.evaluation.report import TrajectoryReport, coverage, evaluate_trajectory, followed
