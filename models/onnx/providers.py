@@ -13,7 +13,7 @@ from typing import Literal
 import onnxruntime
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 
-from vggtgeo.io.errors import install_hint
+from vggtgeo.io.errors import install_hint, put_back_hint
 
 GPU_PACKAGE = "onnxruntime-gpu"
 Provider = Literal["auto", "cuda", "cpu"]
@@ -54,7 +54,7 @@ def _covered() -> str:
         return ""
     return (
         f"{GPU_PACKAGE} {found} is installed, but its files are overwritten by those of the package onnxruntime; "
-        f"`pip install --force-reinstall --no-deps {GPU_PACKAGE}=={found}` puts them back"
+        f"{put_back_hint(GPU_PACKAGE, found)}"
     )
 
 
