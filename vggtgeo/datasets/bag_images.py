@@ -197,7 +197,7 @@ def chosen_topics(path: Path, first: Mapping[str, Any]) -> Chosen:
     Colour goes before grey and infrared, depth that is registered to the colour camera before any other; then the
     order of their names. InputError where none is an image that can be read, with what they are.
     """
-    depths = {name: _rank_of_depth(name) for name, message in first.items() if _is_depth(name, message)}
+    depths = {name: (int(not is_registered(name)),) for name, message in first.items() if _is_depth(name, message)}
     images = {name: rank for name, message in first.items() if (rank := _rank_of_image(name, message)) is not None}
     images = {name: rank for name, rank in images.items() if name not in depths}
     if not images:
@@ -236,10 +236,6 @@ def _is_depth(name: str, message: Any) -> bool:
         return True
     encoding = encoding_of(message)
     return encoding in DEPTH and (encoding != "mono16" or "depth" in name.lower())
-
-
-def _rank_of_depth(name: str) -> tuple[int]:
-    return (0 if is_registered(name) else 1,)
 
 
 def _rank_of_image(name: str, message: Any) -> tuple[int, int, int] | None:

@@ -264,15 +264,10 @@ def _depth_camera(
             height, width = metres_of(message, _place(path, chosen.depth, number)).shape
         except InputError:
             continue
-        transforms = lambda: _transforms(reader)
+        transforms = lambda: _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
         cameras = camera, (width, height)
         return depth_camera_of(path, chosen, first, infos, cameras, transforms, _extrinsics(reader))
     return None
-
-
-def _transforms(reader: Any) -> Iterator[Any]:
-    """Return the undamaged messages of tf."""
-    return _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
 
 
 def _extrinsics(reader: Any) -> np.ndarray | None:
