@@ -43,7 +43,7 @@ def main() -> None:
         truth = Trajectory.load_tum(options.truth) if options.truth else clip.ground_truth()
         if options.width != 1:
             size = round(options.width * clip.camera.width), clip.camera.height
-            clip = ReducedSequence(clip, clip.camera.resized(*size))
+            clip = ReducedSequence(clip, clip.camera.resized(*size), clip.has_depth)
         camera = Camera.guess(clip.camera.width, clip.camera.height)
         has_depth = options.depth and clip.has_depth
         result = vg.reconstruct(

@@ -18,7 +18,6 @@ import numpy as np
 
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.simulation.sequence import SyntheticSequence
 from vggtgeo.slam.clock import Clock
@@ -54,12 +53,9 @@ def _row(seed: int, returns: bool, sections: int) -> str:
     loops, false = _loops(after, sequence, settings.window.size)
     level = judge(after).level
     cells = [seed, "yes" if returns else "no", len(sequence), len(after.keyframes)]
-    cells += [f"{100 * _error(slam, truth):.2f}" for slam in (before, after)]
+    errors = (evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse for slam in (before, after))
+    cells += [f"{100 * error:.2f}" for error in errors]
     return "| " + " | ".join(map(str, [*cells, loops, false, level])) + " |"
-
-
-def _error(slam: Slam, truth: Trajectory) -> float:
-    return evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
 
 
 def _loops(slam: Slam, sequence: SyntheticSequence, apart: int) -> tuple[int, int]:

@@ -27,29 +27,6 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from vggtgeo.models.checks import check_array, check_confidence, check_index, check_pose
 
-__all__ = [
-    "DenseConfidence",
-    "DepthEstimate",
-    "Features",
-    "GeometryResult",
-    "InitialGeometry",
-    "LineDetector",
-    "LineFeatures",
-    "LineMatcher",
-    "LineMatches",
-    "MetricDepth",
-    "PointMatcher",
-    "PointMatches",
-    "PoseGuess",
-    "PoseQuery",
-    "RelativeView",
-    "Segments",
-    "StartGuess",
-    "WindowGeometry",
-    "WindowGuess",
-]
-
-
 # --- point matches -----------------------------------------------------------------------------------------------
 
 

@@ -160,15 +160,8 @@ def _token_counts(pairs: Sequence[tuple[Tensor, Signature]], letters: Mapping[st
 
 def external_files(path: Path) -> list[Path]:
     """Return the existing files of external data that the graph in `path` names, sorted by name."""
-    files = [path.parent / name for name in sorted(set(_values(path, "location")))]
-    return [file for file in files if file.parent == path.parent and _is_there(file)]
-
-
-def _is_there(file: Path) -> bool:
-    try:
-        return file.is_file()
-    except OSError:  # a damaged name may be longer than a file system takes
-        return False
+    beside = {file.name: file for file in path.parent.iterdir() if file.is_file()}
+    return [beside[name] for name in sorted(set(_values(path, "location"))) if name in beside]
 
 
 def has_random_weights(path: Path) -> bool:

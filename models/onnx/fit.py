@@ -64,12 +64,11 @@ class Fit:
         """Return pixels [..., 2] of the image for pixels of the network's input."""
         return (pixels - self.offset + 0.5) / self.scale - 0.5
 
-    def map_to_image(self, values: np.ndarray, nearest: bool = False) -> np.ndarray:
+    def map_to_image(self, values: np.ndarray) -> np.ndarray:
         """Return a map [*network_size, ...] as float32 [*image_size, ...], interpolated, without the border."""
         left, top = (int(value) for value in self.offset)
         content = values[top : top + self.content_size[0], left : left + self.content_size[1]]
-        way = cv2.INTER_NEAREST_EXACT if nearest else cv2.INTER_LINEAR
-        return cv2.resize(np.asarray(content, np.float32), self.image_size[::-1], interpolation=way)
+        return cv2.resize(np.asarray(content, np.float32), self.image_size[::-1], interpolation=cv2.INTER_LINEAR)
 
     def intrinsics_to_image(self, intrinsics: np.ndarray) -> np.ndarray:
         """Return (fx, fy, cx, cy) of the image, float64 [4], from those of the network's input."""

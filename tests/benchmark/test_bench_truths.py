@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.benchmark.inputs import Input, open_input
 from vggtgeo.benchmark.jobs import jobs_of
-from vggtgeo.benchmark.measure import measure, pooled_depth_errors, thinned
+from vggtgeo.benchmark.measure import focal_error, measure, pooled_depth_errors, thinned
 from vggtgeo.evaluation import Similarity, pose_consistency
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
@@ -172,3 +172,9 @@ def test_a_run_that_states_deviations_has_its_nees_in_the_row(tmp_path: Path) ->
     assert row["nees_place"] == pytest.approx(1 / 24, rel=0.2)
     assert row["nees_rotation"] == pytest.approx(0.0, abs=1e-9)
     assert "nees_place" not in measure(_result(own, np.zeros((0, 3)), False), given, spec)
+
+
+def test_the_error_of_the_focal_length() -> None:
+    # Proves sign and size. Oracle: by hand.
+    assert focal_error((510.0, 490.0, 1.0, 1.0), (500.0, 500.0, 0.0, 0.0)) == pytest.approx(0.0)
+    assert focal_error((510.0, 510.0, 1.0, 1.0), (500.0, 500.0, 0.0, 0.0)) == pytest.approx(0.02)

@@ -128,7 +128,7 @@ def test_flags_and_cache_are_set_before_jax(tmp_path: Path) -> None:
     # Proves that the program computes in 64 bits, keeps compiled code in the user's cache folder, adjusts on the
     # processor, and, where it is told to use a GPU, leaves its memory to others.
     script = (
-        "from vggtgeo.cli.environment import set_jax_flags; set_jax_flags(); import jax, os; "
+        "from vggtgeo.cli.main import set_jax_flags; set_jax_flags(); import jax, os; "
         "print(jax.numpy.ones(1).dtype, jax.config.jax_compilation_cache_dir, "
         "jax.config.jax_persistent_cache_min_compile_time_secs, os.environ['XLA_PYTHON_CLIENT_PREALLOCATE'], "
         "jax.config.jax_platforms)"

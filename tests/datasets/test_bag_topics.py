@@ -11,8 +11,7 @@ import tiny_sequences
 from reported import raises
 
 from vggtgeo.datasets.bag_cameras import camera_of
-from vggtgeo.datasets.bag_images import image_of, metres_of
-from vggtgeo.datasets.bag_topics import Chosen, chosen_topics
+from vggtgeo.datasets.bag_images import Chosen, chosen_topics, image_of, metres_of
 
 PLACE = Path("a.bag, /c, 0")
 

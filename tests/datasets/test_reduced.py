@@ -57,6 +57,7 @@ def test_phones_videos_keep_their_proportions(size: tuple[int, int]) -> None:
     assert found.resized(*size).intrinsics == pytest.approx(camera.intrinsics, abs=1e-9)
 
 
+@pytest.mark.usefixtures("uncompiled")
 def test_a_run_of_large_images_says_so_and_is_right() -> None:
     """A run over images of four times the pixels that are worked with comes out where they were taken, from a
     sequence and from plain frames; its summary has both sizes, and the camera as it was read.

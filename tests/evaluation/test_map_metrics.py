@@ -2,19 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from vggtgeo.evaluation import (
     cloud_error,
     consistency,
     depth_error,
-    depth_of_cloud,
-    focal_error,
-    mesh_error,
-    scale_error,
     surface_points,
 )
-from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 
 
@@ -22,13 +16,12 @@ def test_depth_error_is_taken_where_both_are_valid() -> None:
     # Proves RMSE, mean, relative error, inliers, count and coverage. Oracle: four pixels by hand.
     truth = np.array([[1.0, 2.0, 4.0, np.nan], [5.0, 2.0, np.nan, 1.0]])
     depth = np.array([[1.1, 2.0, 2.0, 3.0], [np.nan, 2.0, np.nan, 1.0]])
-    mask = np.array([[True, True, True, True], [True, False, True, True]])
-    found = depth_error(depth, truth, mask)
-    errors = np.array([0.1, 0.0, 2.0, 0.0])
+    found = depth_error(depth, truth)
+    errors = np.array([0.1, 0.0, 2.0, 0.0, 0.0])
     assert found.rmse == pytest.approx(np.sqrt(np.mean(errors**2)))
     assert found.mean == pytest.approx(errors.mean())
-    assert found.relative == pytest.approx((0.1 + 0.5) / 4)
-    assert (found.inliers, found.count, found.coverage) == (0.75, 4, 0.8)
+    assert found.relative == pytest.approx((0.1 + 0.5) / 5)
+    assert (found.inliers, found.count, found.coverage) == (0.8, 5, 5 / 6)
 
 
 def test_depth_error_of_nothing_is_nan() -> None:
@@ -36,23 +29,6 @@ def test_depth_error_of_nothing_is_nan() -> None:
     found = depth_error(np.full((2, 2), np.nan), np.ones((2, 2)))
     assert np.isnan(found.rmse)
     assert (found.count, found.coverage) == (0, 0.0)
-
-
-def test_depth_of_a_cloud_is_the_nearest_point_of_each_pixel() -> None:
-    # Proves that a depth map turned into world points comes back exactly, with a farther cloud behind it and points
-    # behind the camera ignored. Oracle: the depth map.
-    rng = np.random.default_rng(0)
-    camera = Camera((50.0, 52.0, 19.5, 14.5), 40, 30)
-    depth = rng.uniform(1.0, 3.0, (30, 40))
-    depth[rng.random((30, 40)) < 0.2] = np.nan
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.random(rng=rng).as_matrix(), [0.3, -1.0, 2.0]
-    x, y = np.meshgrid(np.arange(40), np.arange(30))
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(camera.matrix).T
-    local = (rays * depth[..., None])[np.isfinite(depth)]
-    local = np.concatenate([local, 2.0 * local, -local])
-    world = (local - pose[:3, 3]) @ pose[:3, :3]
-    np.testing.assert_allclose(depth_of_cloud(world, pose, camera), depth, atol=1e-12)
 
 
 @pytest.mark.parametrize("threshold", [0.05, 0.3, 10.0])
@@ -108,20 +84,6 @@ def test_points_on_a_mesh_are_even_by_area() -> None:
     assert (points[low, :2].sum(axis=1) <= 1 + 1e-12).all()
 
 
-def test_meshes_of_one_surface_agree_however_it_is_cut() -> None:
-    # Proves that a square of two triangles and one of 200, raised by 3 cm, are 3 cm apart everywhere. Oracle: geometry.
-    steps = np.linspace(0, 1, 11)
-    x, y = np.meshgrid(steps, steps)
-    grid = np.column_stack([x.ravel(), y.ravel(), np.full(121, 0.03)])
-    corner = (np.arange(10)[:, None] * 11 + np.arange(10)).ravel()[:, None]
-    many = np.concatenate([corner + [0, 1, 11], corner + [1, 12, 11]])
-    two = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    found = mesh_error((grid, many), two, threshold=0.05)
-    assert (found.precision, found.recall) == (1.0, 1.0)
-    assert found.mean_distance == pytest.approx(0.03, rel=0.03)
-    assert mesh_error((grid, many), two, threshold=0.025).f_score == 0.0
-
-
 def test_nees_of_right_covariances_keeps_to_its_band() -> None:
     # Proves that errors drawn by their covariances are consistent, that errors of twice the size are not, and by how
     # much. Oracle: the chi-square law; the Mahalanobis distance by an inverse.
@@ -132,20 +94,10 @@ def test_nees_of_right_covariances_keeps_to_its_band() -> None:
     found = consistency(errors, covariances)
     expected = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
     np.testing.assert_allclose(found.nees, expected, rtol=1e-9)
-    assert found.consistent, (found.low, found.mean, found.high)
+    assert found.low <= found.mean <= found.high, (found.low, found.mean, found.high)
     too_sure = consistency(2 * errors, covariances)
-    assert not too_sure.consistent
     assert too_sure.mean > too_sure.high
-    assert too_sure.inflation == pytest.approx(2.0, rel=0.05)
-    assert not consistency(0.5 * errors, covariances).consistent
+    assert too_sure.mean == pytest.approx(4 * found.mean)
+    assert consistency(0.5 * errors, covariances).mean < found.low
     with pytest.raises(InputError, match="`covariances`"):
         consistency(errors, -covariances)
-
-
-def test_errors_of_focal_length_and_scale() -> None:
-    # Proves sign and size. Oracle: by hand.
-    assert focal_error((510.0, 490.0, 1.0, 1.0), (500.0, 500.0, 0.0, 0.0)) == pytest.approx(0.0)
-    assert focal_error((510.0, 510.0, 1.0, 1.0), (500.0, 500.0, 0.0, 0.0)) == pytest.approx(0.02)
-    assert scale_error(1 / 1.02) == pytest.approx(0.02)
-    with pytest.raises(InputError, match=r"`scale` .*0"):
-        scale_error(0.0)

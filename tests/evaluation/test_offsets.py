@@ -21,7 +21,7 @@ from vggtgeo.io.errors import InputWarning
 app = typer.Typer()
 app.command()(evaluate)
 
-SECONDS = 15.0
+SECONDS = 10.0
 LEVER = np.array([0.1, -0.05, 0.02])
 TURN = Rotation.from_rotvec([0.1, 0.05, -0.3])
 

@@ -36,10 +36,16 @@ INTRINSICS = np.array([200.0, 210.0, 79.5, 59.5])
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a short simulated run with depth."""
+def run() -> vg.Result:
+    """A short simulated run with depth."""
+    return vg.Result.of(recorded_run().slam)
+
+
+@pytest.fixture(scope="module")
+def folder(run: vg.Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its folder."""
     place = tmp_path_factory.mktemp("run") / "room"
-    vg.Result.of(recorded_run().slam).save(place, depth=True)
+    run.save(place, depth=True)
     return place
 
 
@@ -219,13 +225,12 @@ def test_colours_are_shown_as_those_of_the_pictures(
     np.testing.assert_array_equal(shown(tmp_path / "out"), own(run))
 
 
-def test_borders_that_no_pixel_fills_are_masked(tmp_path: Path) -> None:
+def test_borders_that_no_pixel_fills_are_masked(run: vg.Result, tmp_path: Path) -> None:
     # Proves that both formats say which pixels an undistorted picture made up, and neither does where there are none.
-    result = vg.Result.of(recorded_run().slam)
-    height, width = result.record.slam.keyframes[0].size
+    height, width = run.record.slam.keyframes[0].size
     seen = np.ones((height, width), bool)
     seen[:, :3] = False
-    replace(result, record=replace(result.record, valid=seen)).save(tmp_path / "run", depth=True)
+    replace(run, record=replace(run.record, valid=seen)).save(tmp_path / "run", depth=True)
     export(tmp_path / "run", "nerfstudio", tmp_path / "n")
     export(tmp_path / "run", "colmap", tmp_path / "c")
     frames = json.loads((tmp_path / "n/transforms.json").read_text())["frames"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,11 @@ import numpy as np
 import tiny_bags as bags
 import tiny_layouts as layouts
 import tiny_sequences as tiny
-from changed_file import with_header
 from tiny_state import state
 
 from vggtgeo.datasets import open_sequence
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.io.persistence import DATA, HEADER
 from vggtgeo.results.result import Result
 from vggtgeo.slam.known_map import save_map
 
@@ -153,6 +154,15 @@ def with_map(change: Callable[[Path], Any]) -> Callable[[Path], Path]:
 def cut(file: Path) -> None:
     """Keep the first half of a file."""
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def with_header(file: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Change the header of a map file in place."""
+    with np.load(file) as kept:
+        header, data = json.loads(kept[HEADER].tobytes()), kept[DATA]
+    change(header)
+    with file.open("wb") as stream:
+        np.savez(stream, **{HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8), DATA: data})
 
 
 def newer(file: Path) -> None:

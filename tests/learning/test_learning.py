@@ -26,7 +26,7 @@ from vggtgeo.learning.tracked_windows import FEATURES, INLIER
 
 @pytest.fixture(scope="module")
 def windows() -> list[TrackedWindow]:
-    sequence = vg.simulate("room", 120, 101, (160, 120), rate=10.0)
+    sequence = vg.simulate("room", 120, 0, (160, 120), rate=10.0)
     return list(tracked_windows(sequence, 3, keyframes=3, points=10, seed=1))
 
 
@@ -92,7 +92,7 @@ def test_the_gradient_through_slid_windows_is_that_of_the_error(depth: bool) -> 
     """The error at the end of three slid windows has the gradient of central differences, by the matches of each.
     Without depth the unit is the first baseline. Oracle: the error.
     """
-    sequence = vg.simulate("room", 120, 101, (160, 120), rate=10.0)
+    sequence = vg.simulate("room", 120, 0, (160, 120), rate=10.0)
     (long,) = tracked_windows(sequence, 1, keyframes=5, points=16, seed=1)
     windows = stack_sequences([long], 3, depth=depth).select(0)
     assert windows.truth.shape == (3, 3, 3)

@@ -4,12 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from synthetic_room import room
 from vggtgeo.models.roles import DenseConfidence, LineDetector, MetricDepth, PointMatcher, WindowGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
 from vggtgeo.models.stubs.perception import SmoothField, at_pixels, weakness
 
-from vggtgeo.simulation import SimulatedOracle
+from vggtgeo.simulation import IDEAL, SimulatedOracle, simulate
 
 SIZE = (160, 120)
 EVERY = 4  # frames between images
@@ -17,7 +16,7 @@ EVERY = 4  # frames between images
 
 @pytest.fixture(scope="module")
 def oracle() -> SimulatedOracle:
-    return SimulatedOracle(room(164, SIZE, rate=10.0))
+    return SimulatedOracle(simulate("room", 164, 0, SIZE, rate=10.0, sensor=IDEAL))
 
 
 @pytest.fixture(scope="module")

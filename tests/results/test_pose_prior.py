@@ -6,17 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded_run import SETTINGS
 
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.results.pose_prior import with_pose_prior
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.run_options import RunOptions
-from vggtgeo.results.source import Source, open_source
+from vggtgeo.results.source import Source, open_source, with_pose_prior
 from vggtgeo.simulation import simulate
-from vggtgeo.slam.settings.groups import WindowSettings
-from vggtgeo.slam.settings.slam_settings import SlamSettings
-
-SETTINGS = SlamSettings(window=WindowSettings(size=3, point_slots=16, line_slots=12))
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +43,7 @@ def test_poses_of_a_file_leave_the_truth(source: Source, tmp_path: Path) -> None
     np.testing.assert_allclose(recorded.trajectory.poses, source.truth.poses, atol=1e-6)
 
 
+@pytest.mark.usefixtures("uncompiled")
 def test_a_run_says_what_became_of_the_prior() -> None:
     """Two frames compare no motion: the prior is not used, and the summary and a note say so; there is no truth."""
     sequence = simulate("room", 2, size=(160, 120))

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_sequences as tiny
-from killed import Killed, KilledAfter
 from recorded_run import FRAMES, ROLES, SETTINGS
 from reported import raises
 from same_leaves import differences
@@ -20,6 +19,7 @@ from vggtgeo.models.onnx.bounds import Refusals
 
 import vggtgeo.results.reconstruction as reconstruction
 from vggtgeo.cli.main import make_app
+from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, Notice, RunSoFar, frames_kept
 from vggtgeo.results.reconstruction import reconstruct
@@ -36,6 +36,21 @@ from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.judge import judge
 
 TIMES = ("seconds_by_stage", "frames_per_second", "peak_memory_gb")
+
+
+class Killed(Exception):
+    """What ends a run in the middle of everything."""
+
+
+@dataclass
+class KilledAfter(Callback):
+    """Ends the run at a frame, before its state is kept."""
+
+    frame: int
+
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
+        if frame.index == self.frame:
+            raise Killed
 
 
 @dataclass(frozen=True, eq=False)

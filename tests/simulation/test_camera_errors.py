@@ -24,7 +24,7 @@ INNER = (slice(8, -8), slice(8, -8))
 
 
 def _walk(rate: float = RATE, count: int = 5, **errors: float) -> SyntheticSequence:
-    return vg.simulate("room", count, 3, (200, 150), rate=rate, sensor=replace(IDEAL, **errors))
+    return vg.simulate("room", count, 0, (200, 150), rate=rate, sensor=replace(IDEAL, **errors))
 
 
 @pytest.fixture(scope="module")
@@ -101,11 +101,9 @@ def test_corners_are_dark_and_the_middle_is_not() -> None:
 def test_exposure_follows_the_brightness_with_a_lag() -> None:
     # Proves the control of exposure: a step of brightness by 2 is taken away, and not at once. Oracle: the known step.
     sequence = _walk()
+    first = replace(sequence.frame(0), depth=None)
     levels = [60] * 10 + [120] * 40
-    frames = [
-        replace(sequence.frame(0), index=k, image=np.full((9, 12, 3), v, np.uint8), depth=None)
-        for k, v in enumerate(levels)
-    ]
+    frames = [replace(first, index=k, image=np.full((9, 12, 3), v, np.uint8)) for k, v in enumerate(levels)]
     adapted = auto_exposed(Recording(frames, sequence.camera, sequence.ground_truth()), 1.0, 4.0).frames
     means = np.array([frame.image.mean() for frame in adapted])
     assert means[10] > 1.5 * means[9], means

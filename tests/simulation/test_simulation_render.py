@@ -3,9 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-from synthetic_room import room
 
-from vggtgeo.simulation import IDEAL, Scene, SyntheticSequence, render
+from vggtgeo.simulation import IDEAL, Scene, SyntheticSequence, render, simulate
 from vggtgeo.simulation.furniture import lamp_panel
 from vggtgeo.simulation.raster import encode, inverse_depth_at, surface_coordinates, view_from
 from vggtgeo.simulation.scene import finish
@@ -35,7 +34,7 @@ def world_rays(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def walk() -> SyntheticSequence:
-    return room(120, (320, 240), sensor=IDEAL)
+    return simulate("room", 120, 0, (320, 240), sensor=IDEAL)
 
 
 @pytest.fixture(scope="module")

@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 from reported import raises
-from synthetic_room import room
 
-from vggtgeo.simulation import IDEAL, SimulatedOracle
+from vggtgeo.simulation import IDEAL, SimulatedOracle, simulate
 
 SIZE = (320, 240)
 
 
 @pytest.fixture(scope="module")
 def oracle() -> SimulatedOracle:
-    return SimulatedOracle(room(120, SIZE, rate=10.0, sensor=IDEAL))
+    return SimulatedOracle(simulate("room", 120, 0, SIZE, rate=10.0, sensor=IDEAL))
 
 
 def test_correspondences_agree_with_depth_and_pose_and_come_back(oracle: SimulatedOracle) -> None:
@@ -37,7 +36,7 @@ def test_correspondences_agree_with_depth_and_pose_and_come_back(oracle: Simulat
 
 def test_hidden_points_are_not_seen(oracle: SimulatedOracle) -> None:
     # A point is called seen exactly where the other frame's depth agrees with its own, outlines left out.
-    first, second = 10, 24
+    first, second = 40, 54
     v, u = np.mgrid[4 : SIZE[1] : 9, 4 : SIZE[0] : 9]
     pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
     target, seen = oracle.correspond(first, second, pixels)

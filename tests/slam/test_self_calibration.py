@@ -177,10 +177,8 @@ class _Passes:
         return replace(slam, camera=replace(slam.camera, intrinsics=own, given=own, self_calibrated=True))
 
 
-def settings(frames: int = 150) -> vg.SlamSettings:
-    """Those of the recorded run with a last adjustment, which no test of this file comes to."""
-    base = vg.SlamSettings()
-    return replace(SETTINGS, camera=replace(base.camera, calibration_frames=frames), refinement=base.refinement)
+ADJUSTED = replace(SETTINGS, camera=vg.SlamSettings().camera, refinement=vg.SlamSettings().refinement)
+"""Settings of the recorded run with a last adjustment, which no test of this file comes to."""
 
 
 def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **given: Any) -> vg.Result:
@@ -188,29 +186,29 @@ def run(monkeypatch: pytest.MonkeyPatch, passes: _Passes, frames: Any = None, **
     monkeypatch.setattr(reconstruction, "self_calibrate", passes)
     monkeypatch.setattr(reconstruction, "finish", lambda slam, *_: slam)
     monkeypatch.setattr(reconstruction, "CompileAhead", lambda _: vg.Callback())
-    given = {"roles": ROLES, "settings": settings(), "options": vg.RunOptions(dense="none"), **given}
+    given = {"roles": ROLES, "settings": ADJUSTED, "options": vg.RunOptions(dense="none"), **given}
     return vg.reconstruct(SequenceView(walk(), GUESS, has_depth=True) if frames is None else frames, **given)
 
 
 @pytest.mark.long
 def test_a_guessed_camera_is_sought_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that the run begins with what self-calibration found, over as many frames as the setting says of those that
-    # were selected, and with the guess where that finds none.
+    # Proves that the run begins with what self-calibration found, over at most `CALIBRATION_FRAMES` of the selected
+    # frames, and with the guess where that finds none.
     passes = _Passes()
     result = run(monkeypatch, passes)
     assert result.intrinsics == pytest.approx(np.array(LENS.intrinsics), abs=0.1)
     assert "self-calibration" in result.summary["seconds_by_stage"]
-    run(monkeypatch, passes, settings=settings(2), options=vg.RunOptions(start=1, stride=3, dense="none"))
+    monkeypatch.setattr(reconstruction, "CALIBRATION_FRAMES", 2)
+    run(monkeypatch, passes, options=vg.RunOptions(start=1, stride=3, dense="none"))
     assert passes.counts == [FRAMES, 2]
     assert run(monkeypatch, _Passes(None), options=FEW).record.slam.camera.given.tolist() == list(GUESS.intrinsics)
 
 
 def test_no_self_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that a known camera, frames that come once, and the setting 0 need none.
+    # Proves that a known camera and frames that come once need none.
     passes = _Passes()
     run(monkeypatch, passes, walk(), options=FEW)
     run(monkeypatch, passes, iter(recorded_run().frames[:3]))
-    run(monkeypatch, passes, settings=settings(0), options=FEW)
     assert passes.counts == []
 
 

@@ -12,6 +12,7 @@ from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.suite import ExternalTable, Suite
 from vggtgeo.benchmark.table import Row
 from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets.image_files import is_there
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
@@ -27,7 +28,7 @@ def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> 
         places: dict[Path, Job] = {}
         for job in jobs:
             file = base / table.file(job.sequence, job.seed)
-            if _is_file(file):
+            if is_there(file):
                 places.setdefault(file, job)
         found += [_row(suite, table, job, file, runs) for file, job in places.items()]
     return found
@@ -37,17 +38,10 @@ def warn_of_missing(suite: Suite, jobs: Sequence[Job], base: Path) -> None:
     """Warn of each `[[external]]` without any file, before the runs begin."""
     for table in suite.external:
         files = list(dict.fromkeys(base / table.file(job.sequence, job.seed) for job in jobs))
-        if files and not any(map(_is_file, files)):
+        if files and not any(map(is_there, files)):
             more = f", nor any other of {len(files)} files" if len(files) > 1 else ""
             text = f"external `{table.name}` has no trajectory: `{files[0]}` does not exist{more}"
             warnings.warn(text, InputWarning, stacklevel=2)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that is too long
-        return False
 
 
 def _row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -> Row:

@@ -15,6 +15,7 @@ import numpy as np
 
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence, without_depth
 from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.image_files import is_there
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.evaluation import nearest_in_time
 from vggtgeo.geometry import rigid
@@ -53,21 +54,14 @@ def find_sequences(path: str, folders: Iterable[Path]) -> list[Path]:
     """Return all existing `folder / path`, also with up to two folders in between, the preferred one first."""
     wanted = Path(path).expanduser()
     if wanted.is_absolute():
-        return [wanted.resolve()] if _is_there(wanted) else []
+        return [wanted.resolve()] if is_there(wanted) else []
     parents = (
         parent
         for folder in folders
         for level in _LEVELS
         for parent in ([folder] if not level else sorted(folder.glob(level)))
     )
-    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if _is_there(parent / wanted)))
-
-
-def _is_there(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # for example a name that is too long
-        return False
+    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if is_there(parent / wanted)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +138,8 @@ def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> Rend
         oracle = SimulatedOracle(simulate(scene, frames, seed, size, **options), kept=frames)
     except TypeError as error:
         raise InputError(f"`simulate` in the suite: {error}") from None
-    walk = RenderedWalk(oracle, tuple(oracle.frames()))
+    recording = Recording(list(oracle.frames()), oracle.camera, oracle.ground_truth())
+    walk = RenderedWalk(oracle.name, recording, oracle)
     if kept is not None:
         with atomic_open(kept, "wb") as stream:
             pickle.dump(walk, stream, pickle.HIGHEST_PROTOCOL)
@@ -152,39 +147,10 @@ def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> Rend
 
 
 @dataclass(frozen=True, eq=False)
-class RenderedWalk:
-    """A `Sequence` of frames in memory, so that a run's time excludes rendering. 3 MB per frame of 320 x 240."""
-
-    oracle: SimulatedOracle
-    rendered: tuple[Frame, ...]
-
-    @property
-    def name(self) -> str:
-        return self.oracle.name
-
-    @property
-    def camera(self) -> Camera:
-        return self.oracle.camera
-
-    @property
-    def has_depth(self) -> bool:
-        return self.oracle.has_depth
-
-    def __len__(self) -> int:
-        return len(self.rendered)
-
-    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """Yield the frames at positions start, start + stride, ... below end."""
-        check_selection(self.name, len(self), start, end, stride)
-        yield from self.rendered[start:end:stride]
-
-    def ground_truth(self) -> Trajectory:
-        return self.oracle.ground_truth()
-
-
-@dataclass(frozen=True, eq=False)
 class DegradedWalk:
-    """A rendered walk after a degradation; its camera is the one that a user would assume."""
+    """A rendered walk in memory, so that a run's time excludes rendering: 3 MB per frame of 320 x 240. Its camera is
+    the one that a user would assume.
+    """
 
     name: str
     recording: Recording
@@ -209,10 +175,16 @@ class DegradedWalk:
         return self.recording.truth
 
 
+@dataclass(frozen=True, eq=False)
+class RenderedWalk(DegradedWalk):
+    """A walk without any degradation, and what is true of it."""
+
+    oracle: SimulatedOracle
+
+
 def degraded(walk: RenderedWalk, name: str, seed: int) -> DegradedWalk:
     """Return the walk after the degradation `name`, with noise from the seed."""
-    recording = Recording(list(walk.rendered), walk.camera, walk.ground_truth())
-    changed = DEGRADATIONS[name](recording, np.random.default_rng([seed, 23]))
+    changed = DEGRADATIONS[name](walk.recording, np.random.default_rng([seed, 23]))
     return DegradedWalk(f"{walk.name}, {name}", changed)
 
 

@@ -16,7 +16,7 @@ from vggtgeo.benchmark.suite import PROTOCOLS, SequenceTable, SettingTable, Suit
 from vggtgeo.datasets.opening import is_readable
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.settings.table import Tables, changed, updated
+from vggtgeo.slam.settings.table import changed, updated
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,10 @@ def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: P
         "threshold": sequence.threshold,
         "vertical": sequence.vertical,
         "exact_depth": sequence.exact_depth,
-        "set": _plain(changed(settings)),
+        "set": {group: dict(values) for group, values in changed(settings).items()},
         "pages": suite.pages,
         "recordings": suite.recordings,
     }
 
 
 _ROLES = ("calibrated", "perception", "features", "start_of_pose", "depth_errors")
-
-
-def _plain(tables: Tables) -> dict[str, dict[str, Any]]:
-    return {group: dict(values) for group, values in tables.items()}

@@ -20,7 +20,6 @@ from vggtgeo.evaluation import (
     depth_error,
     estimate_offsets,
     evaluate_trajectory,
-    focal_error,
     pose_consistency,
     surface_points,
 )
@@ -69,7 +68,12 @@ def measure(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str, 
     return {name: _plain(value) for name, value in row.items()}
 
 
-def mean_nees(result: Result, truth: Trajectory, scale: float, max_dt: float = 0.01) -> dict[str, Any]:
+def focal_error(estimated: Sequence[float], true: Sequence[float]) -> float:
+    """Return the relative error of the focal length, the mean over both axes; arguments are fx, fy, cx, cy, pixels."""
+    return 0.5 * (estimated[0] / true[0] + estimated[1] / true[1]) - 1.0
+
+
+def mean_nees(result: Result, truth: Trajectory, scale: float) -> dict[str, Any]:
     """Return the mean NEES of positions and of rotations, divided by its three degrees of freedom.
 
     1 if the run's standard deviations match its errors, more if they are too small. scale: of the Sim(3) alignment,
@@ -80,9 +84,7 @@ def mean_nees(result: Result, truth: Trajectory, scale: float, max_dt: float = 0
         return {}
     factor = 1.0 if result.metric else scale
     try:
-        found = pose_consistency(
-            result.trajectory, truth, factor * stated.translation, stated.rotation, factor, max_dt=max_dt
-        )
+        found = pose_consistency(result.trajectory, truth, factor * stated.translation, stated.rotation, factor)
     except InputError:
         return {}
     return {name: one.mean / one.degrees for name, one in zip(("nees_place", "nees_rotation"), found, strict=True)}
@@ -103,7 +105,7 @@ def between(truth: Trajectory, first: float, last: float) -> Trajectory:
 
 
 def trajectory_errors(
-    estimate: Trajectory, truth: Trajectory, metric: bool = True, max_dt: float = 0.01, vertical: Axis = "z"
+    estimate: Trajectory, truth: Trajectory, metric: bool = True, vertical: Axis = "z"
 ) -> tuple[dict[str, Any], Similarity | None]:
     """Return ATE after each alignment, RTE and RRE at `DELTAS`, and the alignment for maps.
 
@@ -111,11 +113,11 @@ def trajectory_errors(
     a message.
     """
     try:
-        report = evaluate_trajectory(estimate, truth, max_dt, vertical=AXES[vertical])
+        report = evaluate_trajectory(estimate, truth, vertical=AXES[vertical])
     except InputError as error:
         return {"warnings": str(error), "matched": 0}, None
-    verdict = comparability(estimate, truth, max_dt, metric)
-    offsets = estimate_offsets(estimate, truth, max_dt)
+    verdict = comparability(estimate, truth, metric=metric)
+    offsets = estimate_offsets(estimate, truth)
     explained = [offsets.message] if offsets is not None and offsets.explains else []
     row: dict[str, Any] = {
         "matched": report.matched,
@@ -136,7 +138,7 @@ def trajectory_errors(
     if verdict.reasons:
         row |= {"status": NOT_COMPARABLE, "message": "; ".join([*verdict.reasons, *verdict.doubts, *explained])}
     for name, delta, unit in DELTAS:
-        row |= _relative(evaluate_trajectory(estimate, truth, max_dt, delta, unit=unit), name, metric)  # type: ignore[arg-type]
+        row |= _relative(evaluate_trajectory(estimate, truth, delta=delta, unit=unit), name, metric)  # type: ignore[arg-type]
     return row, (report.se3 if metric else report.sim3).alignment
 
 

@@ -13,13 +13,14 @@ from vggtgeo.benchmark.table import Row, select
 from vggtgeo.benchmark.worker import LOG, RECORDING
 from vggtgeo.io.files import write_text
 from vggtgeo.report.figures import svg
-from vggtgeo.report.templates import style, template
+from vggtgeo.report.viewer import style, template
 
 
 def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> None:
     """Write the page, atomically. folder: of the suite, whose runs are linked."""
     good = cells.finished(rows)
     there = [row for row in rows if row["status"] != "absent"]
+    has_error = cells.summary_of(good, figures.headline(good)).count > 0
     text = template("vggtgeo.benchmark", "page.html.j2").render(
         style=style(),
         title=suite.title,
@@ -30,7 +31,7 @@ def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> N
         base=suite.title_of(suite.base),
         compared=[column.head for column in cells.COMPARED],
         differences=cells.differences(suite, good),
-        ablations=svg(figures.ablation_figure(suite, good, 7.5)) if _has_error(good) else None,
+        ablations=svg(figures.ablation_figure(suite, good, 7.5)) if has_error else None,
         sequences=[_sequence(suite, there, name, folder) for name in cells.sequences_of(suite, good)],
         cost=svg(figures.cost_figure(suite, good, 7.5)) if any("frames" in row for row in good) else None,
         runs=[_run(suite, row, folder) for row in rows],
@@ -117,7 +118,3 @@ def _provenance(rows: Sequence[Row]) -> list[tuple[str, str]]:
         if values:
             found.append((name.removeprefix("version_").replace("_", " "), ", ".join(values)))
     return found
-
-
-def _has_error(rows: Sequence[Row]) -> bool:
-    return cells.summary_of(rows, figures.headline(rows)).count > 0

@@ -89,10 +89,5 @@ def published(name: str) -> PublishedTable:
     }
     papers = tomllib.loads((files("vggtgeo.benchmark") / "systems.toml").read_text("utf-8"))
     own = {system: papers[system] for system in rows}
-    return PublishedTable(
-        name, columns=columns, rows=rows, papers=own, **{key: _value(value) for key, value in values.items()}
-    )
-
-
-def _value(value: object) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+    plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    return PublishedTable(name, columns=columns, rows=rows, papers=own, **plain)

@@ -238,9 +238,6 @@ class ExternalTable(RowTable):
     files: str
     metric: bool = True
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-
     def file(self, sequence: str, seed: int) -> Path:
         """Return the file of a run's trajectory, relative to the suite's folder."""
         return Path(self.files.replace("{sequence}", sequence).replace("{seed}", str(seed)))
@@ -321,7 +318,7 @@ def load_suite(name: str | Path) -> Suite:
     if path.suffix == ".toml" or path.is_file():
         try:
             text = whole_text(path, errors="strict")
-        except (OSError, UnicodeDecodeError) as error:
+        except ValueError as error:
             raise InputError(
                 f"`{path}` cannot be read: {error}; give a TOML file or one of {_shipped_text()}"
             ) from None

@@ -140,7 +140,7 @@ def load_scale(path: Path) -> str | None:
         return None
     try:
         return str(json.loads(whole_text(file, errors="strict"))["scale"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         text = f"`{file}` is invalid ({describe_error(error)}): scale and verdict of the run are unknown"
         warnings.warn(InputWarning(text), stacklevel=2)
         return None

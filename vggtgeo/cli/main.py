@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import importlib
 import importlib.metadata
+import io
 import logging
 import os
 import sys
@@ -16,13 +17,10 @@ from typing import Annotated, Any, NamedTuple, NoReturn, TextIO
 import typer
 from typer.core import TyperGroup
 
-from vggtgeo.cli.environment import (
-    set_jax_flags,
-    show_unknown_characters,
-)
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one_line
 from vggtgeo.io.interruption import end_on_signals, ignore_signals
+from vggtgeo.io.jax_environment import jax_environment
 
 EXIT_INPUT = 2
 EXIT_INTERNAL = 1
@@ -293,13 +291,21 @@ def make_app() -> typer.Typer:
     return app
 
 
+def set_jax_flags() -> None:
+    """Set environment variables, which JAX reads on import; those of the user take precedence."""
+    for name, value in jax_environment().items():
+        os.environ.setdefault(name, value)
+
+
 def main() -> None:
     """Run the program."""
     gc.set_threshold(GC_THRESHOLD)
     set_jax_flags()
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; an unknown backend in the environment would end a run
     end_on_signals()
-    show_unknown_characters()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # not the stream of a notebook
+            stream.reconfigure(errors="replace")  # `?` for characters that it cannot encode
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # no messages about its cache folder
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
     try:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
-from vggtgeo.io.checkpoint_pace import EVERY
+from vggtgeo.results.unfinished import EVERY
 
 Provider = Literal["auto", "cuda", "cpu"]
 SequenceArgument = Annotated[

@@ -17,7 +17,6 @@ from vggtgeo.cli.progress import ProgressBar, print_result
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.datasets.views import reduced
-from vggtgeo.io.checkpoint_pace import EVERY
 from vggtgeo.io.errors import InputError, one_line
 from vggtgeo.io.files import whole_path
 from vggtgeo.io.interruption import interruption
@@ -29,7 +28,7 @@ from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
 from vggtgeo.results.run_options import RunOptions
-from vggtgeo.results.unfinished import EXPORTS, SUMMARY
+from vggtgeo.results.unfinished import EVERY, EXPORTS, SUMMARY
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings

@@ -1,20 +1,28 @@
-"""The camera of a bag's images, by its messages of `sensor_msgs/CameraInfo`.
+"""The cameras of a bag: that of its images, that of its depth, and how they lie to each other.
 
-A bag may have messages of several cameras, and of uncalibrated ones: those not used are reported with the reason. The
-matrix of images of a region of interest or with binning follows ROS (`image_geometry`, `PinholeCameraModel`): shifted
-by the region's corner, then divided by the binning.
+A bag may have messages of `sensor_msgs/CameraInfo` of several cameras, and of uncalibrated ones: those not used are
+reported with the reason. The matrix of images of a region of interest or with binning follows ROS (`image_geometry`,
+`PinholeCameraModel`): shifted by the region's corner, then divided by the binning.
+
+RealSense, Kinect and their like take depth with a camera of its own beside the colour camera. Drivers register it to
+the images (topics `aligned_depth_to_color`, `depth_registered`), or leave it as it is. What a bag states decides: the
+`CameraInfo` beside the depth, the frames of both topics, and how these lie (`/tf_static`, `/tf`, or RealSense's
+`extrinsics/depth_to_color`).
 """
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from vggtgeo.datasets.bag_transforms import frame_name
+from vggtgeo.datasets.bag_images import Chosen, is_registered
 from vggtgeo.datasets.intrinsics import is_fisheye, pinhole_of, warn_of_other_size
+from vggtgeo.datasets.pose_files import poses_of
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.io.errors import InputError, InputWarning
 
@@ -136,3 +144,137 @@ def _without_zeros(lens: list[float], counts: Sequence[int]) -> list[float]:
 
 def _warn(message: str) -> None:
     warnings.warn(message, InputWarning, stacklevel=5)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthCamera:
+    """camera: of the depth images. motion: float64 [4, 4], its coordinates -> those of the images' camera, metres."""
+
+    camera: Camera
+    motion: np.ndarray
+
+
+def depth_camera_of(
+    path: Path,
+    chosen: Chosen,
+    first: Mapping[str, Any],
+    infos: Mapping[str, Sequence[Any]],
+    cameras: tuple[Camera | None, tuple[int, int]],
+    transforms: Callable[[], Iterable[Any]],
+    extrinsics: np.ndarray | None,
+) -> DepthCamera | None:
+    """Return the camera of the depth; None if it is that of the images, or the bag does not say.
+
+    first: messages of the two topics. infos: of `CameraInfo`, by topic. cameras: of the images, and width and height of
+    the depth. transforms: reads the messages of tf. extrinsics: [4, 4], depth -> colour, as RealSense publishes it.
+
+    Raises:
+        InputError: the depth is of another camera, and the bag lacks its intrinsics, those of the images, or the
+            extrinsics.
+
+    """
+    image, size = cameras
+    frames = [frame_name(first[topic].header.frame_id) for topic in (chosen.depth, chosen.colour)]
+    stated = all(frames)
+    beside = {name: messages for name, messages in infos.items() if _may_be_of_depth(name, messages, chosen, frames[0])}
+    own = camera_of(path, beside, chosen.depth, size)
+    if own is None and (not stated or frames[0] == frames[1] or is_registered(chosen.depth)):
+        return None
+    if own is not None and own == image and (not stated or frames[0] == frames[1]):
+        return None
+    motion = None
+    if stated:
+        motion = np.eye(4) if frames[0] == frames[1] else motion_between(transforms(), *frames)
+    motion = extrinsics if motion is None else motion
+    motion = np.eye(4) if motion is None and is_registered(chosen.depth) else motion
+    if own is None or image is None or motion is None:
+        raise InputError(_refusal(path, chosen, frames, (own, image), motion))
+    return DepthCamera(own, motion)
+
+
+def _may_be_of_depth(info: str, messages: Sequence[Any], chosen: Chosen, frame: str) -> bool:
+    """Return whether a camera beside both topics may be the depth's: it has the depth's frame, or none."""
+    if not messages or not is_beside(info, chosen.depth):
+        return False
+    return not is_beside(info, chosen.colour) or frame_name(messages[0].header.frame_id) in ("", frame)
+
+
+def _refusal(
+    path: Path,
+    chosen: Chosen,
+    frames: Sequence[str],
+    cameras: tuple[Camera | None, Camera | None],
+    motion: np.ndarray | None,
+) -> str:
+    missing = [
+        f"the `CameraInfo` of `{topic}`"
+        for topic, camera in zip((chosen.depth, chosen.colour), cameras, strict=True)
+        if camera is None
+    ]
+    missing += ["how its frame lies in that of the images (`/tf_static`)"] if motion is None else []
+    depth, image = (_described(*one) for one in zip(cameras, frames, strict=True))
+    return (
+        f"`{path}`: the depth of `{chosen.depth}` is that of another camera ({depth}) than the images of "
+        f"`{chosen.colour}` ({image}), and cannot be registered to them: {' and '.join(missing)} is missing; record "
+        "depth that is registered to the images (RealSense: `align_depth`, "
+        "`/camera/aligned_depth_to_color/image_raw`), or what is missing, too; or leave it out with --rgb-only"
+    )
+
+
+def _described(camera: Camera | None, frame: str) -> str:
+    lens = "intrinsics not stated"
+    if camera is not None:
+        fx, fy, cx, cy = camera.intrinsics
+        lens = f"f = {fx:.1f}, {fy:.1f}, centre {cx:.1f}, {cy:.1f}"
+    return f"{lens}, frame `{frame}`" if frame else lens
+
+
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+"""Types of the messages: of ROS 2 and of ROS 1 since 2013, and those before."""
+_SAME = 1e-6
+"""Change of a matrix that the digits of a publisher that repeats itself make."""
+
+
+def frame_name(name: str) -> str:
+    """Return a frame without the slash that tf wrote before its name until 2013."""
+    return name.strip().lstrip("/")
+
+
+def motion_between(messages: Iterable[Any], source: str, target: str) -> Float[np.ndarray, "4 4"] | None:
+    """Return float64 [4, 4], coordinates of the frame `source` -> those of `target`; None if no transforms connect
+    them, or they change with time (two moving bodies).
+    """
+    steps: dict[str, dict[str, np.ndarray]] = {}
+    moving = set()
+    for message in messages:
+        for one in message.transforms:
+            parent, child = frame_name(one.header.frame_id), frame_name(one.child_frame_id)
+            pose = _transform_matrix(one.transform)
+            known = steps.get(child, {}).get(parent, pose)
+            if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3]) - 1.0) > _SAME:  # no transform
+                continue
+            if not np.allclose(pose, known, atol=_SAME):
+                moving.add((parent, child))
+            steps.setdefault(child, {})[parent] = pose
+            steps.setdefault(parent, {})[child] = np.linalg.inv(pose)
+    for parent, child in moving:
+        steps[child].pop(parent, None)
+        steps[parent].pop(child, None)
+    return _along(steps, source, target)
+
+
+def _along(steps: Mapping[str, Mapping[str, np.ndarray]], source: str, target: str) -> np.ndarray | None:
+    reached, waiting = {source: np.eye(4)}, [source]
+    while waiting and target not in reached:
+        frame = waiting.pop(0)
+        for other, step in steps.get(frame, {}).items():
+            if other not in reached:
+                reached[other] = step @ reached[frame]
+                waiting.append(other)
+    return reached.get(target)
+
+
+def _transform_matrix(transform: Any) -> np.ndarray:
+    place, turn = transform.translation, transform.rotation
+    quaternion = np.array([[turn.x, turn.y, turn.z, turn.w]])
+    return poses_of(np.array([[place.x, place.y, place.z]]), quaternion)[0]

@@ -2,7 +2,7 @@
 
 Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage`; colour before grey and infrared),
 depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
-any other; depth with a camera of its own is registered by what the bag states of it, `bag_depth.py`), the camera's
+any other; depth with a camera of its own is registered by what the bag states of it, `bag_cameras.py`), the camera's
 `CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
 name contains `truth`, `gt`, `vicon` or `mocap`. A choice among several is reported.
 """
@@ -16,11 +16,17 @@ from typing import Any, Self
 
 import numpy as np
 
-from vggtgeo.datasets.bag_cameras import CAMERA_INFO, camera_of
-from vggtgeo.datasets.bag_depth import DepthCamera, depth_camera_of
-from vggtgeo.datasets.bag_images import Unread, image_of, metres_of
-from vggtgeo.datasets.bag_topics import IMAGES, Chosen, chosen_topics, described_choice, truth_topic
-from vggtgeo.datasets.bag_transforms import TRANSFORMS, frame_name
+from vggtgeo.datasets.bag_cameras import CAMERA_INFO, TRANSFORMS, DepthCamera, camera_of, depth_camera_of, frame_name
+from vggtgeo.datasets.bag_images import (
+    IMAGES,
+    Chosen,
+    Unread,
+    chosen_topics,
+    described_choice,
+    image_of,
+    metres_of,
+    truth_topic,
+)
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import orientation_message
 from vggtgeo.datasets.intrinsics import guess_with_warning
@@ -258,15 +264,10 @@ def _depth_camera(
             height, width = metres_of(message, _place(path, chosen.depth, number)).shape
         except InputError:
             continue
-        transforms = lambda: _transforms(reader)
+        transforms = lambda: _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
         cameras = camera, (width, height)
         return depth_camera_of(path, chosen, first, infos, cameras, transforms, _extrinsics(reader))
     return None
-
-
-def _transforms(reader: Any) -> Iterator[Any]:
-    """Return the undamaged messages of tf."""
-    return _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
 
 
 def _extrinsics(reader: Any) -> np.ndarray | None:

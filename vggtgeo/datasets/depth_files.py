@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MAX_PIXELS, decoded, file_content
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MAX_BYTES, MAX_PIXELS, decoded
 from vggtgeo.io.archives import UNREADABLE, array_header
 from vggtgeo.io.errors import InputError, install_hint
+from vggtgeo.io.text_files import content_of
 
 DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
 _EXR_DEPTH = re.compile(r"(.*[.])?(z|depth|depth[.]v|y|v|r)", re.IGNORECASE)
@@ -91,12 +92,12 @@ def read_codes(path: Path) -> np.ndarray:
         return _array(path)
     if path.suffix.lower() == ".exr":
         return exr_depth(path)
-    return decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
+    return decoded(content_of(path, MAX_BYTES), path, cv2.IMREAD_UNCHANGED)
 
 
 def _array(path: Path) -> np.ndarray:
     """Return the array of an `.npy` file; pickles are not opened, and the declared size is checked first."""
-    content = file_content(path)
+    content = content_of(path, MAX_BYTES)
     try:
         stream = io.BytesIO(content)
         header = array_header(stream)
@@ -118,7 +119,7 @@ def exr_depth(path: Path) -> np.ndarray:
         import OpenEXR
     except ImportError:
         raise InputError(f"`{path}` needs the package OpenEXR; {install_hint('phones')}") from None
-    file_content(path)  # OpenEXR names no reason
+    content_of(path, MAX_BYTES)  # OpenEXR names no reason
     try:
         header = OpenEXR.File(str(path), header_only=True).header()
         (left, top), (right, bottom) = header["dataWindow"]

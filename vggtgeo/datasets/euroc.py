@@ -19,7 +19,6 @@ from vggtgeo.datasets.pose_files import (
     parsing,
     poses_of,
     read_matrices,
-    read_text,
     states_list,
     trajectory_of,
     yaml_numbers,
@@ -83,7 +82,7 @@ def _camera(sensor: Path, width: int, height: int) -> Camera:
         check_size(sensor, yaml_numbers(sensor, "resolution", 2), (width, height))
     intrinsics = intrinsics_of(sensor, yaml_numbers(sensor, "intrinsics"))
     coefficients = yaml_numbers(sensor, "distortion_coefficients")
-    found = _MODEL.search(read_text(sensor))
+    found = _MODEL.search(whole_text(sensor))
     fisheye = is_fisheye(f"`{sensor}`: `distortion_model`", found.group(1) if found else "")
     try:
         return Camera(intrinsics, width, height, check_distortion(coefficients), fisheye=fisheye)

@@ -96,8 +96,9 @@ class FolderSequence:
         return self._read_all(self.files[start:end:stride])
 
     def ground_truth(self) -> Trajectory | None:
-        """Return None; layouts with ground truth override it."""
-        return None
+        """Return the poses of `groundtruth.txt` (TUM format), None without it; layouts with others override it."""
+        file = self.folder / "groundtruth.txt"
+        return Trajectory.load_tum(file) if file.exists() else None
 
     @property
     def truth_in_metres(self) -> bool:

@@ -25,11 +25,12 @@ from vggtgeo.datasets.depth_files import FIVE_THOUSANDTHS, metres_of_floats
 from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import guess_with_warning
-from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of, read_matrices, read_text, trajectory_of
+from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of, read_matrices, trajectory_of
 from vggtgeo.datasets.tum import MAX_LETTERS, read_pairs
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import whole_text
 
 _CAMERA, _SIZE = (481.20, 480.00, 319.50, 239.50), (640, 480)
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -130,7 +131,7 @@ class IclNuimRaw(FolderSequence):
         """Return the depth along the optical axis, float32, NaN for none; InputError for another count of numbers."""
         width, height = self.camera.width, self.camera.height
         with parsing(path, f"{width} x {height} distances, metres"):
-            distances = np.array(read_text(path).split(), np.float32).reshape(height, width)
+            distances = np.array(whole_text(path).split(), np.float32).reshape(height, width)
         fx, fy, cx, cy = self.camera.intrinsics
         across, down = (np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy
         return metres_of_floats(distances / np.sqrt(1.0 + across**2 + down[:, None] ** 2))
@@ -150,7 +151,7 @@ def _images(folder: Path) -> Iterable[Path]:
 
 def _pose(file: Path) -> Float[np.ndarray, "4 4"]:
     """Return camera -> world, the camera's y up."""
-    text = read_text(file)
+    text = whole_text(file)
     place, ahead, up = (_vector(file, text, name) for name in ("cam_pos", "cam_dir", "cam_up"))
     pose = np.eye(4)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # no direction: a pose that is none, left out

@@ -19,6 +19,7 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import content_of
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 OTHER_PICTURES = frozenset({".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".dng", ".raw", ".cr2", ".nef", ".arw"})
@@ -71,7 +72,7 @@ def read_image_file(path: Path, min_bits: int = 8) -> ImageFile:
 
     min_bits: the least number of bits of a 16-bit image, however dark it is: that of the images before it.
     """
-    return image_in(file_content(path), path, min_bits)
+    return image_in(content_of(path, MAX_BYTES), path, min_bits)
 
 
 def image_in(content: bytes, path: Path, min_bits: int = 8) -> ImageFile:
@@ -140,19 +141,6 @@ def is_there(path: Path) -> bool:
         return path.exists()
     except (OSError, ValueError):
         return False
-
-
-def file_content(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """Return the content of a regular file; raise InputError if it is larger, or cannot be read."""
-    try:
-        if path.exists() and not path.is_file():  # a pipe has no end
-            raise InputError(f"`{path}` is not a regular file")
-        size = path.stat().st_size
-        if size > max_bytes:
-            raise InputError(f"`{path}` has {size} bytes; at most {max_bytes} are read")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"`{path}` cannot be read: {error.strerror or error}") from None
 
 
 def decoded(content: bytes, path: Path, flags: int) -> np.ndarray:

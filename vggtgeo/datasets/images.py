@@ -9,7 +9,6 @@ from typing import Self
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES
 from vggtgeo.datasets.intrinsics import camera_or_guess
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 
 FRAMES_PER_SECOND = 30.0
@@ -48,11 +47,6 @@ class ImageFolder(FolderSequence):
         times = times_by_name(images)
         frames = [(time, image, None) for time, image in sorted(zip(times, images, strict=True))]
         return cls.listed(folder, frames, lambda *size: camera_or_guess(folder, *size))
-
-    def ground_truth(self) -> Trajectory | None:
-        """Return the ground truth, if the folder has it."""
-        file = self.folder / "groundtruth.txt"
-        return Trajectory.load_tum(file) if file.exists() else None
 
 
 def warn_of_unread(folder: Path, images: list[Path]) -> None:

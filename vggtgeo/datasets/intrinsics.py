@@ -94,7 +94,12 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
             check_plausible(f"`{file}`", camera)
             warn_of_other_size(f"`{file}`", camera)
             return camera
-    return _camera_of_record3d(folder / "metadata.json", width, height)
+    file = folder / "metadata.json"
+    content = read_json(file) if file.is_file() else None
+    if not isinstance(content, dict) or not {"K", "w", "h"} <= content.keys():  # another program's
+        return None
+    same = same_size((content["w"], content["h"]), (width, height))
+    return camera_of_record3d(file, content, width, height) if same else None
 
 
 def camera_or_guess(folder: Path, width: int, height: int) -> Camera:
@@ -102,21 +107,9 @@ def camera_or_guess(folder: Path, width: int, height: int) -> Camera:
     return camera_from_folder(folder, width, height) or guess_with_warning(str(folder), width, height)
 
 
-def _camera_of_record3d(file: Path, width: int, height: int) -> Camera | None:
-    """Return the camera of the metadata of an export of Record3D; None for another program's file."""
-    content = read_json(file) if file.is_file() else None
-    if not isinstance(content, dict) or not {"K", "w", "h"} <= content.keys():
-        return None
-    if not same_size((content["w"], content["h"]), (width, height)):
-        return None
-    camera = Camera(record3d_intrinsics(file, content), width, height)
-    check_plausible(f"`{file}`", camera)
-    return camera
-
-
-def record3d_intrinsics(file: Path, content: Mapping[str, Any]) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy of Record3D's metadata: the median over frames (autofocus changes them slightly), else the
-    matrix `K`, by columns; raise InputError if they are invalid.
+def camera_of_record3d(file: Path, content: Mapping[str, Any], width: int, height: int) -> Camera:
+    """Return the camera of Record3D's metadata: the median over frames (autofocus changes them slightly), else the
+    matrix `K`, by columns; raise InputError if it is invalid.
     """
     frames = content.get("perFrameIntrinsicCoeffs")
     with parsing(file, "nine numbers `K`, or four of each frame in `perFrameIntrinsicCoeffs`"):
@@ -124,7 +117,9 @@ def record3d_intrinsics(file: Path, content: Mapping[str, Any]) -> tuple[float, 
             values = np.median(np.array(frames, np.float64).reshape(len(frames), 4), axis=0)
         else:
             values = np.array(content["K"], np.float64).reshape(9)[[0, 4, 6, 7]]
-        return check_intrinsics(tuple(values.tolist()))
+        camera = Camera(check_intrinsics(tuple(values.tolist())), width, height)
+    check_plausible(f"`{file}`", camera)
+    return camera
 
 
 def check_plausible(where: str, camera: Camera) -> None:

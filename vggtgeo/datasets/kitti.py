@@ -15,7 +15,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_or_guess, intrinsics_of
-from vggtgeo.datasets.pose_files import numbers_of, parsing, read_matrices, trajectory_of_rows
+from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of_rows, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning
@@ -79,9 +79,7 @@ class Kitti(FolderSequence):
         file = next((file for file in places if file.is_file()), None)
         if file is None:
             return None
-        rows = read_matrices(file, 12)
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, :3] = rows.reshape(-1, 3, 4)
+        poses = poses_of_rows(read_matrices(file, 12))
         poses[:, :3, 3] += self.baseline * poses[:, :3, 0]
         lines = rows_of([one.image for one in self.files], len(poses))  # another list than that of times, maybe cut
         return trajectory_of_rows([one.timestamp for one in self.files], lines, poses, file)

@@ -10,10 +10,11 @@ from typing import Any, Self
 
 import cv2
 
-from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.frame import Frame, check_range
+from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning
 
 _WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
 """Digits of a webcam's number."""
@@ -55,14 +56,7 @@ class LiveCamera:
                 InputWarning,
                 stacklevel=3,
             )
-        camera = Camera.guess(width, height)
-        warnings.warn(
-            f"`{_public(source)}`: the camera is unknown and is estimated, beginning with a focal length of "
-            f"{camera.intrinsics[0]:.0f} pixels. To give it: --intrinsics fx,fy,cx,cy",
-            GuessedCameraWarning,
-            stacklevel=3,
-        )
-        return cls(source, camera)
+        return cls(source, guess_with_warning(_public(source), width, height))
 
     @property
     def name(self) -> str:
@@ -76,8 +70,7 @@ class LiveCamera:
         """Return the frames start, start + stride, ... below end as they arrive; frames that are not requested in time
         are lost.
         """
-        if stride < 1 or start < 0 or (end is not None and end <= start):
-            raise InputError(f"`start` is {start}, `end` {end}, `stride` {stride}; they must select a frame")
+        check_range(start, end, stride)
         return self._read(start, end, stride)
 
     def ground_truth(self) -> Trajectory | None:

@@ -44,7 +44,7 @@ def parsing(file: Path, expected: str) -> Iterator[None]:
 def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
     """Return lines of `columns` numbers, separated by blanks or commas; raise InputError naming an invalid line."""
     rows = []
-    for number, line in enumerate(read_text(file).splitlines(), start=1):
+    for number, line in enumerate(whole_text(file).splitlines(), start=1):
         words = line.split(skip, 1)[0].replace(",", " ").split()
         if not words:
             continue
@@ -60,7 +60,7 @@ def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray
 
 def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
     """Return one matrix; raise InputError if the file is missing or has another number of values."""
-    text = read_text(file)
+    text = whole_text(file)
     try:
         return np.array(text.replace(",", " ").split(), np.float64).reshape(shape)
     except ValueError:
@@ -115,6 +115,13 @@ def trajectory_of_rows(
     return trajectory_of([times[place] for place in there], poses[[rows[place] for place in there]], where)
 
 
+def poses_of_rows(rows: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 4 4"]:
+    """Return matrices of their upper three rows, as KITTI writes them."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    return poses
+
+
 def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
     """Return matrices of positions [n, 3] and quaternions [n, 4], x y z w; the rotation is 0 if the length of a
     quaternion is not about 1.
@@ -135,7 +142,7 @@ def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
 
     Raises InputError if it is missing, or does not have `count` values (None: any number).
     """
-    found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", read_text(file), re.MULTILINE)
+    found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", whole_text(file), re.MULTILINE)
     if found is None:
         raise InputError(f"`{file}` has no list `{key}: [...]`")
     words = found.group(1).replace(",", " ").split()
@@ -146,7 +153,7 @@ def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
 
 def states_list(file: Path, key: str) -> bool:
     """Return whether a YAML file has a list `key: [...]`."""
-    return re.search(rf"^\s*{re.escape(key)}\s*:\s*\[", read_text(file), re.MULTILINE) is not None
+    return re.search(rf"^\s*{re.escape(key)}\s*:\s*\[", whole_text(file), re.MULTILINE) is not None
 
 
 def numbers_of(words: Sequence[str], what: str) -> list[float]:
@@ -157,19 +164,9 @@ def numbers_of(words: Sequence[str], what: str) -> list[float]:
         raise InputError(f"{what} is {' '.join(words)[:60]!r}; expected numbers") from None
 
 
-def read_text(file: Path) -> str:
-    """Return the text of a file, invalid UTF-8 replaced; raise InputError if it cannot be read."""
-    try:
-        if file.exists() and not file.is_file():  # a pipe has no end
-            raise InputError(f"`{file}` is not a regular file")
-        return whole_text(file)
-    except OSError as error:
-        raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None
-
-
 def read_json(file: Path) -> Any:
     """Return the content of a JSON file; raise InputError if it is not valid JSON."""
-    return json_in(read_text(file), file)
+    return json_in(whole_text(file), file)
 
 
 def json_in(content: str | bytes, where: Path) -> Any:
@@ -239,7 +236,7 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
 
 def _columns(file: Path) -> int:
     """Return the number of columns of the first line with any."""
-    lines = (line.split("#", 1)[0].replace(",", " ").split() for line in read_text(file).splitlines())
+    lines = (line.split("#", 1)[0].replace(",", " ").split() for line in whole_text(file).splitlines())
     return len(next((words for words in lines if words), ()))
 
 
@@ -250,8 +247,7 @@ def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:
             f"`{file}` has poses without times (12 columns, KITTI), and {len(rows)} of them beside {len(clock)} of the "
             "truth; give one for each of those, or a file with times, `timestamp tx ty tz qx qy qz qw`"
         )
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows.reshape(-1, 3, 4)
+    poses = poses_of_rows(rows)
     times = np.arange(float(len(rows))) if clock is None else clock.timestamps
     found = _with_poses(times, poses, file)
     rounded = len(found) == len(poses) and np.abs(found.poses - poses).max() < _ROUNDING

@@ -27,9 +27,9 @@ import numpy as np
 
 from vggtgeo.datasets.depth_files import metres_of_floats, read_depth
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, file_content, image_in
+from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, image_in
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
-from vggtgeo.datasets.intrinsics import check_plausible, guess_with_warning, record3d_intrinsics
+from vggtgeo.datasets.intrinsics import camera_of_record3d, guess_with_warning
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.datasets.pose_files import json_in, parsing, poses_of, same_size, trajectory_of
 from vggtgeo.geometry.camera import Camera
@@ -37,6 +37,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError, InputWarning, install_hint
 from vggtgeo.io.text_files import MAX_BYTES as MAX_TEXT
+from vggtgeo.io.text_files import content_of
 
 SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"
@@ -148,7 +149,7 @@ class Record3d(FolderSequence):
     def _content(self, path: Path, most: int = MAX_BYTES) -> bytes:
         """Return the content of a file in the folder or archive; at most `most` bytes."""
         if self.folder.is_dir():
-            return file_content(path, most)
+            return content_of(path, most)
         try:
             part = self._archive.getinfo(path.relative_to(self.folder).as_posix())
             return self._archive.read(part)
@@ -236,6 +237,4 @@ def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -
         return None
     if not {"K", "perFrameIntrinsicCoeffs"} & metadata.keys():
         return None
-    camera = Camera(record3d_intrinsics(where, metadata), width, height)
-    check_plausible(f"`{where}`", camera)
-    return camera
+    return camera_of_record3d(where, metadata, width, height)

@@ -43,9 +43,10 @@ class Replica(FolderSequence):
         if not images:
             raise InputError(f"`{folder}` has no `results/frameXXXXXX.jpg`; expected a room of Replica")
         rows = rows_of(images, _poses_in(folder / "traj.txt"))
+        depths = (image.with_name(image.stem.replace("frame", "depth") + ".png") for image in images)
         frames = [
-            ((row - rows[0]) / FRAMES_PER_SECOND, image, existing(_depth(image)))
-            for row, image in zip(rows, images, strict=True)
+            ((row - rows[0]) / FRAMES_PER_SECOND, image, existing(depth))
+            for row, image, depth in zip(rows, images, depths, strict=True)
         ]
         places = (folder / _CAMERA, folder.resolve().parent / _CAMERA)
         file = next((file for file in places if file.is_file()), None)
@@ -66,10 +67,6 @@ def _poses_in(file: Path) -> int | None:
         return len(read_matrices(file, 16))
     except InputError:
         return None
-
-
-def _depth(image: Path) -> Path:
-    return image.with_name(image.stem.replace("frame", "depth") + ".png")
 
 
 class _Stated(NamedTuple):

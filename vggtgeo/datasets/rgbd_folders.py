@@ -20,7 +20,6 @@ from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.datasets.images import image_files, times_by_name, warn_of_unread
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.tum import MAX_DEPTH_DELAY, partners_in_time
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 
 COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
@@ -71,11 +70,6 @@ class RgbdFolders(FolderSequence):
             or guess_with_warning(str(folder), *size)
         )
         return cls.listed(folder, rows, camera)
-
-    def ground_truth(self) -> Trajectory | None:
-        """Return the true poses, if the folder has them."""
-        file = self.folder / "groundtruth.txt"
-        return Trajectory.load_tum(file) if file.exists() else None
 
 
 def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:

@@ -29,11 +29,12 @@ from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import ImageFile
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_of_other_size
-from vggtgeo.datasets.pose_files import have_rotations, numbers_of, parsing, read_matrix, read_text, trajectory_of
+from vggtgeo.datasets.pose_files import have_rotations, numbers_of, parsing, read_matrix, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import whole_text
 
 _COLOUR = frozenset({".jpg", ".jpeg", ".png"})
 
@@ -141,7 +142,7 @@ def _info(folder: Path) -> Path | None:
     own, other = folder / "_info.txt", folder / "info.txt"
     if own.is_file():
         return own
-    return other if other.is_file() and "m_calibration" in read_text(other) else None
+    return other if other.is_file() and "m_calibration" in whole_text(other) else None
 
 
 def _intrinsics(folder: Path, camera: str) -> tuple[float, float, float, float]:
@@ -164,7 +165,7 @@ def _calibration(folder: Path, what: str, camera: str, unstated: np.ndarray | No
     if file.is_file() or info is None:
         return file, unstated if unstated is not None and not file.is_file() else read_matrix(file, (4, 4))
     key = f"m_calibration{camera.capitalize()}{what.capitalize()}"
-    found = re.search(rf"^{key}\s*=(.*)$", read_text(info), re.MULTILINE)
+    found = re.search(rf"^{key}\s*=(.*)$", whole_text(info), re.MULTILINE)
     if found is None and unstated is not None:
         return info, unstated
     with parsing(info, f"`{key}` of 16 numbers"):

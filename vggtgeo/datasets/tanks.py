@@ -13,10 +13,11 @@ from jaxtyping import Bool, Float
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_or_guess
-from vggtgeo.datasets.pose_files import parsing, read_json, read_matrix, read_text, trajectory_of
+from vggtgeo.datasets.pose_files import parsing, read_json, read_matrix, trajectory_of
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import whole_text
 
 _LOG = "_COLMAP_SfM.log"
 _LINES = 5
@@ -141,7 +142,7 @@ def _in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:
     """Return number of the image, and camera -> world, of each pose."""
-    rows = [line.split() for line in read_text(file).splitlines() if line.strip()]
+    rows = [line.split() for line in whole_text(file).splitlines() if line.strip()]
     with parsing(file, "for each pose the number of its image, as in `0 0 0`, and four rows of a matrix"):
         numbers = [int(row[0]) for row in rows[::_LINES]]
         poses = np.array([row for place, row in enumerate(rows) if place % _LINES], np.float64)

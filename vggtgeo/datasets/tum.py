@@ -19,7 +19,6 @@ from vggtgeo.datasets.folder import LATEST, FolderSequence
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.text_files import whole_text
 
@@ -35,7 +34,7 @@ _Frame = tuple[float, Path, Path | None]
 
 @dataclass(frozen=True)
 class TumRgbd(FolderSequence):
-    """One sequence in the layout of the TUM RGB-D benchmark. Truth: `groundtruth.txt`."""
+    """One sequence in the layout of the TUM RGB-D benchmark. Truth: `groundtruth.txt`, at its own times (100 Hz)."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -51,11 +50,6 @@ class TumRgbd(FolderSequence):
         else:
             frames, coding = _of_pairs(file)
         return cls.listed(folder, frames, lambda *size: _camera(folder, *size), coding)
-
-    def ground_truth(self) -> Trajectory | None:
-        """Return the true poses at their own times (100 Hz in the benchmark), not those of the images."""
-        file = self.folder / "groundtruth.txt"
-        return Trajectory.load_tum(file) if file.exists() else None
 
 
 def _camera(folder: Path, width: int, height: int) -> Camera:

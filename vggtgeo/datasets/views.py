@@ -64,11 +64,9 @@ class SequenceView:
         return self.source.ground_truth() if self.has_truth else None
 
 
-def with_intrinsics(
-    sequence: Sequence, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
-) -> Sequence:
+def with_intrinsics(sequence: Sequence, intrinsics: tuple[float, float, float, float]) -> Sequence:
     """Return the sequence with known intrinsics (pixels), replacing those of its folder."""
-    camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height, distortion)
+    camera = Camera(intrinsics, sequence.camera.width, sequence.camera.height)
     check_plausible("`intrinsics`", camera)
     source = replace(sequence, camera=camera) if isinstance(sequence, RosBag) else sequence  # depth is registered to it
     return SequenceView(source, camera, sequence.has_depth)
@@ -118,33 +116,12 @@ def without_depth(sequence: Sequence) -> Sequence:
     return SequenceView(source, sequence.camera, has_depth=False)
 
 
-@dataclass(frozen=True)
-class ReducedSequence:
+class ReducedSequence(SequenceView):
     """`source` with smaller images and depth; `camera` is that of the reduced images."""
-
-    source: Sequence
-    camera: Camera
-
-    @property
-    def name(self) -> str:
-        """Return the name of the source."""
-        return self.source.name
-
-    @property
-    def has_depth(self) -> bool:
-        """Return whether the source has depth."""
-        return self.source.has_depth
-
-    def __len__(self) -> int:
-        return len(self.source)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
         """See `Sequence.frames`."""
         return _reduced_frames(self.source.frames(start, end, stride), self.source.camera, self.camera)
-
-    def ground_truth(self) -> Trajectory | None:
-        """Return the truth of the source."""
-        return self.source.ground_truth()
 
 
 @overload
@@ -164,7 +141,7 @@ def reduced(source: Sequence | FrameStream, max_pixels: int) -> Sequence | Frame
         return source
     if isinstance(source, FrameStream):
         return replace(source, camera=camera, source=_reduced_frames(source.source, source.camera, camera))
-    return ReducedSequence(source, camera)
+    return ReducedSequence(source, camera, source.has_depth)
 
 
 def reduced_camera(camera: Camera, max_pixels: int) -> Camera:

@@ -1,57 +1,36 @@
 """Metrics of trajectories, depth and maps: functions on arrays and trajectories, without files or printing."""
 
-from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
-from vggtgeo.evaluation.alignment import ALIGNMENTS, Alignment, Similarity, align, heading, umeyama
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, nearest_in_time
-from vggtgeo.evaluation.calibration import focal_error, scale_error
-from vggtgeo.evaluation.clouds import CloudError, cloud_error
-from vggtgeo.evaluation.comparability import Comparability, comparability
-from vggtgeo.evaluation.consistency import Consistency, consistency, pose_consistency
-from vggtgeo.evaluation.depth import DepthError, depth_error, depth_of_cloud
-from vggtgeo.evaluation.meshes import Mesh, mesh_error, surface_points
-from vggtgeo.evaluation.offsets import Offsets, estimate_offsets, shifted
-from vggtgeo.evaluation.relative import UNITS, RelativeError, Unit, relative_error, rotation_angle
-from vggtgeo.evaluation.report import TrajectoryReport, coverage, evaluate_trajectory, followed
-from vggtgeo.evaluation.statistics import ErrorStatistics
-
-__all__ = [
-    "ALIGNMENTS",
-    "MAX_TIME_DIFFERENCE",
-    "UNITS",
-    "AbsoluteError",
-    "Alignment",
-    "CloudError",
-    "Comparability",
-    "Consistency",
-    "DepthError",
-    "ErrorStatistics",
-    "Mesh",
-    "Offsets",
-    "RelativeError",
-    "Similarity",
-    "TrajectoryReport",
-    "Unit",
-    "absolute_error",
-    "align",
-    "associate",
-    "cloud_error",
-    "comparability",
-    "consistency",
-    "coverage",
-    "depth_error",
-    "depth_of_cloud",
-    "estimate_offsets",
-    "evaluate_trajectory",
-    "focal_error",
-    "followed",
-    "heading",
-    "mesh_error",
-    "nearest_in_time",
-    "pose_consistency",
-    "relative_error",
-    "rotation_angle",
-    "scale_error",
-    "shifted",
-    "surface_points",
-    "umeyama",
-]
+from vggtgeo.evaluation.absolute import AbsoluteError as AbsoluteError
+from vggtgeo.evaluation.absolute import ErrorStatistics as ErrorStatistics
+from vggtgeo.evaluation.absolute import absolute_error as absolute_error
+from vggtgeo.evaluation.alignment import ALIGNMENTS as ALIGNMENTS
+from vggtgeo.evaluation.alignment import Alignment as Alignment
+from vggtgeo.evaluation.alignment import Similarity as Similarity
+from vggtgeo.evaluation.alignment import align as align
+from vggtgeo.evaluation.alignment import heading as heading
+from vggtgeo.evaluation.alignment import umeyama as umeyama
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE as MAX_TIME_DIFFERENCE
+from vggtgeo.evaluation.association import associate as associate
+from vggtgeo.evaluation.association import nearest_in_time as nearest_in_time
+from vggtgeo.evaluation.comparability import Comparability as Comparability
+from vggtgeo.evaluation.comparability import comparability as comparability
+from vggtgeo.evaluation.consistency import Consistency as Consistency
+from vggtgeo.evaluation.consistency import consistency as consistency
+from vggtgeo.evaluation.consistency import pose_consistency as pose_consistency
+from vggtgeo.evaluation.maps import CloudError as CloudError
+from vggtgeo.evaluation.maps import DepthError as DepthError
+from vggtgeo.evaluation.maps import cloud_error as cloud_error
+from vggtgeo.evaluation.maps import depth_error as depth_error
+from vggtgeo.evaluation.maps import surface_points as surface_points
+from vggtgeo.evaluation.offsets import Offsets as Offsets
+from vggtgeo.evaluation.offsets import estimate_offsets as estimate_offsets
+from vggtgeo.evaluation.offsets import shifted as shifted
+from vggtgeo.evaluation.relative import UNITS as UNITS
+from vggtgeo.evaluation.relative import RelativeError as RelativeError
+from vggtgeo.evaluation.relative import Unit as Unit
+from vggtgeo.evaluation.relative import relative_error as relative_error
+from vggtgeo.evaluation.relative import rotation_angle as rotation_angle
+from vggtgeo.evaluation.report import TrajectoryReport as TrajectoryReport
+from vggtgeo.evaluation.report import coverage as coverage
+from vggtgeo.evaluation.report import evaluate_trajectory as evaluate_trajectory
+from vggtgeo.evaluation.report import followed as followed

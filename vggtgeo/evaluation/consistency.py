@@ -16,7 +16,9 @@ from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, check_trajectori
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_positive, check_real, real_array, real_numbers
+from vggtgeo.io.given import check_positive, real_array, real_numbers
+
+LEVEL = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,47 +26,30 @@ class Consistency:
     """Fields:
     nees: float64 [n], of each error.
     degrees: dimension of an error, the expected NEES for correct covariances.
-    low, high: interval of the mean for correct covariances and independent errors, with probability `level`.
-    level: probability of the interval.
+    low, high: interval of the mean for correct covariances and independent errors, with probability `LEVEL`.
     """
 
     nees: Float[np.ndarray, " n"]
     degrees: int
     low: float
     high: float
-    level: float
 
     @property
     def mean(self) -> float:
         """Mean NEES. Above `high` the covariances are too small (overconfident), below `low` too large."""
         return float(self.nees.mean())
 
-    @property
-    def consistent(self) -> bool:
-        """Whether the mean is within the interval."""
-        return self.low <= self.mean <= self.high
 
-    @property
-    def inflation(self) -> float:
-        """Factor on the standard deviations that makes the mean NEES equal to `degrees`."""
-        return float(np.sqrt(self.mean / self.degrees))
-
-
-def consistency(
-    errors: Float[np.ndarray, "n k"], covariances: Float[np.ndarray, "n k k"], level: float = 0.95
-) -> Consistency:
+def consistency(errors: Float[np.ndarray, "n k"], covariances: Float[np.ndarray, "n k k"]) -> Consistency:
     """Return the NEES of `errors` with their `covariances`, in the same coordinates and units.
 
-    InputError for wrong shapes, no error, NaN, a covariance that is not positive definite, or an invalid level.
+    InputError for wrong shapes, no error, NaN, or a covariance that is not positive definite.
     """
     errors, covariances = real_numbers("errors", errors), real_numbers("covariances", covariances)
-    check_real("level", level)
     if errors.ndim != 2 or not errors.size or covariances.shape != (*errors.shape, errors.shape[1]):
         raise InputError(
             f"`errors` has shape {errors.shape}, `covariances` {covariances.shape}; expected [n, k] and [n, k, k]"
         )
-    if not 0 < level < 1:
-        raise InputError(f"`level` must be between 0 and 1, got {level}")
     if not (np.isfinite(errors).all() and np.isfinite(covariances).all()):
         raise InputError("`errors` and `covariances` must be finite; leave rows with NaN or infinity out")
     try:
@@ -73,8 +58,8 @@ def consistency(
         raise InputError("`covariances` must be positive definite") from None
     white = np.linalg.solve(factors, errors[..., None])[..., 0]
     count, degrees = errors.shape
-    low, high = chi2.ppf([0.5 * (1 - level), 0.5 * (1 + level)], count * degrees) / count
-    return Consistency((white**2).sum(axis=1), degrees, float(low), float(high), level)
+    low, high = chi2.ppf([0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], count * degrees) / count
+    return Consistency((white**2).sum(axis=1), degrees, float(low), float(high))
 
 
 def pose_consistency(

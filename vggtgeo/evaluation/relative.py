@@ -12,8 +12,8 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float, Int
 
+from vggtgeo.evaluation.absolute import ErrorStatistics
 from vggtgeo.evaluation.association import check_trajectories
-from vggtgeo.evaluation.statistics import ErrorStatistics
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_real, real_array

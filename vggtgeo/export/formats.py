@@ -214,7 +214,7 @@ def _record(output: Path, names: list[str], ours: bool) -> None:
     record = output / _RECORD
     try:
         known = set(whole_text(record, errors="strict").splitlines())
-    except (OSError, UnicodeDecodeError):
+    except ValueError:  # no such file, or no text
         known = set()
     foreign = [name for name in names if name not in known and os.path.lexists(output / name)]
     if foreign and not ours:

@@ -70,7 +70,8 @@ def interruption() -> Iterator[Interruption]:
         yield Interruption()
         return
     before = {number: signal.getsignal(number) for number in _signals()}
-    outer = next((owner for handler in before.values() if isinstance(owner := _owner(handler), Interruption)), None)
+    owners = (getattr(handler, "__self__", None) for handler in before.values())
+    outer = next((owner for owner in owners if isinstance(owner, Interruption)), None)
     if outer is not None:
         yield outer
         return
@@ -88,7 +89,3 @@ def interruption() -> Iterator[Interruption]:
 def _signals() -> list[signal.Signals]:
     """Return the signals that this system has."""
     return [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-
-
-def _owner(handler: Any) -> Any:
-    return getattr(handler, "__self__", None)

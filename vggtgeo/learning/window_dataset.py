@@ -164,7 +164,7 @@ class WindowDataset:
         try:
             index = json.loads(whole_text(place / _INDEX, errors="strict"))
             version, count = index["version"], index["windows"]
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"`{place}` is no complete folder of windows; write one first") from None
         if type(version) is not int or version != VERSION:
             raise InputError(f"`{place / _INDEX}` is of version {version!r:.20}; this program reads {VERSION}")

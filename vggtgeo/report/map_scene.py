@@ -113,7 +113,8 @@ def map_scene(
     points, path = place(shown.points), place(trajectory.positions)
     low, high = _box(points, path)
     extent = max(float(np.linalg.norm(high - low)), 1e-6)
-    arrays: dict[str, np.ndarray] = {"palette": _palette()}
+    palette = np.asarray(255 * mpl.colormaps["viridis"](np.arange(256))[:, :3], np.uint8)
+    arrays: dict[str, np.ndarray] = {"palette": palette}
     box = _add_quantised(arrays, "points", points)
     arrays["colours"] = shown.colours
     if shown.confidence is not None:
@@ -188,10 +189,6 @@ def _spacing(points: np.ndarray) -> float:
         return 0.0
     asked = points[:: max(1, len(points) // _SPACING_SAMPLES)]
     return float(np.median(cKDTree(points).query(asked, k=2)[0][:, 1]))
-
-
-def _palette() -> UInt8[np.ndarray, "256 3"]:
-    return np.asarray(255 * mpl.colormaps["viridis"](np.arange(256))[:, :3], np.uint8)
 
 
 def _thinned(positions: np.ndarray) -> Float[np.ndarray, "n 3"]:

@@ -17,8 +17,7 @@ from vggtgeo.io.files import write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
 from vggtgeo.report.map_scene import map_scene, pictured
-from vggtgeo.report.templates import style, template
-from vggtgeo.report.viewer import INSTALL, has_viewer, view_html
+from vggtgeo.report.viewer import INSTALL, has_viewer, style, template, view_html
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe

@@ -1,4 +1,5 @@
-"""The 3D view as HTML that needs nothing else: the scene, K3D-jupyter's JavaScript, and a script of ours between them.
+"""Templates of all pages, and the 3D view as HTML that needs nothing else: the scene, K3D-jupyter's JavaScript, and a
+script of ours between them.
 
 K3D-jupyter (MIT) is optional: it draws with WebGL, and its JavaScript comes in its wheel. Without it there is no view.
 """
@@ -15,14 +16,27 @@ from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
+import jinja2
+
 from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import write_text
 from vggtgeo.report.map_scene import MapScene
-from vggtgeo.report.templates import style, template
 
 INSTALL = install_hint("viewer")
 _HEIGHT = 640
 """Of the view in a notebook, pixels."""
+
+
+def template(package: str, name: str) -> jinja2.Template:
+    """Load a page's template, a file of `package`, with autoescaping."""
+    text = (files(package) / name).read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(text)
+
+
+def style() -> str:
+    """Return the style sheet of all pages: light and dark mode, desktop and phone."""
+    return (files("vggtgeo.report") / "style.css").read_text(encoding="utf-8")
 
 
 def has_viewer() -> bool:

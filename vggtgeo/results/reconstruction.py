@@ -22,10 +22,9 @@ from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.checkpoints import digest_of_map, load_checkpoint, run_identity
-from vggtgeo.results.pose_prior import PosePrior, with_pose_prior
 from vggtgeo.results.result import Result, RunRecord
 from vggtgeo.results.run_options import RunOptions
-from vggtgeo.results.source import Source, open_source, reduction_summary
+from vggtgeo.results.source import PosePrior, Source, open_source, reduction_summary, with_pose_prior
 from vggtgeo.results.summary import compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import RunCallbacks, Tracked, TrackingLoop
 from vggtgeo.slam.callback import Callback
@@ -44,7 +43,7 @@ from vggtgeo.slam.perception.static_overlay import (
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
-from vggtgeo.slam.self_calibration import MAX_PASSES, self_calibrate
+from vggtgeo.slam.self_calibration import CALIBRATION_FRAMES, MAX_PASSES, self_calibrate
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
@@ -252,7 +251,7 @@ def _calibrate(
     Warnings and refusals are restored: the run itself reports them.
     """
     start, _, stride = selection
-    count = min(source.count(*selection) or 0, settings.camera.calibration_frames)
+    count = min(source.count(*selection) or 0, CALIBRATION_FRAMES)
     if source.camera.known or not count or not settings.refinement.global_adjustment:
         return None
     end = start + count * stride

@@ -1,4 +1,6 @@
-"""The input of a run: a folder, a file, a sequence or a stream of images; opened, validated, reduced in size."""
+"""The input of a run: a folder, a file, a sequence or a stream of images; opened, validated, reduced in size; and the
+poses that it is given as a prior.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +19,23 @@ from jaxtyping import UInt8
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence
 from vggtgeo.datasets.frame import check_selection
 from vggtgeo.datasets.in_memory import FrameStream, frame_stream
+from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.datasets.views import reduced
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.given import check_kind
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.summary import lens_parameters
 from vggtgeo.simulation.sequence import SyntheticSequence
+from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
 
 MIN_SIDE = 32
 """Pixels: the windows of features and of the image pyramid need as many."""
+RECORDED = "recorded"
+PosePrior = str | os.PathLike[str] | Trajectory | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,3 +160,28 @@ def reduction_summary(source: Source, slam: Slam) -> dict[str, Any]:
     camera = dict(zip(("fx", "fy", "cx", "cy"), original.intrinsics, strict=True))
     lens = {} if slam.camera.lens is None else {"lens": lens_parameters(enlarge(slam.camera.lens))}
     return {"images_reduced": {"from": read, "to": size, "intrinsics_as_read": camera}, **lens}
+
+
+def with_pose_prior(source: Source, given: PosePrior) -> tuple[Source, RecordedPoses | None]:
+    """Return the source and the prior; poses of the recording are its prior or its ground truth, never both.
+
+    Raises InputError if the source has no recorded poses, or the file cannot be read.
+    """
+    check_kind(
+        "pose_prior",
+        given,
+        str | os.PathLike | Trajectory | None,
+        "'recorded', a file of poses, a `vggtgeo.Trajectory`, or None",
+    )
+    if given is None:
+        return source, None
+    if isinstance(given, Trajectory):
+        return source, RecordedPoses(given)
+    if given != RECORDED:
+        return source, RecordedPoses(load_trajectory(Path(given)))
+    if source.truth is None:
+        raise InputError(
+            f"`pose_prior` is 'recorded', but `{source.name}` has no recorded poses; give a file of poses (`timestamp "
+            "tx ty tz qx qy qz qw`), or None"
+        )
+    return replace(source, truth=None), RecordedPoses(source.truth, metres=source.truth_in_metres)

@@ -166,7 +166,7 @@ def read_summary(folder: Path) -> tuple[dict[str, Any], Verdict]:
     try:
         summary = json.loads(whole_text(folder / "summary.json", errors="strict"))
         return summary, Verdict.from_dict(summary["verdict"], summary["scale"] == "metric")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise summary_error(folder, error) from None
 
 
@@ -183,8 +183,6 @@ def describe_error(error: Exception) -> str:
         return f"`{error.args[0]}` is missing"
     if isinstance(error, TypeError | AttributeError):
         return "an entry has the wrong type"
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
     return "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
 
 
@@ -205,7 +203,7 @@ def warn_if_truncated(file: Path, poses: Trajectory) -> Trajectory:
     try:
         largest = json.loads(whole_text(file.with_name("summary.json"), errors="strict"))["submaps"][0]
         count = largest[POSES[file.name]]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # not a run's, or without the number
+    except (ValueError, LookupError, TypeError, RecursionError):  # not a run's, or without the number
         return poses
     if type(count) is int and count != len(poses):
         warnings.warn(

@@ -13,6 +13,8 @@ EXPORTS = "export"
 """Default folder of `vggtgeo export` in the folder of a run, which no run writes or removes."""
 CHECKPOINT = "checkpoint.npz"
 """In `unfinished/`: the state from which a killed run can be resumed."""
+EVERY = 10.0
+"""Seconds between two checkpoints."""
 
 
 def unfinished_message(folder: Path) -> str | None:

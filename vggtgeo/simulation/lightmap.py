@@ -22,6 +22,7 @@ from vggtgeo.simulation.shapes import Blockers, Surfaces
 _WIDTH = 2048
 _AMBIENT_REACH = 0.8
 _BATCH = 60000  # segments times boxes tested at once: small enough for the cache
+_GROUP = 256  # points at most whose far boxes are left out at once
 _LAMP_CELLS = 3  # a lamp is sampled once in each of 3 x 3 cells
 
 
@@ -147,9 +148,7 @@ def _shadowed(points: np.ndarray, rays: np.ndarray, blockers: Blockers, starts: 
     reach = np.hypot(blockers.half[:, 0], blockers.half[:, 1])
     reach = np.stack([reach, reach, blockers.half[:, 2]], axis=1)
     low, high = blockers.centre - reach, blockers.centre + reach
-    for first, last in pairwise(starts.tolist()):
-        if first == last:
-            continue
+    for first, last in pairwise(np.unique([*starts, *range(0, len(points), _GROUP)]).tolist()):
         at = points[first:last, None]
         end = at + rays[first:last]
         bottom = np.minimum(at.min(axis=(0, 1)), end.min(axis=(0, 1)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,12 +17,26 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_picture, write_text
 from vggtgeo.io.given import check_kind, check_real, check_whole
+from vggtgeo.simulation.building import BUILDING_WALK, build_building
+from vggtgeo.simulation.corridor import CORRIDOR_WALK, build_corridor
+from vggtgeo.simulation.hall import HALL_WALK, build_hall
+from vggtgeo.simulation.office import OFFICE_WALK, build_office
 from vggtgeo.simulation.render import Picture, render
+from vggtgeo.simulation.room import ROOM_WALK, build_room
 from vggtgeo.simulation.scene import Scene
 from vggtgeo.simulation.sensor import Sensor
-from vggtgeo.simulation.trajectories import HandheldMotion
-from vggtgeo.simulation.worlds import WORLDS
+from vggtgeo.simulation.staircase import STAIRCASE_WALK, build_staircase
+from vggtgeo.simulation.trajectories import HandheldMotion, Walk
 
+WORLDS: dict[str, tuple[Callable[[int], Scene], Walk]] = {
+    "room": (build_room, ROOM_WALK),
+    "office": (build_office, OFFICE_WALK),
+    "hall": (build_hall, HALL_WALK),
+    "corridor": (build_corridor, CORRIDOR_WALK),
+    "staircase": (build_staircase, STAIRCASE_WALK),
+    "building": (build_building, BUILDING_WALK),
+}
+"""The built-in worlds by name: how each is built, and how it is walked through."""
 _BAND = 16  # rows that share one pose under rolling exposure
 
 _LEAST, _MOST = 1e-4, 1e4

@@ -33,9 +33,6 @@ _SAMPLES = 4
 _DEPTHS = 1.5, 4.5
 """Metres."""
 
-_MAX_MATCHES = 5_000_000
-"""Of a window: 1 GB while it is made."""
-
 
 @dataclass(frozen=True, eq=False)
 class SimulatedWindow:

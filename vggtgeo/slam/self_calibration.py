@@ -24,6 +24,9 @@ from vggtgeo.slam.run import finish, run_frames
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
+CALIBRATION_FRAMES = 150
+"""Frames that a run calibrates an unknown camera on. Where frames cannot be read twice (a live camera, a stream), it is
+estimated while tracking."""
 MIN_KEYFRAMES = 10
 """Keyframes that self-calibration without depth needs; as many as a window has: a smaller map is adjusted as a whole
 while tracking, and its few keyframes have little parallax. With depth, as many as the last adjustment needs."""

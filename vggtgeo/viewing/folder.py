@@ -28,7 +28,7 @@ def recording_of(folder: Path) -> Path | None:
     """
     try:
         target = tomllib.loads(whole_text(folder / "settings.toml", errors="strict")).get("rerun")
-    except (OSError, ValueError, RecursionError):
+    except (ValueError, RecursionError):
         return max(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, default=None)
     if target is None:
         return None

@@ -34,7 +34,6 @@ WRONG = {
     "depth_terms.surface_points": (-1.0,),
     "weights.confidence": ("on", 1.0),
     "camera.max_pixels": (-1, 1.5),
-    "camera.calibration_frames": (-1, 1.5),
     "camera.static_overlay": (1,),
     "camera.refine_intrinsics": ("sometimes", True),
     "window.size": (2, 10.0),
@@ -43,7 +42,6 @@ WRONG = {
     "window.kernel": (2.0, "cauchy 0", "cauchy 1 2 3", "welsch", ""),
     "refinement.global_adjustment": ("no",),
     "refinement.rolling_shutter": ("yes",),
-    "refinement.loop_candidates": (-1, 1.5),
 }
 OTHER = {bool: lambda value: not value, int: lambda value: 2 * value + 2, float: lambda value: 0.5 * value}
 WORDS = {

@@ -27,6 +27,8 @@ from vggtgeo.slam.tracking.track import PIXEL_SIGMA
 
 MIN_VISIBLE, MAX_TURN = 0.4, np.deg2rad(40)
 """Share of one keyframe's points inside the other's image, and angle between them, for a pair to be proposed."""
+MAX_CANDIDATES = 3
+"""Pairs that each keyframe proposes by the estimated poses."""
 MIN_INLIERS = 50
 """Minimum number of PnP inliers of a loop (exclusive): keyframes far apart in time have no predicted pose for a check.
 """
@@ -88,9 +90,7 @@ def _by_estimate(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]
             if share > MIN_VISIBLE:
                 # Matching fails with the angle between views: a radian costs as much as the whole overlap.
                 scored.append((share - turned, first.number))
-        chosen += [
-            (number, second.number) for _, number in sorted(scored, reverse=True)[: settings.refinement.loop_candidates]
-        ]
+        chosen += [(number, second.number) for _, number in sorted(scored, reverse=True)[:MAX_CANDIDATES]]
     return chosen
 
 
@@ -100,7 +100,7 @@ def _by_appearance(slam: Slam, settings: SlamSettings, known: set[tuple[int, int
     This threshold adapts to the image: a wall resembles any wall, a shelf no other.
     """
     seen = [keyframe for keyframe in slam.keyframes if keyframe.place is not None]
-    if settings.refinement.loop_candidates < 1 or not seen:
+    if not seen:
         return []
     similarity = np.full((len(slam.keyframes),) * 2, -np.inf)
     numbers = np.array([keyframe.number for keyframe in seen])

@@ -127,9 +127,6 @@ class CameraSettings(CheckedSettings):
         max_pixels: Larger images are reduced to about this many pixels when they are read, and the camera with them
             (1920 x 1080 to 943 x 530), see `datasets/views.py`; 0 disables it. Dense maps and exports are of the
             reduced images.
-        calibration_frames: Number of frames used to calibrate an unknown camera before tracking; 0 disables it. A
-            guessed camera is then estimated while tracking, as always where frames cannot be read twice (a live
-            camera, a stream).
         static_overlay: Look for parts of the images that do not move with the scene (bars, a watermark, specks on
             the lens) before tracking, and mask them. Not where frames cannot be read twice, nor in rendered images.
         refine_intrinsics: Whether the last adjustment may change known intrinsics. "auto": if the images contradict
@@ -139,14 +136,13 @@ class CameraSettings(CheckedSettings):
 
     Example:
         >>> import vggtgeo as vg
-        >>> vg.settings.CameraSettings(calibration_frames=0).max_pixels
-        500000
+        >>> vg.settings.CameraSettings(max_pixels=0).static_overlay
+        True
 
     """
 
     group: ClassVar[str] = "camera"
     max_pixels: int = whole(500_000, at_least=0, at_most=100_000_000)
-    calibration_frames: int = whole(150, at_least=0)
     static_overlay: bool = switch(True)
     refine_intrinsics: str = one_of("auto", "always", "never")
 
@@ -192,7 +188,6 @@ class GlobalMapSettings(CheckedSettings):
     Fields:
         global_adjustment: Adjust all keyframes together; without it, the sliding window alone.
         rolling_shutter: Estimate the readout time of a rolling shutter, and correct the map for it.
-        loop_candidates: Pairs that each keyframe proposes for loop closure, at most; 0 disables it.
 
     Example:
         >>> import vggtgeo as vg
@@ -204,4 +199,3 @@ class GlobalMapSettings(CheckedSettings):
     group: ClassVar[str] = "refinement"
     global_adjustment: bool = switch(True)
     rolling_shutter: bool = switch(True)
-    loop_candidates: int = whole(3, at_least=0)
