@@ -12,7 +12,7 @@ from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.global_map.guided_matches import RADIUS, guided_pairs
+from vggtgeo.slam.global_map.guided_matches import guided_pairs
 from vggtgeo.slam.sparse_map.covisibility import Pair, without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
@@ -85,19 +85,23 @@ def test_keyframes_that_were_never_compared_are_paired_where_they_see_the_same()
 
 
 def test_matches_are_aligned_by_the_images() -> None:
-    """Key points found half a pixel off are mostly matched to a tenth; hidden ones are not. Oracle: the plane."""
+    """Key points found a fifth of a pixel off are mostly matched to a tenth. Oracle: the plane."""
     first, second = keyframe(0, 0.0), keyframe(1, 0.1)
-    off = second.features.pixels + np.random.default_rng(2).normal(0.0, 0.5, second.features.pixels.shape)
-    gray = second.features.descriptors.gray.copy()
-    gray[:, :20] = np.random.default_rng(3).integers(0, 255, (48, 20))
-    described = replace(second.features.descriptors, gray=gray)
+    off = second.features.pixels + np.random.default_rng(2).normal(0.0, 0.2, second.features.pixels.shape)
     # Without depths of its own: only the first predicts.
     unknown = replace(second.points, inverse_depth=np.full(len(off), np.nan))
-    second = replace(second, features=replace(second.features, pixels=off, descriptors=described), points=unknown)
+    second = replace(second, features=replace(second.features, pixels=off), points=unknown)
     (pair,) = guided_pairs(known(first, second), CAMERA)
+    assert len(pair.points) > 0.9 * len(POINTS)
     assert right_share(pair, (first, second), within=0.1) > 0.85
-    assert pair.points.pixels_j[:, 0].min() > 15
-    assert len(pair.points) > 0.5 * len(POINTS)
+
+
+def test_a_small_image_is_searched_in_a_small_radius() -> None:
+    """With prediction errors of 0.02 focal lengths a map is not confirmed, in any size of image. Oracle: none."""
+    first, second = keyframe(0, 0.0), keyframe(1, 0.1)
+    pose = second.pose.copy()
+    pose[1, 3] += 0.02 * 2.0
+    assert guided_pairs(known(first, replace(second, pose=pose)), CAMERA) == ()
 
 
 @pytest.mark.parametrize("change", ["pose", "depth"])
@@ -105,8 +109,8 @@ def test_a_wrong_prediction_finds_nothing(change: str) -> None:
     """Where the pose is wrong by more than the radius, or no depth is determined, nothing is added. Oracle: none."""
     first, second = keyframe(0, 0.0), keyframe(1, 0.2)
     if change == "pose":
-        # The grid's pitch is 3.8 pixels: half of it beside a column, and far above the rows.
-        second = replace(second, pose=keyframe(1, 0.2 + 25 * RADIUS / 30).pose)
+        # The grid's pitch is 1.4 / 11 m: half of it beside a column, four times the radius.
+        second = replace(second, pose=keyframe(1, 0.2 + 5.5 * 1.4 / 11).pose)
     else:
         first, second = (
             replace(one, points=replace(one.points, estimate_sigma=np.full(len(POINTS), 1.0)))

@@ -30,13 +30,12 @@ from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.map_points import MAX_TURN, expected_pixels
 
-RADIUS = 4.0
-"""Largest distance of a match from its prediction, pixels: eight standard deviations of a match. A wider one finds what
-confirms an error of the map."""
+RADIUS = 0.008
+"""Largest distance of a match from its prediction, in focal lengths: errors of a map are angles, and in a small image a
+radius in pixels finds what confirms them."""
 
 REFINEMENT = PatchAlignment()
-"""As of the matches by descriptors alone, whose noise the adjustment assumes. Here it also verifies: a match whose
-patches do not align is left out."""
+"""As of the matches by descriptors alone, whose noise the adjustment assumes."""
 
 
 def guided_pairs(known: Map, intrinsics: np.ndarray) -> tuple[Pair, ...]:
@@ -98,13 +97,14 @@ def _further_matches(pair: Pair, keyframes: Sequence[Keyframe], trees: list[cKDT
 
 
 def _near_projection(of: Keyframe, other: Keyframe, tree: cKDTree, intrinsics: np.ndarray) -> PointMatches:
-    """Return the matches of points of `of` that `other` shows near their projection, where both look alike."""
+    """Return the matches of points of `of` that `other` shows near their projection, aligned by the images."""
     index, _, pixels = expected_pixels(of, other.pose, intrinsics)
     known = of.points.determined[index]
-    found = search_near(of.features, index[known], pixels[known], other.features, tree, radius=RADIUS)
+    radius = RADIUS * float(intrinsics[0])
+    found = search_near(of.features, index[known], pixels[known], other.features, tree, radius=radius)
     images = of.features.descriptors.gray, other.features.descriptors.gray
-    refined, aligned = REFINEMENT.refine(*images, found.pixels_i, found.pixels_j)
-    return replace(found, pixels_j=refined).select(aligned)
+    refined, _ = REFINEMENT.refine(*images, found.pixels_i, found.pixels_j)
+    return replace(found, pixels_j=refined)
 
 
 def _first(values: np.ndarray) -> np.ndarray:
