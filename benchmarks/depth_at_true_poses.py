@@ -19,6 +19,7 @@ import numpy as np
 from vggtgeo.models.classical import SiftMatcher
 
 from vggtgeo.datasets import Sequence, open_sequence
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, nearest_in_time
 from vggtgeo.geometry import pinhole, rigid
 
 RANGES = np.array([0.3, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 8.0])
@@ -39,7 +40,7 @@ def main() -> None:
             own = (depth >= low) & (depth < high)
             if np.count_nonzero(own) > 20:
                 share = 100 * information[own].sum() / information.sum()
-                median = _weighted_median(ratio[own], information[own])
+                median = np.quantile(ratio[own], 0.5, weights=information[own], method="inverted_cdf")
                 print(f"{low} to {high} | {np.count_nonzero(own)} | {share:.0f} | {median:.3f}")
 
 
@@ -47,8 +48,10 @@ def _compared(sequence: Sequence) -> Iterator[np.ndarray]:
     """Yield the matches of each pair, float64 [3, m]: measured depth, triangulated over measured, information."""
     truth, matcher, intrinsics = sequence.ground_truth(), SiftMatcher(), np.array(sequence.camera.intrinsics)
     frames = [frame for frame in islice(sequence.frames(), 0, None, EVERY) if frame.depth is not None]
-    nearest = [np.argmin(np.abs(truth.timestamps - frame.timestamp)) for frame in frames]
-    poses, features = rigid.invert(truth.poses[nearest]), [matcher.describe(frame.image) for frame in frames]
+    times = np.array([frame.timestamp for frame in frames])
+    timed, rows = nearest_in_time(times, truth.timestamps, MAX_TIME_DIFFERENCE)
+    frames, poses = [frames[k] for k in timed], rigid.invert(truth.poses[rows])
+    features = [matcher.describe(frame.image) for frame in frames]
     for first in range(len(frames)):
         for second in range(first + 1, min(first + 1 + NEXT, len(frames))):
             relative = poses[second] @ rigid.invert(poses[first])
@@ -64,12 +67,6 @@ def _compared(sequence: Sequence) -> Iterator[np.ndarray]:
             good = (np.linalg.norm(predicted - found.pixels_j, axis=1) < MAX_ERROR) & (inverse > 0)
             # The scale `s` of the path moves the inverse depth by itself: its information is that of `log`.
             yield np.stack([depth, 1 / (inverse * depth), information / depth**2])[:, good]
-
-
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2)])
 
 
 if __name__ == "__main__":

@@ -31,13 +31,15 @@ TEXTURE = cv2.GaussianBlur(np.random.default_rng(1).uniform(0, 255, (48 + 2 * MA
 TEXTURE = np.interp(TEXTURE, (TEXTURE.min(), TEXTURE.max()), (0, 255)).astype(np.uint8)
 
 
-def keyframe(number: int, right: float, points: np.ndarray = POINTS) -> Keyframe:
-    """A camera so far to the right that sees all points; its key points are in an order of its own."""
+def keyframe(number: int, right: float) -> Keyframe:
+    """A camera so far to the right; its key points, of what it sees, are in an order of its own."""
     to_world = np.eye(4)
     to_world[0, 3] = right
     pose = rigid.invert(to_world)
-    order = np.random.default_rng(number).permutation(len(points))
-    pixels, one = rigid.project(points, pose, CAMERA)[order], np.ones(len(points))
+    projected = rigid.project(POINTS, pose, CAMERA)
+    order = np.random.default_rng(number).permutation(len(POINTS))
+    order = order[((projected > 0) & (projected < [64, 48])).all(1)[order]]
+    pixels, one = projected[order], np.ones(len(order))
     made = replace(tiny_keyframe(number), pose=pose)
     shift = np.array([[1.0, 0.0, MARGIN + PITCH * right], [0.0, 1.0, MARGIN]])
     gray = cv2.warpAffine(TEXTURE, shift, (64, 48), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
@@ -82,6 +84,16 @@ def test_keyframes_that_were_never_compared_are_paired_where_they_see_the_same()
     found = guided_pairs(known(keyframe(0, 0.0), keyframe(1, 0.1), away), CAMERA)
     assert [pair.key for pair in found] == [(0, 1)]
     assert right_share(found[0], (keyframe(0, 0.0), keyframe(1, 0.1))) == 1.0
+
+
+def test_only_the_best_neighbours_are_paired() -> None:
+    """Of 20 keyframes along a wall, two that share less of it than 16 others do stay apart. Oracle: the poses."""
+    frames = [keyframe(number, 0.04 * number) for number in range(20)]
+    apart = guided_pairs(known(replace(frames[8], number=0), replace(frames[19], number=1)), CAMERA)
+    assert [pair.key for pair in apart] == [(0, 1)]
+    keys = {pair.key for pair in guided_pairs(known(*frames), CAMERA)}
+    assert (8, 19) not in keys
+    assert all((number, number + 1) in keys for number in range(19))
 
 
 def test_matches_are_aligned_by_the_images() -> None:
