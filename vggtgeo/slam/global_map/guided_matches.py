@@ -32,7 +32,7 @@ from vggtgeo.slam.tracking.map_points import MAX_TURN, expected_pixels
 
 RADIUS = 0.008
 """Largest distance of a match from its prediction, in focal lengths: errors of a map are angles, and in a small image a
-radius in pixels finds what confirms them."""
+radius in pixels finds what confirms them (`benchmarks/keyframe_spacing.py`, whose images have 240 pixels)."""
 
 REFINEMENT = PatchAlignment()
 """As of the matches by descriptors alone, whose noise the adjustment assumes."""
