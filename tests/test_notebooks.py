@@ -63,8 +63,11 @@ def test_notebook_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.long
 def test_solve_starts_from_a_recording_where_there_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The first two cells take a folder in place of the rendered pair, and find how its camera moved; oracle: truth."""
-    for _ in write_tum_folder(simulate("office", 10, 5, (320, 240)), tmp_path):
+    """The first two cells take a folder in place of the rendered pair, and find how its camera moved; oracle: truth.
+
+    The world is that of the notebook itself, in smaller images: it is built once.
+    """
+    for _ in write_tum_folder(simulate("office", 10, 3, (320, 240)), tmp_path):
         pass
     namespace: dict[str, Any] = {}
     for cell in _cells(NOTEBOOKS[0].with_name("solve.ipynb"), "code")[:2]:

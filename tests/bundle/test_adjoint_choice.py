@@ -15,7 +15,7 @@ SOLVER = vg.SchurLevenbergMarquardt(rtol=0.0, atol=0.0, max_iterations=12)
 @pytest.fixture(scope="module")
 def loss() -> Callable[..., jax.Array]:
     """Distance of a solution from the origin, of a small problem with its points weighted."""
-    problem, initial, _ = vg.simulate_window(2, points=8, lines=0).pack()
+    problem, initial, _ = vg.simulate_window(2, points=8, lines=0, host_noise=False).pack(kernel=vg.kernels.Square())
 
     def value(share: jax.Array, **options: optx.AbstractAdjoint) -> jax.Array:
         points = problem.points.reweighted(share * problem.points.weight)

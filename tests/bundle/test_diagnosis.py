@@ -72,7 +72,7 @@ def test_a_derivative_that_is_not_finite_is_found() -> None:
     assert "`range`" in words
     assert "derivative" in words
     assert "observation 0" in words
-    assert not bool(is_finite(linearise(prepared(bad), START)))
+    assert not bool(jax.jit(lambda problem, state: is_finite(linearise(prepared(problem), state)))(bad, START))
     for function in (vg.covariances, vg.observability):
         with pytest.raises(vg.InputError, match="`range`"):
             function(bad, START)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -34,11 +35,31 @@ def _energy_of(problem: Problem, state: State):
     return lambda step: vg.energy(problem, state.moved(step))
 
 
+@jax.jit
+def _gradient(problem: Problem, state: State):
+    return energy_gradient(prepared(problem), state)
+
+
+@partial(jax.jit, static_argnames="exact")
+def _reduced(problem: Problem, state: State, exact: bool = False):
+    """Dense, landmarks eliminated. One program each: of single operations, every one would be compiled by itself."""
+    return dense_schur_complement(linearise(prepared(problem), state, exact=exact))
+
+
+@pytest.fixture(scope="module")
+def least_squares() -> tuple[Problem, State]:
+    """Points alone, without a robust kernel, and a prior that says nothing, at the optimum."""
+    problem, initial, _ = vg.simulate_window(KEYFRAMES, POINTS, 0, host_noise=True).pack(
+        terms=[vg.empty_prior(KEYFRAMES)], kernel=vg.kernels.Square()
+    )
+    return problem, vg.solve(problem, initial).state
+
+
 def test_gradient_is_that_of_the_energy(window):
     """By automatic differentiation of the energy over all unknowns."""
     problem, state = window
     expected = jax.jit(jax.grad(_energy_of(problem, state)))(jnp.zeros(state.num_unknowns))
-    found = energy_gradient(prepared(problem), state)
+    found = _gradient(problem, state)
     dense, slots, points = len(found.dense), state.inverse_depth.size, POINTS
     depth, offset = expected[dense : dense + slots], expected[dense + slots :].reshape(KEYFRAMES, points, 2)
     by_pixel = jnp.stack([found.landmarks[:, :points], found.landmarks[:, points : 2 * points]], -1)
@@ -54,7 +75,7 @@ def test_the_linearised_gradient_is_that_of_the_energy(window, part):
     ready = prepared(problem)
     correction = None if part is None else jnp.asarray(part)
     system = jax.jit(lambda state: linearise(ready, state, correction, joined=False))(state)
-    expected = jax.jit(lambda state: energy_gradient(ready, state))(state)
+    expected = _gradient(problem, state)
     np.testing.assert_allclose(system.cross[:, -2], expected.landmarks, rtol=1e-9, atol=1e-9)
 
 
@@ -62,7 +83,7 @@ def test_schur_complement_of_the_exact_hessian(window):
     """By dense elimination of all landmark unknowns from the Hessian of the energy."""
     problem, state = window
     hessian = np.asarray(jax.jit(jax.hessian(_energy_of(problem, state)))(jnp.zeros(state.num_unknowns)))
-    reduced = dense_schur_complement(linearise(prepared(problem), state, exact=True))
+    reduced = _reduced(problem, state, exact=True)
     count = problem.num_camera
     inverse = np.linalg.pinv(hessian[count:, count:], hermitian=True)
     expected = hessian[:count, :count] - hessian[:count, count:] @ inverse @ hessian[count:, :count]
@@ -75,8 +96,8 @@ def test_hand_written_columns_are_the_derived_ones(window):
     grouped = replace(problem, camera_of=jnp.zeros(KEYFRAMES, jnp.int32))
     grouped = replace(grouped, fixed_intrinsics=problem.fixed_intrinsics[None])
     both = [
-        dense_schur_complement(linearise(prepared(problem), state)),
-        dense_schur_complement(linearise(prepared(grouped), replace(state, intrinsics=state.intrinsics[None]))),
+        _reduced(problem, state),
+        _reduced(grouped, replace(state, intrinsics=state.intrinsics[None])),
     ]
     for name in ("hessian", "gradient", "schur", "schur_gradient"):
         first, second = (np.asarray(getattr(found, name)) for found in both)
@@ -119,10 +140,9 @@ def test_segments_and_triples_stand_beside_each_other():
     assert min(worse) > reached
 
 
-def test_covariances_are_those_of_a_dense_inverse():
+def test_covariances_are_those_of_a_dense_inverse(least_squares):
     """Poses and inverse depths, against the inverse of the dense Gauss-Newton matrix over all unknowns."""
-    problem, initial, _ = vg.simulate_window(KEYFRAMES, POINTS, 0, host_noise=True).pack(kernel=vg.kernels.Square())
-    state = vg.solve(problem, initial).state
+    problem, state = least_squares
 
     def residuals(step):
         found = vg.residuals_at(problem, state.moved(step))
@@ -154,15 +174,12 @@ def test_gradient_through_the_optimum():
         moved = replace(moved, pixels=moved.pixels.at[0, 0, 0].add(shift))
         return jnp.sum(vg.solve(moved, initial).state.poses.translation() ** 2)
 
-    def optimum(scale, shift):  # the loss at the polished point: differences of it are exact to 1e-9
-        return jax.jvp(lambda s: loss(s, shift), (scale,), (0.0,))[0]
-
-    value = jax.jit(optimum)
-    for axis, size in ((0, 1e-3), (1, 1e-3)):
-        steps = [np.eye(2)[axis] * sign * size + [1.0, 0.0] for sign in (1, -1)]
-        expected = (value(*steps[0]) - value(*steps[1])) / (2 * size)
-        found = jax.jit(jax.grad(loss, axis))(1.0, 0.0)
-        np.testing.assert_allclose(found, expected, rtol=1e-5)
+    # The value that is differentiated stands at the polished optimum: differences of it are exact to 1e-9.
+    evaluate, at, size = jax.jit(jax.value_and_grad(loss, (0, 1))), np.array([1.0, 0.0]), 1e-3
+    found = evaluate(*at)[1]
+    for axis, step in enumerate(size * np.eye(2)):
+        expected = (evaluate(*(at + step))[0] - evaluate(*(at - step))[0]) / (2 * size)
+        np.testing.assert_allclose(found[axis], expected, rtol=1e-5)
 
 
 def test_noise_of_the_host_is_counted():
@@ -191,12 +208,9 @@ def test_noise_of_the_host_is_counted():
     assert mean[False] > 1.8, mean
 
 
-def test_marginalisation_takes_the_pixels_along():
+def test_marginalisation_takes_the_pixels_along(least_squares):
     """The prior that a leaving keyframe leaves, against dense elimination of its unknowns."""
-    problem, initial, _ = vg.simulate_window(KEYFRAMES, POINTS, 0, host_noise=True).pack(
-        terms=[vg.empty_prior(KEYFRAMES)], kernel=vg.kernels.Square()
-    )
-    state = vg.solve(problem, initial).state
+    problem, state = least_squares
     prior = vg.marginalise(problem, state, jnp.asarray(1))
     of_host = problem.edges.source == 1
     alone = problem.with_terms(
@@ -209,7 +223,7 @@ def test_marginalisation_takes_the_pixels_along():
             )
         )
     )
-    gauss_newton = dense_schur_complement(linearise(prepared(alone), state))
+    gauss_newton = _reduced(alone, state)
     information = np.asarray(gauss_newton.hessian - gauss_newton.schur)
     kept, gone = np.r_[12:18], np.r_[6:12]
     expected = (

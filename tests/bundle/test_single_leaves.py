@@ -132,7 +132,7 @@ def test_a_landmark_at_its_bound_is_held() -> None:
 def test_the_solution_says_that_it_was_polished() -> None:
     # Proves that under differentiation the solution tells that its state is the polished optimum, and how far it was
     # from rest; and that a derivative at a point that is none can be refused. Oracle: the definition.
-    problem, state = made()
+    problem, state, _ = SCENE.pack(fixed=True)
     short = SchurLevenbergMarquardt(rtol=0.0, max_iterations=1)
 
     def value(alpha: jax.Array, **options: Any) -> tuple[jax.Array, Solution]:

@@ -59,7 +59,7 @@ def solved() -> tuple[Problem, State, np.ndarray]:
     problem, state = poses_alone()
     size = 6 * problem.num_keyframes
     rows = lambda step: vg.residuals_at(problem, state.moved(jnp.pad(step, (0, 4))))["epipolar"]
-    jacobian = np.asarray(jax.jacfwd(rows)(jnp.zeros(size)))[:, 6:]
+    jacobian = np.asarray(jax.jit(jax.jacfwd(rows))(jnp.zeros(size)))[:, 6:]
     information = jacobian.T @ (np.asarray(problem.epipolar.weight)[:, None] * jacobian)
     scale = np.asarray(scale_direction(problem, state))[6:size]
     basis = np.linalg.svd(scale.T)[2][1:].T

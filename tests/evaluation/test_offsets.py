@@ -78,7 +78,7 @@ def test_offsets_are_within_their_deviations(drift: float) -> None:
     # Proves that clock, lever arm and axes are found, and that errors are what the stated deviations say, whether
     # neighbouring errors are alike or not. Oracle: offsets that were applied; the chi-square law of the NEES.
     scaled = []
-    for seed in range(5):
+    for seed in range(3):
         found = _offsets(*_pair(seed, 0.1, LEVER, TURN, drift))
         assert found.explains
         assert found.significant == ("time offset", "lever arm", "rotation")
@@ -87,11 +87,11 @@ def test_offsets_are_within_their_deviations(drift: float) -> None:
         assert abs(errors[0]) < 0.006, f"clock off by {1e3 * errors[0]:.2f} ms"
         scaled.append(errors / np.concatenate([[found.time_sd], found.lever_sd, found.turn_sd]))
     nees = float(np.mean(np.square(scaled)))
-    assert 0.4 < nees < 2.0, f"NEES of 5 x 7 numbers is {nees:.2f}, about 1 where deviations are right"
+    assert 0.4 < nees < 2.0, f"NEES of 3 x 7 numbers is {nees:.2f}, about 1 where deviations are right"
     assert np.abs(scaled).max() < 4.0, f"{np.abs(scaled).max():.1f} deviations off"
 
 
-@pytest.mark.parametrize("late", [-0.3, 0.1, 2.7])
+@pytest.mark.parametrize("late", [-0.3, 2.7])
 def test_a_clock_that_is_late_is_told(late: float) -> None:
     # Proves that a clock alone is found to a millisecond, at once or seconds away, that nothing else is made
     # responsible, and that what is left is the noise. Oracle: 5 mm a direction.
@@ -106,7 +106,7 @@ def test_a_clock_that_is_late_is_told(late: float) -> None:
 def test_noise_of_the_truth_moves_no_clock() -> None:
     # Proves that a truth with noise of its own, which is smaller between its poses as interpolation averages, does not
     # draw the offset there. Oracle: poses of the estimate at every tenth of the truth's, which is exactly at one.
-    found = [_offsets(*_pair(seed, 0.1, turning=0.02, rough=0.001)) for seed in range(3)]
+    found = [_offsets(*_pair(seed, 0.1, turning=0.02, rough=0.001)) for seed in range(2)]
     scaled = [(one.time - 0.1) / one.time_sd for one in found]
     assert np.abs(scaled).max() < 3.0, f"{scaled} deviations off"
 
@@ -122,7 +122,7 @@ def test_a_lever_arm_is_found_where_the_clock_is_right() -> None:
 @pytest.mark.parametrize("drift", [0.0, 0.004])
 def test_an_estimate_that_is_only_wrong_has_no_offset(drift: float) -> None:
     # Proves that noise and drift are not explained away. Oracle: there is no offset; the test's level is 0.001.
-    for seed in range(3):
+    for seed in range(2):
         found = _offsets(*_pair(seed, drift=drift))
         assert found.significant == (), f"seed {seed}: {found}"
         assert not found.explains
@@ -194,11 +194,11 @@ def test_the_command_tells_applies_and_removes_an_offset(tmp_path: Path) -> None
 
 
 def test_offsets_of_a_recorded_truth(shared_cases: Path, tmp_path: Path) -> None:
-    # Proves it on the motion of a person with a camera: clocks 0.1 and 0.3 s late. Oracle: what the script wrote.
+    # Proves it on the motion of a person with a camera: one clock right, one 0.3 s late. Oracle: what the script wrote.
     script = shared_cases / "clock_offset.py"
     truth = shared_cases.parent / "data" / "corridor-office" / "groundtruth.txt"
     subprocess.run([sys.executable, script, truth], cwd=tmp_path, check=True)
-    for late in (0.0, 0.1, 0.3):
+    for late in (0.0, 0.3):
         estimate = Trajectory.load_tum(tmp_path / "estimate.txt")
         found = _offsets(estimate, Trajectory.load_tum(tmp_path / f"truth-{late:g}.txt"))
         assert found.time == pytest.approx(late, abs=1e-3)

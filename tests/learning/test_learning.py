@@ -86,8 +86,8 @@ def test_the_gradient_is_that_of_the_error(batch: Batch) -> None:
     assert not np.asarray(gradient)[~np.asarray(window.present)].any()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("depth", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow  # a minute of compilation; test_sliding.py has a gradient through slid windows
+@pytest.mark.parametrize("depth", [True, False])
 def test_the_gradient_through_slid_windows_is_that_of_the_error(depth: bool) -> None:
     """The error at the end of three slid windows has the gradient of central differences, by the matches of each.
     Without depth the unit is the first baseline. Oracle: the error.

@@ -38,7 +38,7 @@ class CameraHeight(PoseTerm):
     def residual(self, pose: jaxlie.SE3, camera: AbstractCamera) -> Float[Array, ""]:
         return pose.inverse().translation()[1] - self.height
 '''
-SCENE = make_scene(3, 6, 1, 2, noise=0.5, depth_error=0.05, seed=6)
+SCENE = make_scene(3, 6, 0, noise=0.5, depth_error=0.05, seed=6)
 SOLVER = vg.SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
 
 

@@ -51,6 +51,8 @@ from vggtgeo.slam.sparse_map.factors import (
 
 SCENE = make_scene(noise=0.7, outliers=0.3, depth_error=0.1, seed=1)
 Pairs = list[tuple[Any, Any]]
+BENT, TWO = (-0.2, 0.05, 0.004, -0.003), np.array([0, 1, 0])
+"""A lens, and which of two cameras took each keyframe."""
 
 
 @jax.jit
@@ -110,13 +112,14 @@ def test_what_is_written_by_hand_is_what_is_derived(shape: float, shared_focal: 
                 assert error < 1e-12, (name, number, error)
 
 
-@pytest.mark.parametrize("groups", [None, np.array([0, 1, 0])], ids=["one", "two"])
 @pytest.mark.parametrize(
-    ("camera", "lens", "shared_focal"),
+    ("camera", "lens", "shared_focal", "groups"),
     [
-        (vg.cameras.RadialTangential, (-0.2, 0.05, 0.004, -0.003), True),
-        pytest.param(vg.cameras.KannalaBrandt, (0.03, -0.01, 0.004, -0.001), False, marks=pytest.mark.long),
+        (vg.cameras.RadialTangential, BENT, True, None),
+        (vg.cameras.RadialTangential, BENT, True, TWO),
+        pytest.param(vg.cameras.KannalaBrandt, (0.03, -0.01, 0.004, -0.001), False, TWO, marks=pytest.mark.long),
     ],
+    ids=["bent, one", "bent, two", "fisheye, two"],
 )
 def test_columns_with_any_camera_are_what_is_derived(
     camera: type[vg.cameras.AbstractCamera], lens: tuple[float, ...], shared_focal: bool, groups: np.ndarray | None

@@ -155,9 +155,16 @@ def run_of_room() -> Slam:
 
 def redrawn(pixels: np.ndarray) -> np.ndarray:
     """Ideal pixels as the lens draws them: by this package's model, not by OpenCV."""
-    lens = vg.cameras.RadialTangential(jnp.asarray([*LENS.intrinsics, *LENS.distortion]))
-    rays = jnp.asarray(pinhole.rays(pixels.reshape(-1, 2), LENS.intrinsics))
-    return np.asarray(jax.vmap(lens.project)(rays)).reshape(pixels.shape)
+    rays = pinhole.rays(pixels.reshape(-1, 2), LENS.intrinsics)
+    padded = np.pad(rays, ((0, -len(rays) % 2048), (0, 0)), constant_values=1.0).reshape(-1, 2048, 3)
+    drawn = [np.asarray(_drawn(jnp.asarray(some))) for some in padded]
+    return np.concatenate([np.zeros((0, 2)), *drawn])[: len(rays)].reshape(pixels.shape)
+
+
+@jax.jit
+def _drawn(rays: jax.Array) -> jax.Array:
+    """Pixels of as many rays each time: compiled once."""
+    return jax.vmap(vg.cameras.RadialTangential(jnp.asarray([*LENS.intrinsics, *LENS.distortion])).project)(rays)
 
 
 def test_the_map_is_as_an_ideal_camera_sees_it() -> None:

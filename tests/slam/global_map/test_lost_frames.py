@@ -37,7 +37,7 @@ KNOWN = 12
 
 @pytest.fixture(scope="module")
 def walk() -> tuple[list[Frame], Camera, Trajectory]:
-    sequence = simulate("room", 30, 0, SIZE, rate=10.0)
+    sequence = simulate("room", 24, 0, SIZE, rate=10.0)
     truth = sequence.ground_truth()
     assert truth is not None
     return list(sequence.frames()), sequence.camera, truth

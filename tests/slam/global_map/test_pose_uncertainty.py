@@ -23,6 +23,8 @@ from vggtgeo.geometry import rigid
 from vggtgeo.simulation.loop import simulate_loop
 from vggtgeo.slam.global_map import global_adjustment, pose_uncertainty
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma, sparse_worst
+from vggtgeo.slam.settings.groups import WindowSettings
+from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.tracking.evidence import tangent
 
 
@@ -100,7 +102,8 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(pose_uncertainty, "FOCAL_SIGMA", 0.0)  # its camera is the one that is given,
     monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.0)  # with its middle in that of the images,
     monkeypatch.setattr(pose_uncertainty, "MOMENT", 0.0)  # and its images are of one moment
-    result = vg.reconstruct(vg.simulate("room", 40, size=(320, 240), rate=6.0))
+    small = SlamSettings(window=WindowSettings(size=4, point_slots=96, line_slots=48))
+    result = vg.reconstruct(vg.simulate("room", 24, size=(320, 240), rate=6.0), settings=small)
     stated = result.uncertainty
     assert stated is not None
     assert result.record is not None

@@ -15,12 +15,16 @@ from vggtgeo.models.classical import NoDepth, SiftMatcher
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.run import run
-from vggtgeo.slam.settings.groups import WindowSettings
+from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
-ROLES = Roles(points=SiftMatcher(count=800), depth=NoDepth())
-SETTINGS = SlamSettings(window=WindowSettings(size=6, point_slots=192, line_slots=48))
+# The window of test_pipeline.py, so that the solver is compiled once.
+ROLES = Roles(points=SiftMatcher(count=500), depth=NoDepth())
+SETTINGS = SlamSettings(
+    window=WindowSettings(size=4, point_slots=96, line_slots=48),
+    refinement=GlobalMapSettings(global_adjustment=False),
+)
 FRAMES = 24
 
 

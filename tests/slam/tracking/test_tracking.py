@@ -50,7 +50,7 @@ Room = tuple[list[Frame], Camera, Trajectory]
 
 @pytest.fixture(scope="module")
 def room() -> Room:
-    sequence = simulate("room", 30, 0, SIZE, rate=10.0)
+    sequence = simulate("room", 24, 0, SIZE, rate=10.0)
     truth = sequence.ground_truth()
     assert truth is not None
     return list(sequence.frames()), sequence.camera, truth
@@ -185,12 +185,12 @@ def test_frames_are_described_where_flow_fails(room: Room) -> None:
 
     Oracles: the number of descriptions, and the renderer's poses, from which the run by descriptors is the reference.
     """
-    frames, camera, truth = room
+    frames, camera, truth = room[0][:16], *room[1:]
     errors = []
     for flow, least, most in (
         (PatchFlow(), 1, len(frames) // 2),
-        (PatchFlow(similarity=0.999), 30, 30),
-        (None, 30, 30),
+        (PatchFlow(similarity=0.999), 16, 16),
+        (None, 16, 16),
     ):
         _Counting.described = 0
         slam = _run(frames, camera, replace(ROLES, points=_Counting(count=500), flow=flow))
@@ -356,7 +356,7 @@ def test_a_place_is_recognised(room: Room) -> None:
     """The vector of a frame is nearer to that of its neighbour than to that of any distant one; oracle: time."""
     frames, _, _ = room
     matcher = SiftMatcher(count=500)
-    places = [place_vector(matcher.describe(frames[i].image)) for i in (0, 1, 12, 20, 29)]
+    places = [place_vector(matcher.describe(frames[i].image)) for i in (0, 1, 10, 16, 23)]
     similarity = [float(places[0] @ place) for place in places[1:]]
     assert int(np.argmax(similarity)) == 0, similarity
 
@@ -385,7 +385,7 @@ def test_a_place_that_drift_has_moved_is_used_again(
     )
     kept = (*(factor for factor in slam.map.factors if not crossing(factor)), *cut)
     slam = replace(slam, map=replace(slam.map, keyframes=tuple(moved), factors=kept))
-    played = [*range(29, -1, -1)]
+    played = [*range(len(frames) - 1, -1, -1)]
     for index, row in enumerate(played, start=len(frames)):
         frame = replace(frames[row], index=index, timestamp=index / 10)
         slam = step(slam, frame, Description.of(ROLES.points.describe(frame.image)), ROLES, SETTINGS)

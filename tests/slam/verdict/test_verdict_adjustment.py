@@ -90,7 +90,7 @@ def test_noise_is_estimated_from_the_residuals() -> None:
 
 def test_false_alarms_are_as_frequent_as_their_level() -> None:
     """Wald's statistic of the focal length in pure noise, at a level of 5 %, over seeds. Oracle: the binomial law."""
-    runs, alarms, level = 120, 0, 0.05
+    runs, alarms, level = 80, 0, 0.05
     for seed in range(runs):
         tracks = walk(8, seed=seed, density=40).tracks()
         fit = solve(tracks, start_of(tracks), NOISE, FOCAL_LENGTH, steps=6)
@@ -106,7 +106,7 @@ def test_covariances_count_errors_that_a_track_shares() -> None:
     covariance states, and by more than the naive one does. Oracle: the scatter.
     """
     robust, naive = [], []
-    for seed in range(60):
+    for seed in range(40):
         tracks = walk(10, seed=seed, density=30).tracks()
         rng = np.random.default_rng(seed)
         drift = np.cumsum(rng.standard_normal(tracks.pixels.shape), axis=0)

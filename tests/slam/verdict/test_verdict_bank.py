@@ -48,7 +48,7 @@ def test_a_recording_with_a_fault_is_a_recording(bank: ModuleType) -> None:
     # fault changes something. Oracle: the same run without it.
     first = bank.cases(1)[0]
     walk = replace(first.walk, size=(40, 30), frames=12)
-    own = vg.simulate("room", 12, 3, walk.size, rate=walk.rate, sensor=IDEAL)
+    own = vg.simulate("room", 12, 0, walk.size, rate=walk.rate, sensor=IDEAL)
     seen = Recording(list(own.frames()), own.camera, own.ground_truth())
     elsewhere = replace(
         seen, frames=[replace(frame, image=frame.image[::-1].copy(), depth=2 * frame.depth) for frame in seen.frames]
