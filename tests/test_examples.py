@@ -20,7 +20,7 @@ def session() -> dict[str, Any]:
     return {"vg": vg, "jax": jax, "problem": problem, "initial": initial, "index": index, "solution": solution}
 
 
-LONG = {"ArrowAdjoint", "reconstruct"}
+LONG = {"ArrowAdjoint", "reconstruct", "slide"}
 """What compiles for long, of what other files show in a quick test."""
 
 

@@ -23,6 +23,7 @@ PACKED = WINDOW.pack()
 PROBLEM, STATE, INDEX = PACKED[0].with_term(vg.empty_prior(2)), PACKED[1], PACKED[2]
 STEPS = 0.01 * jnp.cos(jnp.arange(STATE.num_unknowns, dtype=float))
 MATCHES = jnp.ones(len(WINDOW.observations.point_edge))
+MARGINALISE = jax.jit(vg.marginalise)  # a plain call would compile hundreds of operations one by one
 
 Function = Callable[[jax.Array], jax.Array]
 
@@ -36,7 +37,7 @@ def weighted(share: jax.Array) -> vg.Problem:
 def prior_left(share: jax.Array) -> jax.Array:
     """Size of the prior that keyframe 1 leaves on a free camera."""
     free = dataclasses.replace(weighted(share), fixed_intrinsics=jnp.zeros(4, bool))
-    return jnp.sum(vg.marginalise(free, STATE, jnp.asarray(1)).root ** 2) * 1e5
+    return jnp.sum(MARGINALISE(free, STATE, jnp.asarray(1)).root ** 2) * 1e5
 
 
 def solved(share: jax.Array) -> vg.Solution:

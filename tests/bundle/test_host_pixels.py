@@ -211,7 +211,7 @@ def test_noise_of_the_host_is_counted():
 def test_marginalisation_takes_the_pixels_along(least_squares):
     """The prior that a leaving keyframe leaves, against dense elimination of its unknowns."""
     problem, state = least_squares
-    prior = vg.marginalise(problem, state, jnp.asarray(1))
+    prior = jax.jit(vg.marginalise)(problem, state, jnp.asarray(1))
     of_host = problem.edges.source == 1
     alone = problem.with_terms(
         tuple(

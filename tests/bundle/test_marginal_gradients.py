@@ -114,7 +114,8 @@ def check_by_weight(
 
 def test_prior_has_its_gradient_by_weights(window: tuple[Problem, State]) -> None:
     # Proves reverse mode through three marginalisations, each under the prior of those before, with absent matches, a
-    # keyframe without an observation (which is the second to leave) and an empty prior. Oracle: central differences of the last prior's energy.
+    # keyframe without an observation (the second to leave) and an empty prior. Oracle: central differences of the last
+    # prior's energy.
     problem, state = window
     elsewhere = make_scene(KEYFRAMES, 6, 1, noise=0.5, depth_error=0.02).at_truth()[1]
 

@@ -125,7 +125,7 @@ def test_only_the_same_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         ({"roles": replace(ROLES, flow=None)}, "`flow` .*PatchFlow"),
         ({"options": {"seed": 1}}, "`seed` is 1.* 0"),
         ({"options": {"end": 4}}, r"`start, end, stride` is \(0, 4, 1\).*\(0, None, 1\)"),
-        ({"frames": sequence(1)}, "`name` is 'synthetic room, seed 1'.*'synthetic room, seed 0'"),
+        ({"frames": replace(sequence(), seed=1)}, "`name` is 'synthetic room, seed 1'.*'synthetic room, seed 0'"),
         ({"frames": iter(sequence().frames())}, "`frames` .*cannot be resumed"),
     ):
         with pytest.raises(InputError, match=sentence):

@@ -29,7 +29,7 @@ from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
 
-FRAMES, HALF = 18, 9
+FRAMES, HALF = 14, 7
 FIXED = replace(SETTINGS, keyframes=replace(SETTINGS.keyframes, localise_only=True))
 
 
@@ -162,7 +162,7 @@ def test_the_command_saves_and_takes_a_map(tmp_path: Path, monkeypatch: pytest.M
     """`--save-map`, then `--map --localise-only` on the same frames: all are placed, no keyframe is added; oracle: the
     summaries. A map that cannot be saved costs no result.
     """
-    for _ in write_tum_folder(vg.simulate("room", 3, 0, (320, 240), rate=20.0), tmp_path / "room"):
+    for _ in write_tum_folder(vg.simulate("room", 3, 0, (160, 120), rate=20.0), tmp_path / "room"):
         pass
     found = []
     for more in (["--save-map", str(tmp_path / "a.map")], ["--map", str(tmp_path / "a.map"), "--localise-only"]):

@@ -50,7 +50,7 @@ ROLES = Roles(points=SiftMatcher(count=500))
 
 @pytest.fixture(scope="module")
 def room() -> tuple[list[Frame], Camera, object]:
-    sequence = simulate("room", 30, 0, SIZE, rate=10.0)
+    sequence = simulate("room", 24, 0, SIZE, rate=10.0)
     return list(sequence.frames()), sequence.camera, sequence.ground_truth()
 
 

@@ -11,6 +11,7 @@ import rerun as rr
 
 import vggtgeo as vg
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.viewing.callback import RerunCallback
 
 
@@ -19,9 +20,10 @@ def test_a_run_with_everything_compiled_and_recorded(tmp_path: Path) -> None:
     """A run from warm-up to report and recording, in a session without 64-bit types, which stays as it was."""
     stream = rr.RecordingStream("single precision")
     stream.save(str(tmp_path / "run.rrd"))
+    settings = vg.SlamSettings(window=WindowSettings(size=4, point_slots=96, line_slots=48))  # as in test_pipeline.py
     with jax.enable_x64(False):
-        frames = vg.simulate("room", 24, size=(160, 120), rate=6.0)
-        result = vg.reconstruct(frames, callbacks=(RerunCallback(stream),))
+        frames = vg.simulate("room", 16, size=(160, 120), rate=6.0)
+        result = vg.reconstruct(frames, settings=settings, callbacks=(RerunCallback(stream),))
         result.save(tmp_path / "run")
         assert not jax.config.jax_enable_x64
     assert len(result.keyframes) > 2

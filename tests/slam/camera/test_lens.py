@@ -39,9 +39,8 @@ def bent(window: vg.data.SimulatedWindow, *distortion: float) -> vg.data.Simulat
     """Its key points and matches as a lens draws them."""
     lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *distortion, 0.0, 0.0]))
     straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
-    curve = lambda pixels: np.asarray(
-        jax.vmap(lambda pixel: lens.project(straight.unproject(pixel)))(jnp.asarray(pixels))
-    )
+    bend = jax.jit(jax.vmap(lambda pixel: lens.project(straight.unproject(pixel))))
+    curve = lambda pixels: np.asarray(bend(jnp.asarray(pixels)))
     seen = window.observations
     return replace(window, observations=replace(seen, point_target=curve(seen.point_target), pixel=curve(seen.pixel)))
 

@@ -53,9 +53,8 @@ def drawn(window: vg.data.SimulatedWindow, squeeze: float, *distortion: float) -
     """Its key points and matches as a lens draws them, in images of `squeeze` times the width."""
     lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *(distortion or (0.0, 0.0)), 0.0, 0.0]))
     straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
-    bent = lambda pixels: np.asarray(
-        jax.vmap(lambda pixel: lens.project(straight.unproject(pixel)))(jnp.asarray(pixels))
-    )
+    bend = jax.jit(jax.vmap(lambda pixel: lens.project(straight.unproject(pixel))))
+    bent = lambda pixels: np.asarray(bend(jnp.asarray(pixels)))
     resized = lambda pixels: (bent(pixels) + 0.5) * np.array([squeeze, 1.0]) - 0.5
     seen = window.observations
     return replace(
