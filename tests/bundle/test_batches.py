@@ -39,7 +39,7 @@ def batch() -> tuple[Problem, State, list]:
 
 
 @pytest.mark.parametrize(
-    "at_once", [3, pytest.param(1, marks=pytest.mark.long), pytest.param(2, marks=pytest.mark.slow)]
+    "at_once", [3, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
 )
 def test_a_ragged_batch_gives_what_each_window_gives(at_once: int) -> None:
     # Proves padding to one shape, mapping and vmapping, and `gather` of every window. Oracle: `solve` of each alone,
@@ -62,28 +62,32 @@ def solve_alone(problem: Problem, state: State):
 @pytest.mark.long
 @pytest.mark.parametrize("at_once", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_gradients_of_a_batch_are_those_of_its_windows(at_once: int) -> None:
-    # Proves `grad` through `solve_batch`, mapped and vmapped. Oracle: `grad` through `solve`, window by window.
+    # Proves `solve_batch`, and `grad` through it, mapped and vmapped. Oracle: `solve` and its `grad`, one by one.
     problems, states, _ = batch()
 
-    def loss(weight: jax.Array, problem: Problem, run) -> jax.Array:
+    def loss(weight: jax.Array, problem: Problem, run) -> tuple[jax.Array, jax.Array]:
         changed = eqx.tree_at(lambda p: p.points.weight, problem, weight)
-        return jnp.sum(run(changed).state.poses.wxyz_xyz ** 3)
+        solution = run(changed)
+        return jnp.sum(solution.state.poses.wxyz_xyz**3), solution.energy
 
     together = lambda problem: solve_batch(problem, states, solver=SOLVER, at_once=at_once)
-    found = jax.jit(jax.grad(lambda weight: loss(weight, problems, together)))(problems.points.weight)
+    run = jax.jit(jax.grad(lambda weight: loss(weight, problems, together), has_aux=True))
+    found, energy = run(problems.points.weight)
     for number in range(len(SCENES)):
         problem, state = jax.tree.map(lambda leaf, n=number: leaf[n], (problems, states))
-        expected = gradient_alone(problem, state)
+        expected, alone = gradient_alone(problem, state)
+        assert float(energy[number]) == pytest.approx(float(alone), rel=1e-9)
         np.testing.assert_allclose(found[number], expected, atol=1e-6 * float(jnp.abs(expected).max()))
 
 
 @eqx.filter_jit
-def gradient_alone(problem: Problem, state: State) -> jax.Array:
-    def loss(weight: jax.Array) -> jax.Array:
+def gradient_alone(problem: Problem, state: State) -> tuple[jax.Array, jax.Array]:
+    def loss(weight: jax.Array) -> tuple[jax.Array, jax.Array]:
         changed = eqx.tree_at(lambda p: p.points.weight, problem, weight)
-        return jnp.sum(solve(changed, state, solver=SOLVER).state.poses.wxyz_xyz ** 3)
+        solution = solve(changed, state, solver=SOLVER)
+        return jnp.sum(solution.state.poses.wxyz_xyz**3), solution.energy
 
-    return jax.grad(loss)(problem.points.weight)
+    return jax.grad(loss, has_aux=True)(problem.points.weight)
 
 
 def test_windows_of_another_kernel_or_camera_are_refused() -> None:

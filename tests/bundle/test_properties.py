@@ -54,7 +54,7 @@ def _packed(drawn: Drawn, **options: object) -> tuple[Problem, State]:
 
 
 @pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.long)])
-@examples(30)
+@examples(20)
 @given(st.data())
 def test_any_finite_problem_ends_in_finite_numbers_or_a_code(dtype: type, data: st.DataObject) -> None:
     """Oracle: the definition: a code that there is, a state that is finite and no worse than the start, what is held
@@ -115,7 +115,7 @@ def test_orders_leave_the_optimum(seed: int, order: int) -> None:
 
 
 @pytest.mark.long  # compiles once more; test_solve.py shows it in one case
-@examples(10)
+@examples(6)
 @given(SEEDS)
 def test_padding_leaves_the_optimum(seed: int) -> None:
     """Places that hold nothing, of every kind; oracle: the solution of another padded size."""
@@ -165,7 +165,7 @@ def _gradient(problem: Problem, state: State) -> tuple[Problem, State]:
 
 
 @pytest.mark.long
-@examples(40)
+@examples(20)
 @given(finite_problems(numbers_of(np.float64, largest=1e6)))
 def test_every_gradient_is_finite(drawn: Drawn) -> None:
     """By every leaf of problems that determine little, contradict themselves or lie decades apart, and have a finite
