@@ -81,10 +81,10 @@ def _disturbed(truth: Trajectory, drift: float = 0.02, scale: float = 1.05) -> T
 
 
 def _other(truth: Trajectory) -> Trajectory:
-    """A recording of another walk at the same times."""
-    other = simulate("corridor", 60, 3, SIZE, rate=5.0).ground_truth()
+    """A recording of another part of a long walk, at the same times."""
+    other = simulate("office", 160, 0, SIZE, rate=5.0).ground_truth()
     assert other is not None
-    return Trajectory(truth.timestamps, other.poses[: len(truth)])
+    return Trajectory(truth.timestamps, other.poses[100 : 100 + len(truth)])
 
 
 def _ties(truth: Trajectory, noise: float, rng: np.random.Generator) -> Map:

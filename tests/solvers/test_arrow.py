@@ -38,7 +38,6 @@ def unflat(values: np.ndarray) -> ArrowVector:
 KINDS = {
     "Gauss-Newton": {},
     "twisted": {"twisted": True},
-    "in groups": {"grouped": True},
     "in groups, twisted": {"grouped": True, "twisted": True},
 }
 

@@ -115,7 +115,7 @@ def test_what_is_written_by_hand_is_what_is_derived(shape: float, shared_focal: 
 @pytest.mark.parametrize(
     ("camera", "lens", "shared_focal", "groups"),
     [
-        (vg.cameras.RadialTangential, BENT, True, None),
+        pytest.param(vg.cameras.RadialTangential, BENT, True, None, marks=pytest.mark.long),
         (vg.cameras.RadialTangential, BENT, True, TWO),
         pytest.param(vg.cameras.KannalaBrandt, (0.03, -0.01, 0.004, -0.001), False, TWO, marks=pytest.mark.long),
     ],
