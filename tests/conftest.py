@@ -46,24 +46,41 @@ install_import_hook("vggtgeo", "typechecker.check")
 gc.set_threshold(200_000, 50, 100)
 
 LONGEST = (
-    "test_pipeline",
+    "test_transformations",
     "test_gradients",
-    "test_single_leaves",
-    "test_optimised",
-    "test_run_folder",
+    "test_doc_blocks",
+    "test_pipeline",
+    "test_rows",
     "test_tracking",
-    "test_reduced_solvers",
-    "test_structured_inverse",
-    "test_stubs",
-    "test_examples",
+    "test_loop_consistency",
+    "test_pose_uncertainty",
+    "test_user_terms",
     "test_terms",
-    "test_simulation_sequence",
-    "test_known_map",
-    "test_resume",
+    "test_host_pixels",
+    "test_recorded_prior",
+    "test_properties",
+    "test_examples",
     "test_notebooks",
+    "test_batches",
+    "test_camera_groups",
+    "test_optimised",
+    "test_sliding",
+    "test_known_map",
+    "test_uncertainty",
+    "test_diagnosis",
+    "test_adjoint_choice",
+    "test_solve",
+    "test_resume",
+    "test_run_folder",
+    "test_single_leaves",
+    "test_single_precision",
+    "test_agreement",
+    "test_simulation_sequence",
+    "test_structured_inverse",
 )
-"""Files of more than 15 s: they begin, so that no worker waits long for another's last file (`make test` keeps this
-order by `--no-loadscope-reorder`; pytest-xdist would begin with the files of most tests)."""
+"""Files of more than 15 s, with or without the tests marked `long`: they begin, so that no worker waits long for
+another's last file (`make test` keeps this order by `--no-loadscope-reorder`; pytest-xdist would begin with the files
+of most tests)."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
