@@ -10,6 +10,7 @@ information is divided by `SHARED_ERRORS`. What the points leave open is filled 
 from __future__ import annotations
 
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -40,11 +41,23 @@ MAX_DEPTH = 1e6
 """Largest depth that is used, in map units; the smallest is that of depth sensors."""
 
 
+_FOUND: WeakKeyDictionary[Slam, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
+"""Poses by the state that they are of, which never changes: the outputs of a run ask seven times for them, and 100
+resections take half a second."""
+
+
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     """Return times [n], s, and poses [n, 4, 4], world -> camera, of all frames; for a lost frame the last known pose.
 
     Resection is done only after the last adjustment, since that moves the map once more.
     """
+    if slam not in _FOUND:
+        _FOUND[slam] = _frame_poses(slam)
+    times, poses = _FOUND[slam]
+    return times.copy(), poses.copy()
+
+
+def _frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     times, poses = carried_poses(slam)
     if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
         return times, poses
