@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -32,10 +32,10 @@ class Piece:
 
     @classmethod
     def of(cls, path: Path, count: int, depth: bool = True) -> Piece:
-        """The first `count` frames, with the true pose nearest in time to each."""
+        """The first `count` frames, with the true pose nearest in time to each. depth: use measured depth."""
         jax.config.update("jax_enable_x64", True)
         sequence = open_sequence(path)
-        frames = list(sequence.frames(0, count, 1))
+        frames = [frame if depth else replace(frame, depth=None) for frame in sequence.frames(0, count, 1)]
         truth = sequence.ground_truth()
         rows = [int(np.argmin(np.abs(truth.timestamps - frame.timestamp))) for frame in frames]
         times = np.array([frame.timestamp for frame in frames])

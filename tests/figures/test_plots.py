@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import vggtgeo as vg
 from vggtgeo.figures import plots
+from vggtgeo.figures.style import BLUE, ORANGE
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -92,8 +93,8 @@ def test_a_picture_is_written(tmp_path: Path, count: int, with_truth: bool) -> N
     assert image is not None
     assert min(image.shape[:2]) > 300
     if count == 40:
-        assert _has(image, plots._ESTIMATE)
-        assert _has(image, plots._TRUTH) or not with_truth
+        assert _has(image, BLUE)
+        assert _has(image, ORANGE) or not with_truth
 
 
 def test_truth_without_common_times_is_left_out(tmp_path: Path) -> None:

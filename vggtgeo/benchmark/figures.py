@@ -17,12 +17,10 @@ from vggtgeo.benchmark.table import Row, Summary, select, values
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import align, associate
 from vggtgeo.figures.plots import NotebookFigure, view_axes
+from vggtgeo.figures.style import BLUE, INK, ORANGE, RULE, line_colour, style
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.report.figures import calm
 
-_FULL, _OTHER, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
-LINES = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8e5fb0", "#b0413e", "#7a7a2a", "#3b9aa5", "#a05a2c")
 _ROW, _LINE, _MARGIN = 0.3, 0.15, 0.9
 """Inches."""
 _LABEL, _TITLE, _ENTRY = 30, 60, 44
@@ -58,8 +56,8 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
     for axes, (name, keys) in zip(drawn, panels.items(), strict=True):
         _draw_panel(axes, suite, [_errors(good, name, key, column) for key in keys], keys)
         axes.set_yticks(range(len(keys)), rows_of[name])
-        axes.set_title(_wrapped(name, _TITLE), loc="left", fontsize=10, color=_INK)
-    drawn[-1].set_xlabel(f"{column.head}; dots: runs, bars: means with 95 % intervals", fontsize=9, color=_INK)
+        axes.set_title(_wrapped(name, _TITLE), loc="left", fontsize=10, color=INK)
+    drawn[-1].set_xlabel(f"{column.head}; dots: runs, bars: means with 95 % intervals", fontsize=9, color=INK)
     return figure
 
 
@@ -91,7 +89,7 @@ def _errors(rows: Sequence[Row], sequence: str, setting: str, column: cells.Colu
 
 def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Sequence[str]) -> None:
     for row, (key, numbers) in enumerate(zip(keys, errors, strict=True)):
-        colour = _FULL if key == suite.base else _OTHER
+        colour = BLUE if key == suite.base else ORANGE
         summary = Summary.of(numbers)
         axes.plot(numbers, np.full(len(numbers), row), "o", ms=5, color=colour, alpha=0.55, mec="none")
         axes.plot([summary.mean] * 2, [row - 0.32, row + 0.32], color=colour, lw=2.5)
@@ -99,7 +97,7 @@ def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Seq
             low = max(summary.mean - summary.half, 0.3 * float(numbers.min()))
             axes.plot([low, summary.mean + summary.half], [row, row], color=colour, lw=1.2)
         if key == suite.base:
-            axes.axvline(summary.mean, color=_FULL, lw=0.8, ls=":")
+            axes.axvline(summary.mean, color=BLUE, lw=0.8, ls=":")
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     wider = max(np.sqrt(_MIN_SPAN * low / high), 1.0)
@@ -108,11 +106,7 @@ def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Seq
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(len(keys) - 0.4, -0.6)
-    axes.grid(axis="x", color=_GRID, lw=0.7, which="both")
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=_INK, labelsize=9)
-    for spine in axes.spines.values():
-        spine.set_color("#bbbbbb")
+    style(axes, axis="x", which="both")
 
 
 class Path3:
@@ -161,21 +155,19 @@ def paths_figure(given: Sequence[Path3], width: float = 5.0) -> NotebookFigure:
     above, along = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
     view, origin = view_axes(given[0].truth, level_world=True), given[0].truth.positions[0]
     flat = lambda trajectory: ((trajectory.positions - origin) @ view.T)[:, :2].T
-    above.plot(*flat(given[0].truth), color="#333333", lw=1.0, ls="--", label="truth")
+    above.plot(*flat(given[0].truth), color=INK, lw=1.0, ls="--", label="truth")
     for number, one in enumerate(given):
-        colour = LINES[number % len(LINES)]
+        colour = line_colour(number)
         above.plot(*flat(one.estimate), color=colour, lw=1.2, label=_wrapped(one.title, _ENTRY))
         along.plot(one.estimate.timestamps - one.truth.timestamps[0], 100 * one.errors, color=colour, lw=1.0)
     above.set_aspect("equal", adjustable="datalim")
     above.set_xlabel("m")
-    above.legend(
-        frameon=False, fontsize=8, labelcolor="#333333", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.1)
-    )
+    above.legend(frameon=False, fontsize=8, labelcolor=INK, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.1))
     along.set_xlabel("seconds")
     along.set_ylabel("error cm")
     along.set_ylim(bottom=0)
     for axes in (above, along):
-        calm(axes)
+        style(axes)
     return figure
 
 
@@ -202,17 +194,17 @@ def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> Notebo
     for number, name in enumerate(stages):
         seconds = np.nan_to_num([_mean(own, name) for _, own in groups])
         label = name.removeprefix("seconds_").replace("_", " ")
-        time.barh(range(len(groups)), seconds, left=left, color=LINES[number % len(LINES)], height=0.6, label=label)
+        time.barh(range(len(groups)), seconds, left=left, color=line_colour(number), height=0.6, label=label)
         left += seconds
-    memory.barh(range(len(groups)), [_mean(own, "peak_memory_gb") for _, own in groups], color="#bbbbbb", height=0.6)
+    memory.barh(range(len(groups)), [_mean(own, "peak_memory_gb") for _, own in groups], color=RULE, height=0.6)
     time.set_yticks(range(len(groups)), [name for name, _ in groups])
     time.set_ylim(len(groups) - 0.4, -0.6)
     time.set_xlabel("seconds, by stage")
     memory.set_xlabel("memory GB")
     for axes in (time, memory):
-        calm(axes)
+        style(axes)
     if stages:
-        figure.legend(loc="outside lower center", frameon=False, fontsize=8, labelcolor="#333333", ncols=5)
+        figure.legend(loc="outside lower center", frameon=False, fontsize=8, labelcolor=INK, ncols=5)
     return figure
 
 

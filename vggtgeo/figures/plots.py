@@ -19,11 +19,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from vggtgeo.evaluation import AbsoluteError, TrajectoryReport, absolute_error, associate
+from vggtgeo.figures.style import BLUE, INK, ORANGE, style
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
 
-_ESTIMATE, _TRUTH, _INK, _GRID = "#1f5fbf", "#e07b1a", "#333333", "#e3e3e3"
 _WIDTH = 11.0
 """Inches."""
 _WEIGHT_OF_MEAN_UP = 0.02
@@ -96,7 +96,7 @@ def trajectory_figure(
         "seen from the side" + ("" if drawn.truth or _yaws(seen) else "; up is that of the images"),
     )
     if title is not None:
-        figure.suptitle(_title(drawn, title, with_scale, metres), x=0.01, ha="left", fontsize=12, color=_INK)
+        figure.suptitle(_title(drawn, title, with_scale, metres), x=0.01, ha="left", fontsize=12, color=INK)
     return figure
 
 
@@ -166,7 +166,7 @@ def _draw(drawn: _Aligned, axes_of_view: np.ndarray, unit: str, width: float, si
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[vertical], high[vertical])
         axes.set_ylabel(f"{'across' if vertical == 1 else 'up'} [{unit}]")
-        axes.set_title(name, loc="left", fontsize=10, color=_INK)
+        axes.set_title(name, loc="left", fontsize=10, color=INK)
     side.set_xlabel(f"along the longest extent [{unit}]")
     handles, labels = top.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=len(labels), frameon=False, fontsize=9)
@@ -179,18 +179,14 @@ def _draw_view(axes: Any, drawn: _Aligned, origin: np.ndarray, rows: np.ndarray)
 
     path = flat(drawn.estimate.positions)
     if drawn.truth is not None:
-        axes.plot(*flat(drawn.truth.positions), color=_TRUTH, lw=2.2, alpha=0.9, label="truth", zorder=2)
-    axes.plot(*path, color=_ESTIMATE, lw=1.3, label="estimate", zorder=3)
+        axes.plot(*flat(drawn.truth.positions), color=ORANGE, lw=2.2, alpha=0.9, label="truth", zorder=2)
+    axes.plot(*path, color=BLUE, lw=1.3, label="estimate", zorder=3)
     if len(drawn.keyframes):
-        axes.plot(*flat(drawn.keyframes), ".", color=_ESTIMATE, ms=5, label="keyframes", zorder=4)
-    axes.plot(*path[:, 0], "o", color="white", mec=_INK, mew=1.5, ms=9, label="start", zorder=5)
-    axes.plot(*path[:, -1], "s", color=_INK, mec="white", mew=1.0, ms=9, label="end", zorder=5)
+        axes.plot(*flat(drawn.keyframes), ".", color=BLUE, ms=5, label="keyframes", zorder=4)
+    axes.plot(*path[:, 0], "o", color="white", mec=INK, mew=1.5, ms=9, label="start", zorder=5)
+    axes.plot(*path[:, -1], "s", color=INK, mec="white", mew=1.0, ms=9, label="end", zorder=5)
     axes.set_aspect("equal", adjustable="box")
-    axes.grid(color=_GRID, lw=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=_INK, labelsize=9)
-    for spine in axes.spines.values():
-        spine.set_color("#bbbbbb")
+    style(axes)
 
 
 def _title(drawn: _Aligned, title: str, with_scale: bool, metres: bool) -> str:
@@ -211,7 +207,7 @@ def errors_figure(report: TrajectoryReport) -> NotebookFigure:
     figure = NotebookFigure(figsize=(6.0, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    found = (("SE(3)", report.se3, _ESTIMATE), ("Sim(3)", report.sim3, _TRUTH))
+    found = (("SE(3)", report.se3, BLUE), ("Sim(3)", report.sim3, ORANGE))
     edges = np.linspace(0, 100 * max(float(error.errors.max()) for _, error, _ in found) + 1e-9, 31)
     for name, error, colour in found:
         label = f"after {name}: RMSE {100 * error.statistics.rmse:.2f} cm"
@@ -227,9 +223,9 @@ def energy_figure(history: np.ndarray, message: str) -> NotebookFigure:
     figure = NotebookFigure(figsize=(5.0, 3.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    axes.semilogy(history, ".-", color=_ESTIMATE)
+    axes.semilogy(history, ".-", color=BLUE)
     axes.set_xlabel("iteration")
     axes.set_ylabel("energy")
-    axes.set_title(message, loc="left", fontsize=10, color=_INK)
-    axes.grid(color=_GRID, lw=0.7)
+    axes.set_title(message, loc="left", fontsize=10, color=INK)
+    style(axes)
     return figure

@@ -13,11 +13,9 @@ from vggtgeo.bundle.analysis.covariances import Covariances
 from vggtgeo.bundle.analysis.observability_report import WEAK, Observability, lost_shares
 from vggtgeo.bundle.problem import State
 from vggtgeo.figures.plots import NotebookFigure
+from vggtgeo.figures.style import BLUE, INK, ORANGE, line_colour, style
 from vggtgeo.geometry import rigid
 
-COLOURS = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8a8f98", "#8e5fb0", "#b0413e")
-"""Of the terms of a problem, repeated if there are more."""
-_INK, _GRID = "#333333", "#e3e3e3"
 _FACTORS = (1, 3, 10, 30, 100, 300, 1000)
 """Standard deviations to choose from for the ellipses."""
 _MAX_SHARE = 0.2
@@ -46,12 +44,12 @@ def covariance_figure(
     for place, sizes, directions in zip(centres, half_axes, vectors, strict=True):
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
         size = 2 * factor * sizes[::-1]
-        axes.add_patch(Ellipse(place, *size, angle=angle, color="#e07b1a", alpha=0.35, lw=0, zorder=1))
-    axes.plot(*centres.T, "o-", color="#1f5fbf", ms=5, lw=0.8, label="estimate", zorder=3)
+        axes.add_patch(Ellipse(place, *size, angle=angle, color=ORANGE, alpha=0.35, lw=0, zorder=1))
+    axes.plot(*centres.T, "o-", color=BLUE, ms=5, lw=0.8, label="estimate", zorder=3)
     if truth is not None:
         axes.plot(*flat(np.asarray(truth)).T, "+", color="black", ms=10, label="truth", zorder=4)
     for number, place in enumerate(centres):
-        axes.annotate(str(number), place, (0, -14), textcoords="offset points", ha="center", fontsize=8, color=_INK)
+        axes.annotate(str(number), place, (0, -14), textcoords="offset points", ha="center", fontsize=8, color=INK)
     unknown = f"; undetermined: {', '.join(map(str, np.nonzero(~known)[0]))}" if not known.all() else ""
     axes.set_title(f"Camera centres from above, ellipses of {factor:g} sigma{unknown}", loc="left", fontsize=10)
     axes.set(xlabel="to the right of the first camera [m]", ylabel="ahead of it [m]")
@@ -70,8 +68,8 @@ def observability_figure(found: Observability) -> NotebookFigure:
     left, right = figure.subplots(1, 2, width_ratios=[2, 3])
     shown = min(int(np.sum(found.free)), found.whole.values.shape[-1])
     floor = 0.1 * float(np.finfo(found.whole.values.dtype).eps)
-    rows = [("all", found.whole.values[0], _INK)]
-    rows += [(f"without {kind}", found.without.values[k], _colour(k)) for k, kind in enumerate(found.terms)]
+    rows = [("all", found.whole.values[0], INK)]
+    rows += [(f"without {kind}", found.without.values[k], line_colour(k)) for k, kind in enumerate(found.terms)]
     for name, values, colour in rows:
         style = {"lw": 2.2, "zorder": 3} if name == "all" else {"lw": 1.2}
         left.semilogy(np.maximum(np.asarray(values)[:shown], floor), ".-", ms=4, color=colour, label=name, **style)
@@ -84,7 +82,7 @@ def observability_figure(found: Observability) -> NotebookFigure:
     names = [name for name in shares if not name.startswith("keyframe")]
     for k, kind in enumerate(found.terms):
         heights = [100 * shares[name][kind] for name in names]
-        right.bar(np.arange(len(names)) + 0.2 * (k - 1.5), heights, 0.2, color=_colour(k), label=kind)
+        right.bar(np.arange(len(names)) + 0.2 * (k - 1.5), heights, 0.2, color=line_colour(k), label=kind)
     right.set_xticks(range(len(names)), [name.replace("translation ", "") for name in names], rotation=30, ha="right")
     right.set_ylabel("information lost [%]")
     right.set_title("Without a kind of observation", loc="left", fontsize=10)
@@ -92,23 +90,13 @@ def observability_figure(found: Observability) -> NotebookFigure:
     right.set_ylim(0, 118)
     right.set_yticks([0, 25, 50, 75, 100])
     for axes in (left, right):
-        _tidy(axes)
+        style(axes)
     return figure
-
-
-def _colour(k: int) -> str:
-    return COLOURS[k % len(COLOURS)]
 
 
 def _figure(width: float, height: float) -> tuple[NotebookFigure, Any]:
     figure = NotebookFigure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    _tidy(axes)
+    style(axes)
     return figure, axes
-
-
-def _tidy(axes: Any) -> None:
-    axes.grid(color=_GRID, lw=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=_INK, labelsize=9)

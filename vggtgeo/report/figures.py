@@ -7,7 +7,6 @@ import io
 import re
 import zlib
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import matplotlib as mpl
@@ -17,20 +16,19 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from vggtgeo.figures.plots import trajectory_figure
+from vggtgeo.figures.style import BLUE, GREEN, GRID, INK, ORANGE, RULE, line_colour, style
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.window_recorder import WindowRecord
 
 COLOURS = {
-    "#1f5fbf": "var(--blue)",
-    "#e07b1a": "var(--orange)",
-    "#3a8f5c": "var(--green)",
-    "#333333": "var(--ink)",
-    "#bbbbbb": "var(--rule)",
-    "#e3e3e3": "var(--grid)",
+    BLUE: "var(--blue)",
+    ORANGE: "var(--orange)",
+    GREEN: "var(--green)",
+    INK: "var(--ink)",
+    RULE: "var(--rule)",
+    GRID: "var(--grid)",
 }
 """Colours of the figures, and the variables of the style sheet that replace them."""
-_TERMS = ("#1f5fbf", "#e07b1a", "#3a8f5c", "#8e5fb0", "#b0413e")
-"""Colours of the terms of a window, repeated if there are more."""
 _LABELS = {
     "points": "points",
     "lines": "lines",
@@ -64,14 +62,15 @@ def residuals_svg(records: Sequence[WindowRecord]) -> str:
     time = np.array([record.timestamp for record in records]) - records[0].timestamp
     for number, (name, unit) in enumerate(units.items()):
         values = np.array([record.rms.get(name, np.nan) for record in records])
-        colour = _TERMS[number % len(_TERMS)]
-        rows[unit].plot(time, values, color=colour, lw=1.4, marker=".", ms=3, label=_LABELS.get(name, name))
+        rows[unit].plot(
+            time, values, color=line_colour(number), lw=1.4, marker=".", ms=3, label=_LABELS.get(name, name)
+        )
     for unit, axes in rows.items():
         axes.set_ylabel(_UNITS.get(unit, unit))
         axes.set_ylim(bottom=0)
-        calm(axes)
+        style(axes)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize=9, labelcolor="#333333", ncols=2)
+            axes.legend(frameon=False, fontsize=9, labelcolor=INK, ncols=2)
     rows[kinds[-1]].set_xlabel("time [s]")
     return svg(figure)
 
@@ -101,17 +100,6 @@ def confidence_colours(confidence: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray
 
 def _map_colours(share: np.ndarray) -> np.ndarray:
     return np.asarray(255 * mpl.colormaps["viridis"](share)[..., :3], np.uint8)
-
-
-def calm(axes: Any) -> None:
-    """Style axes with the colours of the page."""
-    axes.grid(color="#e3e3e3", lw=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors="#333333", labelsize=9)
-    axes.xaxis.label.set(color="#333333", fontsize=9)
-    axes.yaxis.label.set(color="#333333", fontsize=9)
-    for spine in axes.spines.values():
-        spine.set_color("#bbbbbb")
 
 
 def svg(figure: Figure) -> str:

@@ -15,7 +15,9 @@ from recorded_run import SETTINGS, recorded_run
 import vggtgeo as vg
 from vggtgeo.slam.global_map import compile_ahead, global_adjustment
 from vggtgeo.slam.global_map.compile_ahead import compile_before_runs
+from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline
+from vggtgeo.slam.state import Slam
 
 
 class _Ready(np.ndarray):
@@ -49,9 +51,7 @@ def test_the_programs_of_the_end_are_compiled_before(monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(compile_ahead, name, lambda *_: None)
     monkeypatch.setattr(compile_ahead, "solve_jit", solve)
     compile_before_runs(SETTINGS, 320, 240)
-    slam = recorded_run().states[-1]
-    factors = (() if metric else (MeasuredBaseline(0, 1, 1.0, 1e-3),)) + slam.map.factors
-    slam = replace(slam, map=replace(slam.map, metric=metric, factors=factors))
+    slam = _with_or_without_depth(metric)
 
     def called(*args: Any) -> Any:
         assert _program(*args) in compiled
@@ -60,6 +60,43 @@ def test_the_programs_of_the_end_are_compiled_before(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(global_adjustment, "solve_jit", called)
     with pytest.raises(_Called):
         global_adjustment.adjust_all(slam, SETTINGS)
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_program_of_the_end_is_compiled_during_the_run(monkeypatch: pytest.MonkeyPatch, metric: bool) -> None:
+    # Proves that the callback compiles what the last adjustment of a map with depth and of one without asks for, once.
+    # Oracle: structure and shapes of what the adjustment of a recorded run solves.
+    compiled: list[tuple[Any, ...]] = []
+
+    def solve(*args: Any) -> Any:
+        compiled.append(_program(*args))
+        return SimpleNamespace(energy=np.zeros(1).view(_Ready))
+
+    monkeypatch.setattr(compile_ahead, "keyframe_sigma", lambda *_: None)
+    monkeypatch.setattr(compile_ahead, "solve_jit", solve)
+    slam = _with_or_without_depth(metric)
+    settings = updated(SETTINGS, {"refinement": {"global_adjustment": True}})
+    ahead, count = compile_ahead.CompileAhead(settings), len(slam.frames)
+    ahead.on_begin("a walk", round(count / 0.6))
+    for _ in range(2):
+        ahead.on_frame(slam, recorded_run().frames[-1])
+    ahead.on_adjust(slam)
+    assert len(compiled) == 1
+
+    def called(*args: Any) -> Any:
+        assert _program(*args) in compiled
+        raise _Called
+
+    monkeypatch.setattr(global_adjustment, "solve_jit", called)
+    with pytest.raises(_Called):
+        global_adjustment.adjust_all(slam, settings)
+
+
+def _with_or_without_depth(metric: bool) -> Slam:
+    """A recorded run, its map with or without depth."""
+    slam = recorded_run().states[-1]
+    factors = (() if metric else (MeasuredBaseline(0, 1, 1.0, 1e-3),)) + slam.map.factors
+    return replace(slam, map=replace(slam.map, metric=metric, factors=factors))
 
 
 def test_the_command_takes_the_size_of_images(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,13 +9,15 @@ import pytest
 from small_keyframes import INTRINSICS, SIZE, keyframe
 from vggtgeo.models.roles import GeometryResult, PoseGuess
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.camera.rolling_shutter import image_shift
+from vggtgeo.slam.global_map import frame_poses as module
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_motions import frame_motions
 from vggtgeo.slam.global_map.frame_poses import MIN_POINTS, frame_poses
+from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
@@ -108,9 +110,9 @@ def test_what_the_adjustment_did_to_points_and_keyframe_counts() -> None:
 
 def test_without_enough_points_a_pose_stays() -> None:
     """One point too few, points whose depth is gone, or that came to lie behind the camera, a frame without a pose, a
-    map that is not finished: as it was carried, to the bit.
+    map that is not finished; and nothing known of its tracking: as it was carried, to the bit.
     """
-    slam, _ = walked(np.random.default_rng(2), MIN_POINTS)
+    slam = with_second(walked(np.random.default_rng(2), MIN_POINTS)[0], evidence=Evidence())
     few = slam.frames[1].seen
     assert few is not None
     first = slam.keyframes[0]
@@ -118,7 +120,7 @@ def test_without_enough_points_a_pose_stays() -> None:
     for wrong in (
         with_second(slam, seen=SeenPoints(few.slots[1:], few.pixels[1:])),
         replace(slam, map=replace(slam.map, keyframes=(gone,))),
-        with_second(slam, relative=exponential(np.array([0, 0, -9.0, 0, 0, 0])), evidence=Evidence()),
+        with_second(slam, relative=exponential(np.array([0, 0, -9.0, 0, 0, 0]))),
         with_second(slam, tracked=False),
         replace(slam, map=replace(slam.map, pose_sigma=None)),
     ):
@@ -174,3 +176,28 @@ def test_a_frame_keeps_some_of_its_matches() -> None:
     assert few is not None
     assert len(few.slots) == 0
     assert Located(guess, 500, np.zeros((500, 3)), 2.0).seen is None
+
+
+def test_what_points_leave_open_is_smoothed_without_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frame that is neither a keyframe's nor unknown is free, with the information of its points at their noise;
+    with measured depth nothing is smoothed. Oracle: the noise that was drawn, and dense algebra.
+    """
+    rng, asked = np.random.default_rng(4), []
+    slam, _ = walked(rng)
+    seen = slam.frames[1].seen
+    assert seen is not None
+    noisy = seen.pixels + rng.normal(0, 0.3, seen.pixels.shape).astype(np.float32)
+    slam = with_second(slam, seen=replace(seen, pixels=noisy))
+    monkeypatch.setattr(module, "smoothed", lambda *given: asked.append(given) or given[1])
+    frame_poses(slam)
+    ((_, poses, information, free, label),) = asked
+    assert free.tolist() == [False, True, False]
+    assert label.tolist() == [0, 0, 0]
+    first = slam.keyframes[0]
+    points = rigid.unproject(first.points.pixels, first.points.inverse_depth, first.pose, INTRINSICS)
+    rows = np.concatenate(pinhole.projection_rows(points @ poses[1, :3, :3].T + poses[1, :3, 3], INTRINSICS), 1)
+    expected = rows @ rows.T / (SHARED_ERRORS * 0.3**2)
+    # Robust weights of a Gaussian take a share of it.
+    assert 0.5 < np.trace(information[1]) / np.trace(expected) < 1.1
+    frame_poses(replace(slam, map=replace(slam.map, metric=True)))
+    assert len(asked) == 1

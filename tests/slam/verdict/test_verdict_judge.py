@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.results.result import Result
 from vggtgeo.slam.verdict import judge as judge_module
-from vggtgeo.slam.verdict.claim import WINDOW, linked, thinned, windows
+from vggtgeo.slam.verdict.claim import WINDOW, Claim, linked, thinned, windows
 from vggtgeo.slam.verdict.corner_adjustment import Noise, solve, start_of
 from vggtgeo.slam.verdict.corner_findings import findings
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
@@ -36,10 +36,13 @@ def test_a_run_is_judged_as_a_whole() -> None:
     for frame in run.frames:
         recorder.add(frame)
     assert judge(run.slam, recorder.frames).level == "good"
+    assert judge(run.slam, recorder.frames[:-1]).level == "good"
     assert Result.of(run.slam, recorder.frames).verdict.level == "good"
     keyframes = [replace(k, pose=k.pose @ _turn(30.0 * k.number)) for k in run.slam.keyframes]
-    stirred = judge(replace(run.slam, map=replace(run.slam.map, keyframes=tuple(keyframes))), recorder.frames)
+    wrong = replace(run.slam, map=replace(run.slam.map, keyframes=tuple(keyframes)))
+    stirred = judge(wrong, recorder.frames)
     assert stirred.level != "good"
+    assert judge(wrong, recorder.frames[:-1]).level != "good"
     again = Verdict.from_dict(json.loads(json.dumps(stirred.to_dict())), stirred.metric)
     assert again == stirred
 
@@ -58,6 +61,8 @@ def test_an_error_in_the_verdict_loses_no_result(monkeypatch: pytest.MonkeyPatch
     assert verdict.level == "degraded"
     assert any("LinAlgError: Singular matrix" in reason for reason in verdict.reasons)
     assert known.text in verdict.reasons
+    monkeypatch.setattr(Claim, "of", fails)
+    assert judge_or_report(slam, (), (known,)) == verdict
 
 
 def test_a_cause_is_one_reason() -> None:

@@ -79,6 +79,9 @@ def test_pictures_that_are_shown_again_while_the_camera_moves(still: bool, told:
     corners[12:27] = [replace(here.evidence[11], frame=row) for row in range(12, 27)]
     claim = replace(here.claim, poses=poses)
     assert [one.check for one in check_frozen(claim, corners)] == ["frozen"] * told
+    # Lost frames tell no speed, whatever their poses.
+    lost = replace(claim, tracked=np.arange(40) < 27, poses=np.r_[poses[:27], np.tile(poses[26:27], (13, 1, 1))])
+    assert [one.check for one in check_frozen(lost, corners)] == ["frozen"] * told
     rng = np.random.default_rng(0)
     moved = [
         replace(one, pixels=(one.pixels + 0.05 * rng.standard_normal(one.pixels.shape)).astype(np.float32))

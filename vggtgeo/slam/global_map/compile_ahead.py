@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -53,11 +54,12 @@ class CompileAhead(Callback):
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         count = expected_keyframes(len(slam.keyframes), len(slam.frames), self._total)
-        if count is None or not slam.metric or not self._settings.refinement.global_adjustment:
+        if count is None or not slam.keyframes or not self._settings.refinement.global_adjustment:
             return
         shape = self._shape(slam, count)
         if shape.size.keyframes <= MAX_DENSE and shape not in self._asked:
-            self._asked[shape] = self._pool.submit(compile_global, shape, self._settings, shares_focal(slam))
+            task = partial(compile_global, shape, self._settings, shares_focal(slam), metric=slam.metric)
+            self._asked[shape] = self._pool.submit(task)
 
     def on_adjust(self, slam: Slam) -> None:
         """Wait for the program that is needed now."""
@@ -69,7 +71,8 @@ class CompileAhead(Callback):
         """Return the shape of a map with so many keyframes and as many edges for each as now."""
         ends = np.array([pair.key for pair in slam.map.pairs], int).reshape(-1, 2)
         edges = np.minimum(np.bincount(ends.ravel(), minlength=1), MAX_NEIGHBOURS).sum()
-        return shape_for(keyframes, round(edges * keyframes / len(slam.keyframes)), self._settings)
+        shape = shape_for(keyframes, round(edges * keyframes / len(slam.keyframes)), self._settings)
+        return shape if slam.metric else _without_depth(shape)
 
 
 def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | None:
@@ -118,7 +121,9 @@ def usual_shapes(settings: SlamSettings, metric: bool) -> list[GlobalShape]:
     """Return the shapes of maps of at most 64 keyframes in one submap, without recorded poses."""
     edges = [(SMALL[0], 0), *((SMALL[1], int(share * MAX_NEIGHBOURS * SMALL[1])) for share in EDGE_SHARES)]
     shapes = [shape_for(*own, settings) for own in edges]
-    if metric:
-        return shapes
-    # The scale's anchor is the first factor of a map without depth.
-    return [replace(shape, factors=((MeasuredBaseline, padded_count(1)), *shape.factors)) for shape in shapes]
+    return shapes if metric else list(map(_without_depth, shapes))
+
+
+def _without_depth(shape: GlobalShape) -> GlobalShape:
+    """Return the shape of a map without measured depth: its first factor is the scale's anchor."""
+    return replace(shape, factors=((MeasuredBaseline, padded_count(1)), *shape.factors))

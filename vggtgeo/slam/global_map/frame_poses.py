@@ -1,22 +1,28 @@
-"""Final poses of all frames: relative to their keyframes and, without measured depth, resected in the final map.
+"""Final poses of all frames: relative to their keyframes and, without measured depth, resected and smoothed.
 
 Without measured depth a frame is tracked against depths from two or three keyframes, and later adjustments change the
 map. Poses relative to keyframes would then have a step at each new keyframe. So a frame keeps some of its tracked
 points (`SeenPoints`), and its pose is estimated from them in the final map (resection), with the tracked pose as a
 prior (`benchmarks/between_keyframes.py`). The matches of that prior share the errors of their depths, so its
-information is divided by `SHARED_ERRORS`.
+information is divided by `SHARED_ERRORS`. What the points leave open is filled in by `smooth_motion.py`.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.robust import sigma_by_median
 from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.global_map.smooth_motion import smoothed
 from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
+from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.evidence import tangent
@@ -29,8 +35,15 @@ WIDTH, MAX_WIDTH = 1.0, 8.0
 """Width of the Geman-McClure kernel, pixels: final and initial, halved in each step. A redescending kernel, because
 matches may be off by as much as the gate of tracking, some pixels (`benchmarks/between_keyframes.py`)."""
 STEPS, CONVERGED = 15, 1e-5
+MIN_NOISE = 0.01
+"""Smallest noise of a match, pixels: of their rounding."""
 MAX_DEPTH = 1e6
 """Largest depth that is used, in map units; the smallest is that of depth sensors."""
+
+
+_FOUND: WeakKeyDictionary[Slam, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
+"""Poses by the state that they are of, which never changes: the outputs of a run ask seven times for them, and 100
+resections take half a second."""
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
@@ -38,6 +51,13 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
 
     Resection is done only after the last adjustment, since that moves the map once more.
     """
+    if slam not in _FOUND:
+        _FOUND[slam] = _frame_poses(slam)
+    times, poses = _FOUND[slam]
+    return times.copy(), poses.copy()
+
+
+def _frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     times, poses = carried_poses(slam)
     if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
         return times, poses
@@ -47,15 +67,27 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     motions = _motions(slam)
     # With metric depth the errors that frames share are in the tracked information already.
     as_one = 1.0 if slam.metric else SHARED_ERRORS
+    tracked = np.array([tracked_information(record.evidence) / as_one for record in slam.frames])
 
-    def placed(row: int) -> np.ndarray:
+    def placed(row: int) -> _Resected:
         points, pixels = _sight(slam, row, poses[row], motions)
-        known = tracked_information(slam.frames[row].evidence) / as_one
-        return _resected(points, pixels, poses[row], known, slam.intrinsics)
+        return _resected(points, pixels, poses[row], tracked[row], slam.intrinsics)
 
-    found = poses.copy()
-    found[rows] = np.array(map_in_threads(placed, rows))
-    return times, found
+    found, resected = poses.copy(), map_in_threads(placed, rows)
+    found[rows] = [one.pose for one in resected]
+    noise = sigma_by_median(np.concatenate([one.residuals.ravel() for one in resected] + [np.full(1, MIN_NOISE)]))
+    for row, one in zip(rows, resected, strict=True):
+        if len(one.residuals):
+            tracked[row] = tracked[row] + one.information / (as_one * max(noise, MIN_NOISE) ** 2)
+    return times, found if slam.metric else _smoothed(slam, times, found, tracked)
+
+
+def _smoothed(slam: Slam, times: np.ndarray, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Return the poses of all frames, those between keyframes smoothed. information: [n, 6, 6], zero if unknown."""
+    submap = submap_of(slam.map)
+    label = np.array([submap[record.reference] if record.tracked else -1 for record in slam.frames])
+    apart = [not np.array_equal(record.relative, np.eye(4)) for record in slam.frames]
+    return smoothed(times, poses, information, np.array(apart) & information.any((1, 2)), label)
 
 
 def _placed_by_points(slam: Slam) -> list[int]:
@@ -97,15 +129,25 @@ def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tupl
     return points, record.seen.pixels[known].astype(np.float64)
 
 
+class _Resected(NamedTuple):
+    """A pose [4, 4] by points, their information about it [6, 6] for a noise of one pixel, and their residuals [m, 2],
+    pixels; none where the pose stays for lack of points.
+    """
+
+    pose: np.ndarray
+    information: np.ndarray = np.zeros((6, 6))
+    residuals: np.ndarray = np.zeros((0, 2))
+
+
 def _resected(
     points: np.ndarray, pixels: np.ndarray, pose: np.ndarray, known: np.ndarray, intrinsics: np.ndarray
-) -> np.ndarray:
+) -> _Resected:
     """Return the pose [4, 4] near `pose`, with prior information `known` [6, 6], of points [m, 3] at pixels [m, 2].
 
     Robust; `pose` itself if there are few points, or the energy does not fall.
     """
     if len(points) < MIN_POINTS:
-        return pose
+        return _Resected(pose)
     current, before = pose, _energy(points, pixels, pose, intrinsics)
     for number in range(STEPS):
         # Graduated non-convexity: from a pose that is off, right matches look like outliers to the final width.
@@ -113,19 +155,21 @@ def _resected(
         local = points @ current[:3, :3].T + current[:3, 3]
         front = local[:, 2] > MIN_DEPTH
         if np.count_nonzero(front) < MIN_POINTS:
-            return pose
+            return _Resected(pose)
         off = pinhole.project(local[front], intrinsics) - pixels[front]
         weight = 1.0 / (1.0 + (off**2).sum(1) / width**2) ** 2
         rows = np.concatenate(pinhole.projection_rows(local[front], intrinsics), 1)
         weighted = rows * np.tile(weight, 2)
-        hessian = weighted @ rows.T + known
+        information = weighted @ rows.T
+        hessian = information + known
         gradient = weighted @ off.T.ravel() + known @ tangent(current @ rigid.invert(pose))
         step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
         current = rigid.moved(current[None], step[None])[0]
         if width == WIDTH and np.abs(step).max() < CONVERGED:
             break
     # A redescending kernel has other minima: a step away from the tracked pose must lower the energy.
-    return rigid.orthonormal(current) if _energy(points, pixels, current, intrinsics) < before else pose
+    better = _energy(points, pixels, current, intrinsics) < before
+    return _Resected(rigid.orthonormal(current) if better else pose, information, off)
 
 
 def _energy(points: np.ndarray, pixels: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> float:

@@ -45,16 +45,17 @@ def judge_or_report(slam: Slam, evidence: CornerTracks = (), input_findings: tup
         return judge(slam, evidence, input_findings)
     except Exception as error:  # noqa: BLE001 - of any kind: the result exists, and is worth more than its verdict
         text = f"the verdict ended in an error ({type(error).__name__}: {error}): the result is unchecked"
-        claim, found = Claim.of(slam), [*input_findings, Finding("verdict", "degraded", text)]
-        return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
+        frames, times = [record.frame for record in slam.frames], [record.timestamp for record in slam.frames]
+        return conclude([*input_findings, Finding("verdict", "degraded", text)], frames, times, slam.metric)
 
 
 def aligned(slam: Slam, claim: Claim, evidence: CornerTracks) -> CornerTracks | None:
-    """Return the corners of each frame of the run, undistorted as it estimated; None if some are missing."""
+    """Return the corners of each frame of the run, undistorted as it estimated; None if none were recorded."""
     by_frame, lens = {noted.frame: noted for noted in evidence}, slam.camera.lens
-    if any(frame not in by_frame for frame in claim.frames):
+    if not evidence:
         return None
-    found = [by_frame[frame] for frame in claim.frames]
+    empty = replace(evidence[0], ids=evidence[0].ids[:0], pixels=evidence[0].pixels[:0], depth=evidence[0].depth[:0])
+    found = [by_frame.get(frame, empty) for frame in claim.frames.tolist()]
     if lens is None:
         return found
     return [replace(noted, pixels=lens.undistorted(noted.pixels).astype(np.float32)) for noted in found]
@@ -168,8 +169,7 @@ def check_extent(claim: Claim, share: float) -> list[Finding]:
 
 def check_unit(claim: Claim, corners: CornerTracks) -> list[Finding]:
     """Check that measured depths are in the range of sensors for rooms: images alone cannot show a wrong unit."""
-    depths = np.concatenate([frame.depth for frame in corners])
-    depths = depths[np.isfinite(depths)]
+    depths = np.concatenate([frame.depth[np.isfinite(frame.depth)] for frame in corners])
     if not claim.metric or not len(depths):
         return []
     near, middle = np.quantile(depths, [0.1, 0.5])
@@ -188,10 +188,11 @@ def check_frozen(claim: Claim, corners: CornerTracks) -> list[Finding]:
     """
     repeated = np.array([False, *(_same_picture(*pair) for pair in pairwise(corners))], bool)
     parts = stretches(repeated & claim.tracked)
-    if not parts or repeated[1:].all():
+    moved = ~repeated[1:] & claim.tracked[1:] & claim.tracked[:-1]
+    if not parts or not moved.any():
         return []
     steps = np.linalg.norm(np.diff(rigid.centres(claim.poses), axis=0), axis=1)
-    speed = np.median((steps / np.maximum(np.diff(claim.times), 1e-9))[~repeated[1:]])
+    speed = np.median((steps / np.maximum(np.diff(claim.times), 1e-9))[moved])
     squares = [(last - first + 1) * (claim.times[last] - claim.times[first - 1]) ** 2 / 3 for first, last in parts]
     if speed * np.sqrt(sum(squares) / len(claim)) <= max_place_error(claim.metric, claim.poses[claim.tracked]):
         return []
