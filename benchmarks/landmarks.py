@@ -12,6 +12,7 @@ Sim(3) alignment, for a noise of one pixel.
 
 from __future__ import annotations
 
+import argparse
 from itertools import permutations
 
 import jax
@@ -28,6 +29,7 @@ FOCAL, CENTRE, SIZE = 400.0, np.array([320.0, 240.0]), np.array([640, 480])
 
 def main() -> None:
     """Print a row for each length of tracks."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     jax.config.update("jax_enable_x64", True)
     print("| keyframes that see a point | one landmark, cm | one a keyframe, cm | ratio |\n|---|---|---|---|")
     for longest in (5, 8, KEYFRAMES):

@@ -71,8 +71,8 @@ def observability_figure(found: Observability) -> NotebookFigure:
     rows = [("all", found.whole.values[0], INK)]
     rows += [(f"without {kind}", found.without.values[k], line_colour(k)) for k, kind in enumerate(found.terms)]
     for name, values, colour in rows:
-        style = {"lw": 2.2, "zorder": 3} if name == "all" else {"lw": 1.2}
-        left.semilogy(np.maximum(np.asarray(values)[:shown], floor), ".-", ms=4, color=colour, label=name, **style)
+        line = {"lw": 2.2, "zorder": 3} if name == "all" else {"lw": 1.2}
+        left.semilogy(np.maximum(np.asarray(values)[:shown], floor), ".-", ms=4, color=colour, label=name, **line)
     left.axhline(WEAK, color="#c0392b", lw=0.9, ls="--")
     left.annotate("weak below", (shown - 1, WEAK), (0, 3), textcoords="offset points", ha="right", fontsize=8)
     left.set(xlabel="direction, the weakest first", ylabel="eigenvalue, balanced")
