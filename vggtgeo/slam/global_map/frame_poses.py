@@ -149,6 +149,7 @@ def _resected(
     if len(points) < MIN_POINTS:
         return _Resected(pose)
     current, before = pose, _energy(points, pixels, pose, intrinsics)
+    information, off = np.zeros((6, 6)), np.zeros((0, 2))
     for number in range(STEPS):
         # Graduated non-convexity: from a pose that is off, right matches look like outliers to the final width.
         width = max(MAX_WIDTH / 2**number, WIDTH)
