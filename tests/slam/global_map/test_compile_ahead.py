@@ -1,4 +1,4 @@
-"""What `vggtgeo warm-up` compiles is what the end of a run calls."""
+"""What `vggtgeo warm-up`, and a run beside its frames, compile is what the end of a run calls."""
 
 from __future__ import annotations
 
@@ -37,59 +37,18 @@ def _program(*args: Any) -> tuple[Any, ...]:
     return structure, tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
 
 
-@pytest.mark.parametrize("metric", [True, False])
-def test_the_programs_of_the_end_are_compiled_before(monkeypatch: pytest.MonkeyPatch, metric: bool) -> None:
-    # Proves that the last adjustment of a map with depth and of one without asks for a program that was compiled.
-    # Oracle: structure and shapes of what the adjustment of a recorded run solves.
-    compiled: list[tuple[Any, ...]] = []
+def _compiled(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """The programs of the solver that are compiled from here on, none of them really."""
+    programs: list[tuple[Any, ...]] = []
 
     def solve(*args: Any) -> Any:
-        compiled.append(_program(*args))
+        programs.append(_program(*args))
         return SimpleNamespace(energy=np.zeros(1).view(_Ready))
 
     for name in ("warm_up", "compile_alignment", "keyframe_sigma"):
         monkeypatch.setattr(compile_ahead, name, lambda *_: None)
     monkeypatch.setattr(compile_ahead, "solve_jit", solve)
-    compile_before_runs(SETTINGS, 320, 240)
-    slam = _with_or_without_depth(metric)
-
-    def called(*args: Any) -> Any:
-        assert _program(*args) in compiled
-        raise _Called
-
-    monkeypatch.setattr(global_adjustment, "solve_jit", called)
-    with pytest.raises(_Called):
-        global_adjustment.adjust_all(slam, SETTINGS)
-
-
-@pytest.mark.parametrize("metric", [True, False])
-def test_the_program_of_the_end_is_compiled_during_the_run(monkeypatch: pytest.MonkeyPatch, metric: bool) -> None:
-    # Proves that the callback compiles what the last adjustment of a map with depth and of one without asks for, once.
-    # Oracle: structure and shapes of what the adjustment of a recorded run solves.
-    compiled: list[tuple[Any, ...]] = []
-
-    def solve(*args: Any) -> Any:
-        compiled.append(_program(*args))
-        return SimpleNamespace(energy=np.zeros(1).view(_Ready))
-
-    monkeypatch.setattr(compile_ahead, "keyframe_sigma", lambda *_: None)
-    monkeypatch.setattr(compile_ahead, "solve_jit", solve)
-    slam = _with_or_without_depth(metric)
-    settings = updated(SETTINGS, {"refinement": {"global_adjustment": True}})
-    ahead, count = compile_ahead.CompileAhead(settings), len(slam.frames)
-    ahead.on_begin("a walk", round(count / 0.6))
-    for _ in range(2):
-        ahead.on_frame(slam, recorded_run().frames[-1])
-    ahead.on_adjust(slam)
-    assert len(compiled) == 1
-
-    def called(*args: Any) -> Any:
-        assert _program(*args) in compiled
-        raise _Called
-
-    monkeypatch.setattr(global_adjustment, "solve_jit", called)
-    with pytest.raises(_Called):
-        global_adjustment.adjust_all(slam, settings)
+    return programs
 
 
 def _with_or_without_depth(metric: bool) -> Slam:
@@ -97,6 +56,44 @@ def _with_or_without_depth(metric: bool) -> Slam:
     slam = recorded_run().states[-1]
     factors = (() if metric else (MeasuredBaseline(0, 1, 1.0, 1e-3),)) + slam.map.factors
     return replace(slam, map=replace(slam.map, metric=metric, factors=factors))
+
+
+def _check_asked(
+    monkeypatch: pytest.MonkeyPatch, compiled: list[tuple[Any, ...]], metric: bool, settings: vg.SlamSettings
+) -> None:
+    """Check that the last adjustment begins with a program that was compiled."""
+
+    def called(*args: Any) -> Any:
+        assert _program(*args) in compiled
+        raise _Called
+
+    monkeypatch.setattr(global_adjustment, "solve_jit", called)
+    with pytest.raises(_Called):
+        global_adjustment.adjust_all(_with_or_without_depth(metric), settings)
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_programs_of_the_end_are_compiled_before(monkeypatch: pytest.MonkeyPatch, metric: bool) -> None:
+    # Proves that the last adjustment of a map with depth and of one without asks for a program that was compiled.
+    # Oracle: structure and shapes of what the adjustment of a recorded run solves.
+    compiled = _compiled(monkeypatch)
+    compile_before_runs(SETTINGS, 320, 240)
+    _check_asked(monkeypatch, compiled, metric, SETTINGS)
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_program_of_the_end_is_compiled_during_the_run(monkeypatch: pytest.MonkeyPatch, metric: bool) -> None:
+    # Proves that the callback compiles what the last adjustment of a map with depth and of one without asks for, once.
+    # Oracle: structure and shapes of what the adjustment of a recorded run solves.
+    compiled, slam = _compiled(monkeypatch), _with_or_without_depth(metric)
+    settings = updated(SETTINGS, {"refinement": {"global_adjustment": True}})
+    ahead, count = compile_ahead.CompileAhead(settings), len(slam.frames)
+    ahead.on_begin("a walk", round(count / 0.6))
+    for _ in range(2):
+        ahead.on_frame(slam, recorded_run().frames[-1])
+    ahead.on_adjust(slam)
+    assert len(compiled) == 1
+    _check_asked(monkeypatch, compiled, metric, settings)
 
 
 def test_the_command_takes_the_size_of_images(monkeypatch: pytest.MonkeyPatch) -> None:

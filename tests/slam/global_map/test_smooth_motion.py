@@ -1,4 +1,4 @@
-"""Places of frames between keyframes, smoothed; oracles: the path that was planted, and dense least squares."""
+"""Places of frames between keyframes, smoothed; oracles: the path that was planted, and the energy of its points."""
 
 from __future__ import annotations
 

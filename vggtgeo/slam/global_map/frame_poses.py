@@ -40,10 +40,9 @@ MIN_NOISE = 0.01
 MAX_DEPTH = 1e6
 """Largest depth that is used, in map units; the smallest is that of depth sensors."""
 
-
 _FOUND: WeakKeyDictionary[Slam, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
-"""Poses by the state that they are of, which never changes: the outputs of a run ask seven times for them, and 100
-resections take half a second."""
+"""Poses by the state that they are of, which never changes: the outputs of a run ask for them again and again, and each
+time every frame would be resected."""
 
 
 def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:

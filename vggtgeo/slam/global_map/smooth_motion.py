@@ -51,19 +51,20 @@ def smoothed(
     if not len(rows) or not motion.shape[0]:
         return poses
     centres, turned = rigid.centres(poses), poses[rows, :3, :3]
-    sigma = max(sigma_by_median(motion @ centres), FLOOR)
+    accelerations = motion @ centres
+    sigma = max(sigma_by_median(accelerations), FLOOR)
     known = information[rows] + FLOOR * np.eye(6)
     # A displacement `d` of the centre is the translation `-R d` of the tangent; the rotation is eliminated.
     follows = np.linalg.solve(known[:, 3:, 3:], known[:, 3:, :3])
     places = turned.mT @ (known[:, :3, :3] - known[:, :3, 3:] @ follows) @ turned
     moved, fits, bends = np.zeros((len(times), 3)), np.ones(len(rows)), np.ones(motion.shape[0])
-    own = motion[:, rows]
+    own, diagonal = motion[:, rows], (np.arange(len(rows)), np.arange(len(rows) + 1))
     for _ in range(ROUNDS):
         weighted = own.T @ sp.diags_array(bends / sigma**2)
-        hessian = sp.kron(weighted @ own, np.eye(3)) + sp.block_diag([*(fits[:, None, None] * places)])
-        moved[rows] = spsolve(hessian.tocsc(), -(weighted @ (motion @ centres)).ravel()).reshape(-1, 3)
+        hessian = sp.kron(weighted @ own, np.eye(3)) + sp.bsr_array((fits[:, None, None] * places, *diagonal))
+        moved[rows] = spsolve(hessian.tocsc(), -(weighted @ accelerations).ravel()).reshape(-1, 3)
         fits = _cauchy(np.einsum("ni,nij,nj->n", moved[rows], places, moved[rows]))
-        bends = _cauchy(((motion @ (centres + moved)) ** 2).sum(1) / sigma**2)
+        bends = _cauchy(((accelerations + motion @ moved) ** 2).sum(1) / sigma**2)
     shift = -(turned @ moved[rows, :, None])
     found = poses.copy()
     found[rows] = rigid.moved(poses[rows], np.concatenate([shift, -follows @ shift], 1)[..., 0])
