@@ -20,7 +20,7 @@ depth is z in metres with NaN for "none"; a pose is a 4 x 4 matrix world -> came
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import Any, Protocol, runtime_checkable
 
@@ -76,15 +76,15 @@ class PointMatches:
     def __len__(self) -> int:
         return len(self.index_i)
 
+    @classmethod
+    def none(cls) -> PointMatches:
+        """Return no match at all."""
+        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
+        return cls(none, none, nowhere, nowhere, np.zeros(0))
+
     def select(self, keep: np.ndarray) -> PointMatches:
         """Return the matches that `keep` (bool [m] or int [k]) names."""
-        return PointMatches(
-            self.index_i[keep],
-            self.index_j[keep],
-            self.pixels_i[keep],
-            self.pixels_j[keep],
-            self.confidence[keep],
-        )
+        return PointMatches(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
 @runtime_checkable

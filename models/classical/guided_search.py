@@ -43,11 +43,9 @@ def search_near(
 
     index: int [n], key points of i. predicted: float [n, 2], pixels. tree: `search_tree(features_j)`.
     """
-    first, second = _vectors(features_i), _vectors(features_j)
-    none = np.zeros(0, int)
     if not len(index) or not len(features_j):
-        nowhere = np.zeros((0, 2))
-        return PointMatches(none, none, nowhere, nowhere, np.zeros(0))
+        return PointMatches.none()
+    first, second = _vectors(features_i), _vectors(features_j)
     _, near = tree.query(predicted, k=NEIGHBOURS, distance_upper_bound=radius)
     there = near < len(features_j)
     alike = np.einsum("nd,nkd->nk", first[index], second[np.where(there, near, 0)])

@@ -38,6 +38,7 @@ NEAREST, FARTHEST = 0.05, 100.0
 """Minimum and maximum depth of an indoor world, a sports hall included, metres."""
 AVERAGE = 0.5
 """Confidence that replaces an invalid one: that of an average pixel."""
+_NO_SEGMENTS = Segments(np.zeros((0, 2, 2)), np.zeros(0))
 
 
 @dataclass
@@ -132,7 +133,7 @@ class BoundedLines(_Bounded[LineDetector]):
         """See `LineDetector.detect`."""
         found = self._asked(lambda: self.source.detect(image))
         if found is None:
-            return Segments(np.zeros((0, 2, 2)), np.zeros(0))
+            return _NO_SEGMENTS
         inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
         good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
         self.refusals.note(len(found), int(len(found) - good.sum()), left=True)  # an image may have no line
@@ -147,7 +148,7 @@ class BoundedLineMatcher(_Bounded[LineMatcher]):
         """See `LineMatcher.describe`."""
         found = self._asked(lambda: self.source.describe(image, segments))
         if found is None:
-            return LineFeatures(Segments(np.zeros((0, 2, 2)), np.zeros(0)))
+            return LineFeatures(_NO_SEGMENTS)
         self.refusals.note(1, 0, left=True)
         return found
 
@@ -156,8 +157,7 @@ class BoundedLineMatcher(_Bounded[LineMatcher]):
     ) -> LineMatches:
         """See `LineMatcher.match`."""
         if not len(features_i) or not len(features_j):
-            none = np.zeros(0, np.int64)
-            return LineMatches(none, none, np.zeros(0))
+            return LineMatches(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
         return self.source.match(features_i, features_j, relative)
 
 
@@ -172,12 +172,11 @@ class BoundedPoints(_Bounded[PointMatcher]):
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
         """See `PointMatcher.match`."""
-        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
         if not (len(features_i) and len(features_j)):
-            return PointMatches(none, none, nowhere, nowhere, np.zeros(0))
+            return PointMatches.none()
         found = self._asked(lambda: self.source.match(features_i, features_j, predicted))
         if found is None:
-            return PointMatches(none, none, nowhere, nowhere, np.zeros(0))
+            return PointMatches.none()
         self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
         return found
 

@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from vggtgeo.models.onnx.providers import warn_once
@@ -15,7 +16,8 @@ from vggtgeo.models.onnx.session import Session
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.persistence import Format
 
-Outputs = dict[str, np.ndarray]
+Outputs = dict[str, Any]
+"""Arrays by name; those of a `MemoryCache` may be on a device."""
 _FORMAT = Format("network output", 1, {})
 
 

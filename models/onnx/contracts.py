@@ -27,6 +27,10 @@ RANDOM_WEIGHTS = "random"
 """Value of `METADATA_WEIGHTS` of a file with random weights."""
 PARITY_SUFFIX = ".parity.npz"
 """`FILE.onnx.parity.npz` holds `input.NAME` and `output.NAME` arrays that PyTorch computed with the same weights."""
+TOLERANCE = 1e-3
+"""Largest relative difference from PyTorch in single precision."""
+HALF_TOLERANCE = 3e-2
+"""Largest relative difference from PyTorch in half precision: some three digits, through tens of blocks."""
 
 _FLOATS = ("float32", "float16")
 
@@ -112,10 +116,7 @@ field of view (radians), world -> camera, of views in the frame of the first. `d
 DINOV3 = Contract(
     network="dinov3",
     role="descriptors and dense confidence",
-    plays=(
-        "line_matches",
-        "confidence",
-    ),
+    plays=("line_matches", "confidence"),
     inputs=(Tensor("image", (1, 3, "H", "W")),),
     outputs=(
         Tensor("patch_descriptors", (1, Patches(16), "C")),
@@ -221,3 +222,10 @@ XFEAT = Contract(
 _ALL = (VGGT, DINOV3, MOGE2, LETR, MLSD, MAST3R_ENCODER, MAST3R_DECODER, ALIKE, XFEAT)
 CONTRACTS = {contract.network: contract for contract in _ALL}
 """Every contract by its network's name."""
+
+
+def relative_difference(found: np.ndarray, reference: np.ndarray) -> float:
+    """Return max |found - reference| / max |reference|; NaN if any value is, infinity for other shapes."""
+    if found.shape != reference.shape:
+        return float("inf")
+    return float(np.abs(found - reference).max()) / max(float(np.abs(reference).max()), 1e-30)

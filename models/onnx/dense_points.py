@@ -13,7 +13,6 @@ import numpy as np
 from vggtgeo.models.checks import check_image
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher, spread
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
-from vggtgeo.models.onnx.fit import Fit, at_multiples
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Features
 
@@ -42,15 +41,12 @@ class DensePointMatcher(PixelMatcher):
         return Features(found["pixels"], found["scores"], PixelDescriptors(found["vectors"], gray))
 
     def _run(self, image: np.ndarray) -> Outputs:
-        contract = self.session.contract
-        wanted = at_multiples(image.shape[:2], contract.multiple)
-        rows, columns = self.session.inputs["image"].shape[2:]
-        fit = Fit.of(image.shape[:2], (rows or wanted[0], columns or wanted[1]))
-        scores, descriptors = (tensor.name for tensor in contract.outputs)
-        maps = self.session.run({"image": contract.normalisation.apply(fit.resize(image))[None]})
+        fit = self.session.fit(image)
+        scores, descriptors = (tensor.name for tensor in self.session.contract.outputs)
+        maps = self.session.run({"image": self.session.prepare(image, fit)})
         places, strength = peaks(maps[scores][0, 0], self.score)
         pixels = fit.to_image(places)
-        inside = np.flatnonzero(((pixels >= 0) & (pixels <= np.array(image.shape[1::-1]) - 1)).all(axis=1))
+        inside = np.flatnonzero(fit.inside(pixels))
         keep = inside[spread(pixels[inside], strength[inside], self.count, image.shape[1::-1])]
         vectors = vectors_at(maps[descriptors][0], places[keep], fit.network_size)
         return {"pixels": pixels[keep], "scores": strength[keep], "vectors": vectors}

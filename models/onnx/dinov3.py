@@ -1,4 +1,4 @@
-"""DINOv3 (Siméoni et al., 2025): dense confidence from its attention, and descriptors of its patches."""
+"""DINOv3 (Siméoni et al., 2025): dense confidence from its attention, and line matches by descriptors of patches."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_image
+from vggtgeo.models.checks import check_fields, check_image
+from vggtgeo.models.classical.lines import allowed_pairs
+from vggtgeo.models.classical.nearest import mutual_nearest
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import DINOV3
-from vggtgeo.models.onnx.fit import Fit, at_multiples
+from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.session import NetworkValueError, Session
+from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
 
 PREFIX = 5
 """Tokens before the patches: the class token and four registers."""
@@ -68,13 +71,11 @@ class DinoFeatures:
 
     def _outputs(self, image: np.ndarray) -> tuple[Outputs, Fit]:
         check_image("image", image)
-        wanted = at_multiples(image.shape[:2], DINOV3.multiple)
-        rows, columns = self.session.inputs["image"].shape[2:]
-        fit = Fit.of(image.shape[:2], (rows or wanted[0], columns or wanted[1]))
+        fit = self.session.fit(image)
         return self.cache.get((self.session,), ("features",), (image,), lambda: self._run(image, fit)), fit
 
     def _run(self, image: np.ndarray, fit: Fit) -> Outputs:
-        found = self.session.run({"image": DINOV3.normalisation.apply(fit.resize(image))[None]})
+        found = self.session.run({"image": self.session.prepare(image, fit)})
         patches = found["attention"][0, :, 0, PREFIX:]
         if patches.min() < 0 or not patches.any():  # its rows sum to 1
             raise NetworkValueError(
@@ -98,3 +99,51 @@ def saliency(attention: np.ndarray) -> np.ndarray:
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Return `vectors` [..., C] normalised to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.float32(1e-9))
+
+
+@dataclass(frozen=True, eq=False)
+class DenseLineMatcher:
+    """A `LineMatcher`. Two segments are as alike as their samples: each sample takes the best of the other segment's,
+    and the means of both directions are averaged, so that a segment that is seen in part still matches.
+
+    samples: along each segment. ratio: largest ratio of the best to the second-best distance. similarity: least mean
+    inner product of a pair.
+    """
+
+    features: DinoFeatures
+    samples: int = 8
+    ratio: float = 0.95
+    similarity: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_fields(self, samples="[2, inf)", ratio="(0, 1]")
+
+    def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
+        """Return descriptors float16 [L, samples, C] along `segments` of `image` (uint8 [H, W, 3])."""
+        if not len(segments):
+            return LineFeatures(segments, np.zeros((0, self.samples, 1), np.float16))
+        place = ((np.arange(self.samples) + 0.5) / self.samples)[:, None]
+        ends = segments.endpoints
+        pixels = ends[:, None, 0] + place * (ends[:, None, 1] - ends[:, None, 0])
+        vectors = self.features.describe(image).at(pixels.reshape(-1, 2))
+        return LineFeatures(segments, vectors.reshape(len(segments), self.samples, -1).astype(np.float16))
+
+    def match(
+        self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
+    ) -> LineMatches:
+        """Return the matches from view i to view j; see `LineMatcher.match`."""
+        ends_i, ends_j = features_i.segments.endpoints, features_j.segments.endpoints
+        allowed = allowed_pairs(ends_i, ends_j, relative)
+        similarity = np.where(allowed, segment_similarity(features_i.descriptors, features_j.descriptors), -np.inf)
+        index_i, index_j, clarity = mutual_nearest(similarity, self.ratio, self.similarity)
+        return LineMatches(index_i, index_j, np.clip(1.0 - clarity**2, 0.05, 1.0))
+
+
+def segment_similarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return float32 [I, J] in [-1, 1] of unit descriptors [I, n, C] and [J, m, C] along two sets of segments."""
+    if not len(first) or not len(second):
+        return np.zeros((len(first), len(second)), np.float32)
+    flat = first.reshape(-1, first.shape[2]).astype(np.float32)
+    other = second.reshape(-1, second.shape[2]).astype(np.float32)
+    products = (flat @ other.T).reshape(len(first), first.shape[1], len(second), second.shape[1])
+    return 0.5 * (products.max(axis=3).mean(axis=1) + products.max(axis=1).mean(axis=2))

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from vggtgeo.models.checks import check_image
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
-from vggtgeo.models.onnx.contracts import LETR, MLSD
-from vggtgeo.models.onnx.fit import Fit
+from vggtgeo.models.onnx.contracts import MLSD
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Segments
 
@@ -91,19 +90,16 @@ class LetrDetector:
         """Return segments of `image` (uint8 [H, W, 3]), most probable first."""
         check_image("image", image)
         factor = SHORT_SIDE / min(image.shape[:2])
-        wanted = tuple(round(factor * side) for side in image.shape[:2])
-        rows, columns = self.session.inputs["image"].shape[2:]
-        fit = Fit.of(image.shape[:2], (rows or wanted[0], columns or wanted[1]))
-        outputs = self.cache.get((self.session,), ("lines",), (image,), lambda: self._run(image, fit))
+        height, width = (round(factor * side) for side in image.shape[:2])
+        fit = self.session.fit(image, (height, width))
+        run = lambda: self.session.run({"image": self.session.prepare(image, fit)})
+        outputs = self.cache.get((self.session,), ("lines",), (image,), run)
         ends, scores = decode_lines(outputs["pred_logits"][0], outputs["pred_lines"][0], fit.network_size)
         size = np.array(fit.network_size[::-1], np.float64)
         # Segments may end slightly outside the image; those a whole image away are invalid.
         near = ((ends > -size) & (ends < 2 * size)).all(axis=(1, 2))
         keep = near & (scores >= self.score)
         return tidy(image, fit.to_image(ends[keep]), scores[keep], self.shortest, self.count)
-
-    def _run(self, image: np.ndarray, fit: Fit) -> Outputs:
-        return self.session.run({"image": LETR.normalisation.apply(fit.resize(image))[None]})
 
 
 def decode_lines(logits: np.ndarray, lines: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

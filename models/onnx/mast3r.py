@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
-from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs, key_of
-from vggtgeo.models.onnx.contracts import MAST3R_ENCODER
+from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.fit import Fit
-from vggtgeo.models.onnx.session import DeviceArray, Session
+from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Features, PointMatches
 
 _WANTED = ("descriptors_1", "descriptors_2", "descriptor_confidence_1", "descriptor_confidence_2")
@@ -50,10 +49,11 @@ class Mast3rMatcher:
     kept: int = 24
     verifier: EpipolarVerifier = field(default_factory=EpipolarVerifier)
     refinement: PatchAlignment | None = field(default_factory=PatchAlignment)
-    _encoded: OrderedDict[str, DeviceArray] = field(default_factory=OrderedDict, init=False, repr=False)
+    _encoded: MemoryCache = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         check_fields(self, spacing="[1, inf)", stride="[1, inf)", tolerance="[0, inf)", kept="[2, inf)")
+        object.__setattr__(self, "_encoded", MemoryCache(self.kept))
         self._check_pair()
 
     @property
@@ -72,7 +72,7 @@ class Mast3rMatcher:
         fit = Fit.of(image.shape[:2], self.size)
         starts, strength = corners(fit.resize(image), self.spacing, self.corner)
         pixels = fit.to_image(starts.astype(np.float64))
-        inside = ((pixels >= 0) & (pixels <= np.array(image.shape[1::-1]) - 1)).all(axis=1)
+        inside = fit.inside(pixels)
         return Features(pixels[inside], strength[inside], Mast3rView(image, fit, starts[inside]))
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
@@ -83,8 +83,7 @@ class Mast3rMatcher:
         images = (first.image, second.image)
         found = self.cache.get((self.encoder, self.decoder), settings, images, lambda: self._run(first, second))
         pixels_j = second.fit.to_image(found["targets"].astype(np.float64))
-        inside = ((pixels_j >= 0) & (pixels_j <= np.array(second.image.shape[1::-1]) - 1)).all(axis=1)
-        index = np.flatnonzero(inside & (found["gap"] <= self.tolerance))
+        index = np.flatnonzero(second.fit.inside(pixels_j) & (found["gap"] <= self.tolerance))
         matches = PointMatches(
             index,
             np.full(len(index), -1, np.int64),
@@ -105,16 +104,10 @@ class Mast3rMatcher:
         certainty = np.minimum(found["descriptor_confidence_1"][0][y, x], found["descriptor_confidence_2"][0][v, u])
         return {"targets": targets.astype(np.int32), "gap": gap, "certainty": certainty}
 
-    def _encode(self, view: Mast3rView) -> DeviceArray:
+    def _encode(self, view: Mast3rView) -> Any:
         """Return the encoder features of an image, which stay on the device for the next pairs."""
-        key = key_of((), (), (view.image,))
-        if key not in self._encoded:
-            image = MAST3R_ENCODER.normalisation.apply(view.fit.resize(view.image))[None]
-            self._encoded[key] = self.encoder.run_on_device({"image": image})["features"]
-        self._encoded.move_to_end(key)
-        while len(self._encoded) > self.kept:
-            self._encoded.popitem(last=False)
-        return self._encoded[key]
+        run = lambda: self.encoder.run_on_device({"image": self.encoder.prepare(view.image, view.fit)})
+        return self._encoded.get((), (), (view.image,), run)["features"]
 
     def _refined(self, first: Mast3rView, second: Mast3rView, matches: PointMatches) -> PointMatches:
         if self.refinement is None or not len(matches):

@@ -10,7 +10,6 @@ from scipy.optimize import least_squares
 from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.sensor_depth import no_depth
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
-from vggtgeo.models.onnx.contracts import MOGE2
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import DepthEstimate
@@ -43,9 +42,7 @@ class MogeDepth:
     ) -> DepthEstimate:
         """Return metric depth; with `intrinsics` only the shift is recovered, without them the focal length too."""
         check_image("image", image)
-        size = image.shape[:2]
-        rows, columns = self.session.inputs["image"].shape[2:]
-        fit = Fit.of(size, (rows or size[0], columns or size[1]))
+        fit = self.session.fit(image)
         outputs = self.cache.get((self.session,), ("depth", self.tokens), (image,), lambda: self._run(image, fit))
         mask = fit.map_to_image(outputs["mask"][0])
         points = fit.map_to_image(outputs["points"][0])
@@ -54,7 +51,7 @@ class MogeDepth:
         depth = (points[..., 2] + np.float32(shift)) * np.float32(outputs["metric_scale"].reshape(-1)[0])
         valid = keep & (depth > 0)
         if not valid.any():
-            return no_depth(size)
+            return no_depth(image.shape[:2])
         return DepthEstimate(
             np.where(valid, depth, np.float32(np.nan)).astype(np.float32),
             np.where(valid, np.clip(mask, 0.0, 1.0), 0.0).astype(np.float32),
@@ -62,7 +59,7 @@ class MogeDepth:
         )
 
     def _run(self, image: np.ndarray, fit: Fit) -> Outputs:
-        inputs = {"image": MOGE2.normalisation.apply(fit.resize(image))[None]}
+        inputs = {"image": self.session.prepare(image, fit)}
         if "num_tokens" in self.session.inputs:
             inputs["num_tokens"] = np.asarray(self.tokens, np.int64)
         return self.session.run(inputs, ("points", "mask", "metric_scale"))

@@ -39,7 +39,7 @@ class VggtWindow:
         beyond all scenes, is not found.
         """
         self._check(images)
-        fit = Fit.of(images[0].shape[:2], self._size(images[0].shape[:2]))
+        fit = self.session.fit(images[0], at_multiples(images[0].shape[:2], VGGT.multiple, WIDTH))
         outputs = self.cache.get((self.session,), ("window",), images, lambda: self._run(images, fit))
         count = len(images)
         poses, cameras, found = decode_cameras(outputs["pose_enc"][:count], fit.network_size)
@@ -70,16 +70,10 @@ class VggtWindow:
         if any(image.shape != images[0].shape for image in images):
             raise ValueError("`images` have different sizes, expected one size; resize them")
 
-    def _size(self, size: tuple[int, int]) -> tuple[int, int]:
-        height, width = self.session.inputs["images"].shape[2:]
-        wanted = at_multiples(size, VGGT.multiple, WIDTH)
-        return height or wanted[0], width or wanted[1]
-
     def _run(self, images: Sequence[np.ndarray], fit: Fit) -> Outputs:
-        normal = VGGT.normalisation
-        batch = np.stack([normal.apply(fit.resize(image)) for image in images])
+        prepared = [self.session.prepare(image, fit) for image in images]
         missing = (self.views or len(images)) - len(images)
-        batch = np.concatenate([batch, np.repeat(batch[-1:], missing, axis=0)])
+        batch = np.concatenate(prepared + prepared[-1:] * missing)
         return self.session.run({"images": batch}, ("pose_enc", "depth", "depth_conf"))
 
 

@@ -8,7 +8,7 @@ import pytest
 import tiny_networks as tiny
 from vggtgeo.models.classical import LsdDetector
 from vggtgeo.models.onnx import contracts
-from vggtgeo.models.onnx.dinov3 import DinoFeatures
+from vggtgeo.models.onnx.dinov3 import DenseLineMatcher, DinoFeatures, segment_similarity
 from vggtgeo.models.onnx.line_detectors import (
     LetrDetector,
     MlsdDetector,
@@ -18,7 +18,6 @@ from vggtgeo.models.onnx.line_detectors import (
     directed,
     tidy,
 )
-from vggtgeo.models.onnx.line_matcher import DenseLineMatcher, segment_similarity
 from vggtgeo.models.onnx.session import open_session
 from vggtgeo.models.roles import LineDetector, LineMatcher, RelativeView, Segments
 

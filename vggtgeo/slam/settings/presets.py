@@ -32,10 +32,9 @@ from vggtgeo.models.onnx.bounds import (
 )
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
 from vggtgeo.models.onnx.dense_points import DensePointMatcher
-from vggtgeo.models.onnx.dinov3 import DinoFeatures
+from vggtgeo.models.onnx.dinov3 import DenseLineMatcher, DinoFeatures
 from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
 from vggtgeo.models.onnx.line_detectors import LetrDetector, MlsdDetector
-from vggtgeo.models.onnx.line_matcher import DenseLineMatcher
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
 from vggtgeo.models.onnx.moge2 import MogeDepth
 from vggtgeo.models.onnx.providers import Provider
