@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.checks import check_array
 from vggtgeo.models.classical.two_view import median_parallax
 from vggtgeo.models.roles import (
     GeometryResult,
@@ -131,11 +130,7 @@ def align_window(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndar
     poses: float [k, 4, 4], world -> camera, of the first k views of the window. depths: of those views, float [H, W]
     in metres, NaN = none.
     """
-    check_array("poses", poses, (None, 4, 4))
-    count = len(poses)
-    if count > len(guess.poses):
-        raise ValueError(f"`poses` must have at most the window's {len(guess.poses)} views, got {count}")
-    use = np.flatnonzero(guess.found[:count])
+    use = np.flatnonzero(guess.found[: len(poses)])
     scale = _scale(guess, poses, depths, use)
     if not len(use) or scale is None:
         return None
@@ -156,19 +151,19 @@ def _scale(guess: WindowGuess, poses: np.ndarray, depths: Sequence[np.ndarray], 
         return by_depth
     if guess.metric:
         return 1.0
-    spreads = [np.linalg.norm(centres - centres.mean(axis=0)) for centres in _two_centres(guess.poses, poses, use)]
+    if len(use) < 2:
+        return None
+    own, known = (
+        float(np.linalg.norm(centres - centres.mean(axis=0)))
+        for centres in (rigid.centres(guess.poses[use]), rigid.centres(poses[use]))
+    )
     # Below 1 cm of motion the scale would be noise of the poses.
-    return float(spreads[1] / spreads[0]) if len(use) > 1 and spreads[1] > 0.01 and spreads[0] > 1e-9 else None
-
-
-def _two_centres(first: np.ndarray, second: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return (rigid.centres(first[use]), rigid.centres(second[use])) if len(use) else (np.zeros((1, 3)), np.zeros((1, 3)))
+    return known / own if known > 0.01 and own > 1e-9 else None
 
 
 def _depth_scale(guess: WindowGuess, depths: Sequence[np.ndarray], use: np.ndarray) -> float | None:
     ratios, weights = [], []
     for view in use[use < len(depths)]:
-        check_array("depths", depths[view], guess.depth.shape[1:], finite=False)
         # The median of some thousand pixels is accurate enough.
         step = max(1, int(np.sqrt(depths[view].size / _ENOUGH_PIXELS)))
         own, known, confidence = (

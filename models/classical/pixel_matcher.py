@@ -7,7 +7,7 @@ faster and less exact, and networks (ALIKE, XFeat).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -185,3 +185,31 @@ def _shrunk(gray: np.ndarray, area: int) -> tuple[np.ndarray, np.ndarray]:
         return gray, np.ones(2)
     size = tuple(max(round(side * scale), 1) for side in gray.shape[::-1])
     return cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.array(gray.shape[::-1]) / size
+
+
+_BITS = 5
+
+
+def place_vector(features: Features) -> np.ndarray | None:
+    """Return the global descriptor of an image, a unit vector, float32 `[2^bits * D]`: aggregated local descriptors
+    (VLAD, Jegou et al. 2010). None for descriptors without vectors, or fewer than 20 points.
+
+    Each descriptor, minus the mean of its image, is assigned to one of 2^bits cells by the signs of its products with
+    fixed random directions (Charikar 2002). This replaces a trained vocabulary and works for any descriptor. The sums
+    of the cells, square-rooted and normalised per cell and then together, are the vector.
+    """
+    if not isinstance(features.descriptors, PixelDescriptors) or len(features) < 20:
+        return None
+    vectors = features.descriptors.vectors - features.descriptors.vectors.mean(0)
+    cell = ((vectors @ _directions(vectors.shape[1])) > 0) @ (1 << np.arange(_BITS))
+    sums = np.zeros((1 << _BITS, vectors.shape[1]), np.float32)
+    np.add.at(sums, cell, vectors)
+    sums = np.sign(sums) * np.sqrt(np.abs(sums))
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    whole = sums.ravel()
+    return whole / max(float(np.linalg.norm(whole)), 1e-9)
+
+
+@cache
+def _directions(length: int) -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((length, _BITS)).astype(np.float32)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields
-from vggtgeo.models.classical.sample_order import SampleOrder
 from vggtgeo.models.classical.two_view import TwoViewStart
+from vggtgeo.models.classical.verification import SampleOrder
 from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery, StartGuess
 
 from vggtgeo.geometry import pinhole
@@ -18,7 +18,24 @@ from vggtgeo.geometry.rigid import exponential
 
 
 @dataclass(frozen=True)
-class PnpGeometry:
+class _TwoViewGeometry:
+    """Base of the `InitialGeometry`s that begin with the matches of two views."""
+
+    two_view: TwoViewStart = field(default_factory=TwoViewStart, kw_only=True)
+
+    def start(
+        self,
+        pixels_i: np.ndarray,
+        pixels_j: np.ndarray,
+        intrinsics: np.ndarray,
+        images: Sequence[np.ndarray] = (),
+    ) -> StartGuess:
+        """Return motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
+        return self.two_view.start(pixels_i, pixels_j, intrinsics)
+
+
+@dataclass(frozen=True)
+class PnpGeometry(_TwoViewGeometry):
     """P3P inside MAGSAC++ (Barath et al. 2020), then a robust refinement weighted by confidence.
 
     The predicted pose competes with the sampled one: the pose with more inliers is the start of the refinement, so that
@@ -33,7 +50,6 @@ class PnpGeometry:
     confidence: float = 0.999
     max_iterations: int = 1000
     sure: float = 0.9
-    two_view: TwoViewStart = field(default_factory=TwoViewStart)
     order: SampleOrder = field(default_factory=SampleOrder)
 
     def __post_init__(self) -> None:
@@ -58,16 +74,6 @@ class PnpGeometry:
         if len(error) < self.least:
             return failed_guess(query, GeometryResult.TOO_FEW_INLIERS)
         return PoseGuess(pose, inliers, float(np.median(error)), GeometryResult.SUCCESS)
-
-    def start(
-        self,
-        pixels_i: np.ndarray,
-        pixels_j: np.ndarray,
-        intrinsics: np.ndarray,
-        images: Sequence[np.ndarray] = (),
-    ) -> StartGuess:
-        """Return motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
-        return self.two_view.start(pixels_i, pixels_j, intrinsics)
 
     def _start(self, query: PoseQuery, intrinsics: np.ndarray) -> np.ndarray | None:
         """Return the refined prediction if most matches agree with it, else the better of it and a sampled pose."""
@@ -108,14 +114,13 @@ class PnpGeometry:
 
 
 @dataclass(frozen=True)
-class ConstantVelocity:
+class ConstantVelocity(_TwoViewGeometry):
     """Use the predicted pose unchanged, for bundle adjustment to correct; matches are only counted.
 
     threshold: maximum reprojection error of an inlier, pixels; large, since a prediction is coarse.
     """
 
     threshold: float = 30.0
-    two_view: TwoViewStart = field(default_factory=TwoViewStart)
 
     def locate(self, query: PoseQuery) -> PoseGuess:
         """Return the prediction, with the matches it explains to `threshold`; see `InitialGeometry.locate`."""
@@ -125,16 +130,6 @@ class ConstantVelocity:
         inliers = errors < self.threshold
         error = float(np.median(errors[inliers])) if inliers.any() else float("nan")
         return PoseGuess(query.predicted, inliers, error, GeometryResult.SUCCESS)
-
-    def start(
-        self,
-        pixels_i: np.ndarray,
-        pixels_j: np.ndarray,
-        intrinsics: np.ndarray,
-        images: Sequence[np.ndarray] = (),
-    ) -> StartGuess:
-        """Return motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
-        return self.two_view.start(pixels_i, pixels_j, intrinsics)
 
 
 def failed_guess(query: PoseQuery, result: GeometryResult) -> PoseGuess:

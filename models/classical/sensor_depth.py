@@ -104,20 +104,12 @@ def _relative_jump(depth: np.ndarray, reach: int) -> np.ndarray:
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.nan_to_num(1.0 / depth, nan=0.0, posinf=0.0)
-    known = (inverse > 0).astype(np.float32)
+    known = inverse > 0
     step = max(reach, 1)
     bend = np.zeros_like(inverse)
-    for axis in (0, 1):
-        before, after = np.roll(inverse, step, axis), np.roll(inverse, -step, axis)
-        both = np.roll(known, step, axis) * np.roll(known, -step, axis) * known
-        second = np.abs(before - 2.0 * inverse + after) * both
-        bend = np.maximum(bend, _without_border(second, step, axis))
+    for value, valid, largest in ((inverse, known, bend), (inverse.T, known.T, bend.T)):
+        before, here, after = slice(None, -2 * step), slice(step, -step), slice(2 * step, None)
+        second = np.abs(value[before] - 2.0 * value[here] + value[after])
+        np.maximum(largest[here], second, out=largest[here], where=valid[before] & valid[here] & valid[after])
     spread = cv2.dilate(bend.astype(np.float32), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-    return np.where(known > 0, spread / np.maximum(inverse, 1e-9), 0.0)
-
-
-def _without_border(values: np.ndarray, width: int, axis: int) -> np.ndarray:
-    """Set `values` to 0 along the two borders of `axis`, where `np.roll` has wrapped around."""
-    inside = np.zeros(values.shape[axis], dtype=bool)
-    inside[width:-width] = True
-    return values * (inside[:, None] if axis == 0 else inside[None, :])
+    return np.where(known, spread / np.maximum(inverse, 1e-9), 0.0)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.checks import check_array
-from vggtgeo.models.classical.sample_order import SampleOrder
+from vggtgeo.models.classical.verification import SampleOrder
 from vggtgeo.models.roles import GeometryResult, StartGuess
 
 from vggtgeo.geometry import pinhole
@@ -172,19 +172,14 @@ def _triangulate(
     return np.where(good[:, None], midpoint, np.nan), good
 
 
-def parallax(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the angles between the rays to points [n, 3] from two cameras, radians, float64 [n].
+def median_parallax(points: np.ndarray, pose: np.ndarray) -> float:
+    """Return the median angle between the rays to points [n, 3] from two cameras, radians.
 
     Points are in the first camera; the pose of the second is first -> second.
     """
     second = points - (-pose[:3, :3].T @ pose[:3, 3])
     cosine = (points * second).sum(axis=1) / (np.linalg.norm(points, axis=1) * np.linalg.norm(second, axis=1))
-    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def median_parallax(points: np.ndarray, pose: np.ndarray) -> float:
-    """Return the median of the angles of `parallax`."""
-    return float(np.median(parallax(points, pose)))
+    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def _rotation_between(rays_i: np.ndarray, rays_j: np.ndarray) -> np.ndarray:

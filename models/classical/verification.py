@@ -1,17 +1,60 @@
-"""Geometric verification of matches between two views."""
+"""Geometric verification of matches between two views, and the seeds of robust estimation.
+
+OpenCV's samplers (USAC) have a generator that starts in the same state at every call, independent of `setRNGSeed`.
+Another order of the matches gives other samples.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields
-from vggtgeo.models.classical.sample_order import SampleOrder
 
 from vggtgeo.geometry import pinhole
+
+Role = TypeVar("Role")
+
+
+@dataclass(frozen=True)
+class SampleOrder:
+    """Order of matches by a seed; 0 keeps the given order.
+
+    Example:
+        >>> from vggtgeo.models.classical import SampleOrder
+        >>> SampleOrder().of(3).tolist(), SampleOrder(1).of(3).tolist()
+        ([0, 1, 2], [2, 0, 1])
+
+    """
+
+    seed: int = 0
+
+    def of(self, count: int) -> np.ndarray:
+        """Return a permutation of `count` matches, int [count]."""
+        if self.seed == 0:
+            return np.arange(count)
+        return np.random.default_rng(self.seed).permutation(count)
+
+    def undone(self, values: np.ndarray) -> np.ndarray:
+        """Return values [count] from this order in the given order."""
+        own = np.empty_like(values)
+        own[self.of(len(values))] = values
+        return own
+
+
+def in_order(role: Role, order: SampleOrder) -> Role:
+    """Return a role, with all its parts, with another order of samples."""
+    if isinstance(role, SampleOrder):
+        changed: Any = order
+        return changed
+    if not is_dataclass(role) or isinstance(role, type):
+        return role
+    members = {part.name: getattr(role, part.name) for part in fields(role) if part.init}
+    new = {name: made for name, value in members.items() if (made := in_order(value, order)) is not value}
+    return replace(role, **new) if new else role
 
 
 @dataclass(frozen=True)
@@ -53,26 +96,16 @@ class EpipolarVerifier:
         return best if np.count_nonzero(best) >= self.least else np.zeros(len(first), dtype=bool)
 
     def _epipolar(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        if self.intrinsics is None:
+            settings = (cv2.USAC_MAGSAC, self.threshold, self.confidence, self.max_iterations)
+            return _agreeing(cv2.findFundamentalMat, first, second, *settings)
+        matrix = pinhole.matrix(self.intrinsics)
         settings = (cv2.USAC_MAGSAC, self.confidence, self.threshold, self.max_iterations)
-        if self.intrinsics is not None:
-            mask = _quietly(cv2.findEssentialMat, first, second, pinhole.matrix(self.intrinsics), *settings)
-        else:
-            method, confidence, threshold, iterations = settings
-            mask = _quietly(cv2.findFundamentalMat, first, second, method, threshold, confidence, iterations)
-        return _as_bool(mask, len(first))
+        return _agreeing(cv2.findEssentialMat, first, second, matrix, *settings)
 
     def _homography(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        mask = _quietly(
-            cv2.findHomography,
-            first,
-            second,
-            cv2.USAC_MAGSAC,
-            self.threshold,
-            None,
-            self.max_iterations,
-            self.confidence,
-        )
-        return _as_bool(mask, len(first))
+        settings = (cv2.USAC_MAGSAC, self.threshold, None, self.max_iterations, self.confidence)
+        return _agreeing(cv2.findHomography, first, second, *settings)
 
 
 def _adds_nothing(epipolar: np.ndarray, homography: np.ndarray) -> bool:
@@ -84,15 +117,14 @@ def _adds_nothing(epipolar: np.ndarray, homography: np.ndarray) -> bool:
     return bool(extra < 0.15 * np.count_nonzero(~homography))
 
 
-def _quietly(estimate: Callable[..., tuple[Any, np.ndarray | None]], *arguments: Any) -> np.ndarray | None:
-    """Return the inlier mask of an OpenCV estimator; None for degenerate points (all equal, collinear)."""
+def _agreeing(
+    estimate: Callable[..., tuple[Any, np.ndarray | None]], first: np.ndarray, second: np.ndarray, *settings: Any
+) -> np.ndarray:
+    """Return the inliers of an OpenCV estimator, bool [m]; none for degenerate points (all equal, collinear)."""
     try:
-        return estimate(*arguments)[1]
+        mask = estimate(first, second, *settings)[1]
     except cv2.error:
-        return None
-
-
-def _as_bool(mask: np.ndarray | None, count: int) -> np.ndarray:
-    if mask is None or mask.size != count:
-        return np.zeros(count, dtype=bool)
+        mask = None
+    if mask is None or mask.size != len(first):
+        return np.zeros(len(first), dtype=bool)
     return mask.ravel().astype(bool)

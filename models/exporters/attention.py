@@ -104,18 +104,3 @@ def _halve(layer: Any) -> None:
         return inner(*cast, **others).float()
 
     layer.forward = forward
-
-
-def as_module(network: Any, forward: Callable[..., Any]) -> Any:
-    """Return a torch module that owns `network` and computes `forward(network, *inputs)`."""
-    base: Any = load("torch").nn.Module
-
-    class Wrapped(base):
-        def __init__(self, owned: Any) -> None:  # an argument: a class that knows the network would outlive it
-            super().__init__()
-            self.network = owned
-
-        def forward(self, *inputs: Any) -> Any:
-            return forward(self.network, *inputs)
-
-    return Wrapped(network).eval()

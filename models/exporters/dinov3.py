@@ -10,16 +10,13 @@ Changes to the loaded module:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
-from vggtgeo.models.exporters.attention import as_module, attention_replaced, halve_blocks
-from vggtgeo.models.exporters.checkout import Checkout, import_from
-from vggtgeo.models.exporters.request import Graph, Request, load
-from vggtgeo.models.exporters.weights import fill, seed
+from vggtgeo.models.exporters.attention import attention_replaced, halve_blocks
+from vggtgeo.models.exporters.request import Graph, Request, as_module, load
+from vggtgeo.models.exporters.weights import fill
 
-CHECKOUT = Checkout("facebookresearch/dinov3", "dinov3/hub/backbones.py", ("dinov3",))
 PREFIX = 5
 """The class token and four registers."""
 _DEVIATIONS = 2.0
@@ -29,16 +26,22 @@ _DEVIATIONS = 2.0
 def build(request: Request) -> Graph:
     """Return the network for one image of the request's size."""
     torch = load("torch")
-    with CHECKOUT.importable(request.source):
-        seed(request)
-        hub = import_from(request.source, "dinov3.hub.backbones", "its requirements.txt lists what it needs")
-        network = getattr(hub, f"dinov3_{request.variant}")(pretrained=False)
+    with request.code() as imported:
+        network = getattr(imported("dinov3.hub.backbones"), f"dinov3_{request.variant}")(pretrained=False)
     fill(network, request, f"DINOv3 {request.variant}")
     image = request.random_images(-_DEVIATIONS, _DEVIATIONS)
-    with torch.inference_mode(), _recorded_attention() as recorded:
+    recorded: list[tuple[Any, Any]] = []
+
+    def recording(original: Callable[..., Any]) -> Callable[..., Any]:
+        def attention(query: Any, key: Any, *others: Any, **named: Any) -> Any:
+            recorded[:] = [(query, key)]
+            return original(query, key, *others, **named)
+
+        return attention
+
+    with torch.inference_mode(), attention_replaced(recording):
         descriptors = network.forward_features(torch.from_numpy(image))["x_norm_patchtokens"]
-        query, key = recorded[-1]
-        attention = _attention(query, key)
+        attention = _attention(*recorded[-1])
     published = {"patch_descriptors": descriptors.numpy(), "attention": attention.numpy()}
     if request.half:
         halve_blocks(network.blocks)
@@ -69,19 +72,3 @@ def _attention(query: Any, key: Any) -> Any:
     """Return softmax(q k^T / sqrt(size)) of the prefix tokens' queries, [1, heads, 5, tokens]."""
     prefix = query[:, :, :PREFIX].float()
     return (prefix @ key.float().transpose(-2, -1) * query.shape[-1] ** -0.5).softmax(dim=-1)
-
-
-@contextmanager
-def _recorded_attention() -> Iterator[list[tuple[Any, Any]]]:
-    """Collect the queries and keys of every attention that the published code computes in the block."""
-    recorded: list[tuple[Any, Any]] = []
-
-    def recording(original: Callable[..., Any]) -> Callable[..., Any]:
-        def attention(query: Any, key: Any, *others: Any, **named: Any) -> Any:
-            recorded[:] = [(query, key)]
-            return original(query, key, *others, **named)
-
-        return attention
-
-    with attention_replaced(recording):
-        yield recorded

@@ -16,7 +16,6 @@ import gc
 import io
 import logging
 import os
-import shutil
 import tempfile
 import time
 import warnings
@@ -27,19 +26,23 @@ from typing import Any
 
 import numpy as np
 from vggtgeo.models.exporters.recipes import Recipe
-from vggtgeo.models.exporters.request import ExportError, Graph, Request, check_all, load
+from vggtgeo.models.exporters.request import ExportError, Graph, Request, evaluate, load
 from vggtgeo.models.exporters.weights import identity, read_checkpoint
-from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, METADATA_WEIGHTS, PARITY_SUFFIX
+from vggtgeo.models.onnx.contracts import (
+    CONTRACTS,
+    HALF_TOLERANCE,
+    METADATA_NETWORK,
+    METADATA_WEIGHTS,
+    PARITY_SUFFIX,
+    TOLERANCE,
+    relative_difference,
+)
 
 from vggtgeo.io.peak_memory import peak_memory_gb
 
 OPSET = 20
-TOLERANCE = 1e-3
-"""Largest difference of a file in float32."""
 EMBEDDED = 64e6
 """Bytes of weights up to which they are in the ONNX file itself."""
-HALF_TOLERANCE = 3e-2
-"""Largest difference of a file in half precision: some three digits, through tens of blocks."""
 
 
 @dataclass(frozen=True)
@@ -78,24 +81,31 @@ def export(
     nothing is written.
     """
     started = time.perf_counter()
-    _check_output(output)
+    if output.suffix != ".onnx" or output.is_dir():
+        raise ExportError(f"`--output` is {output}, expected the name of a file that ends in .onnx")
     recipe.checkout.root(request.source)
-    check_all()
+    for package in ("torch", "onnx", "onnxscript", "onnxruntime"):  # before any work begins
+        load(package)
     if request.checkpoint is not None:
         read_checkpoint(request.checkpoint)  # before a network of gigabytes is built
     weights = identity(request.checkpoint)
     tolerance = tolerance or (HALF_TOLERANCE if request.half else TOLERANCE)
-    with _folder_beside(output) as folder:
+    output.parent.mkdir(parents=True, exist_ok=True)
+    # On the same file system, so that moving its files out is one step each.
+    with tempfile.TemporaryDirectory(prefix=f".{output.stem}.", dir=output.parent) as temporary:
+        folder = Path(temporary)
         written = folder / output.name
         properties = _properties(recipe, request, weights)
         with _quiet():
-            expected, parameters, rewrite = _write(recipe, request, written, properties, tolerance, say)
+            inputs, outputs, parameters, rewrite = _write(recipe, request, written, properties, tolerance, say)
         say("checking the file")
         load("onnx").checker.check_model(str(written), full_check=True)
         say("running it in onnxruntime")
-        found, latency = _run(written, expected)
-        parity = _compare("onnxruntime", found, expected.outputs, tolerance)
-        _save_parity(folder / (output.name + PARITY_SUFFIX), expected)
+        found, latency = _run(written, inputs, list(outputs))
+        parity = _compare("onnxruntime", found, outputs, tolerance)
+        record: dict[str, Any] = {f"input.{name}": array for name, array in inputs.items()}
+        record |= {f"output.{name}": array for name, array in outputs.items()}
+        np.savez(folder / (output.name + PARITY_SUFFIX), **record)
         megabytes = sum(file.stat().st_size for file in folder.glob(f"{output.name}*") if file.suffix != ".npz") / 1e6
         _move(folder, output)
     seconds = time.perf_counter() - started
@@ -103,12 +113,7 @@ def export(
     return Report(output, recipe.network, weights, parameters, rewrite, parity, megabytes, seconds, latency, memory)
 
 
-@dataclass(frozen=True)
-class _Expected:
-    """Input and PyTorch's outputs, by name."""
-
-    inputs: Mapping[str, np.ndarray]
-    outputs: Mapping[str, np.ndarray]
+_Arrays = Mapping[str, np.ndarray]
 
 
 def _write(
@@ -118,18 +123,21 @@ def _write(
     properties: Mapping[str, str],
     tolerance: float,
     say: Callable[[str], None],
-) -> tuple[_Expected, int, float]:
-    """Build, compare with the published code, and write. On return the torch module's weights are gone from memory."""
+) -> tuple[_Arrays, _Arrays, int, float]:
+    """Build, compare with the published code, and write. On return the torch module's weights are gone from memory.
+
+    Return inputs, PyTorch's outputs, number of weights, and difference of the changed module from the published one.
+    """
     say(f"building {recipe.network} ({request.variant}) from {request.source}")
     graph = recipe.build(request)
     names = _output_names(recipe.network, graph)
     say("comparing with the published code in PyTorch")
-    values = _evaluate(graph, names)
+    values = evaluate(graph.module, graph.inputs, names)
     rewrite = _compare("the changed module", values, graph.published, tolerance)
     say("exporting")
     parameters = _save(graph, names, path, properties)
     _free(graph.module)
-    return _Expected(graph.inputs, values), parameters, rewrite
+    return graph.inputs, values, parameters, rewrite
 
 
 def _output_names(network: str, graph: Graph) -> tuple[str, ...]:
@@ -144,14 +152,6 @@ def _output_names(network: str, graph: Graph) -> tuple[str, ...]:
             "version with all of these heads?"
         )
     return names
-
-
-def _evaluate(graph: Graph, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    torch = load("torch")
-    with torch.inference_mode():
-        outputs = graph.module(*(torch.from_numpy(array) for array in graph.inputs.values()))
-    outputs = outputs if isinstance(outputs, tuple) else (outputs,)
-    return {name: output.numpy() for name, output in zip(names, outputs, strict=True)}
 
 
 def _save(graph: Graph, names: tuple[str, ...], path: Path, properties: Mapping[str, str]) -> int:
@@ -195,26 +195,23 @@ def _strip(model: Any) -> None:
         value.metadata_props.clear()
 
 
-def _run(path: Path, expected: _Expected) -> tuple[dict[str, np.ndarray], float]:
+def _run(path: Path, inputs: _Arrays, names: list[str]) -> tuple[_Arrays, float]:
     """Return outputs by name, and the seconds of the second call."""
     runtime = load("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = load("torch").get_num_threads()
     session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    names = list(expected.outputs)
-    outputs = session.run(names, dict(expected.inputs))
+    outputs = session.run(names, dict(inputs))
     started = time.perf_counter()
-    session.run(names, dict(expected.inputs))
+    session.run(names, dict(inputs))
     return dict(zip(names, outputs, strict=True)), time.perf_counter() - started
 
 
-def _compare(who: str, found: Mapping[str, np.ndarray], wanted: Mapping[str, np.ndarray], tolerance: float) -> float:
+def _compare(who: str, found: _Arrays, wanted: _Arrays, tolerance: float) -> float:
     """Return the largest difference; raise `ExportError` above `tolerance`, for NaN, or for another shape."""
     largest = 0.0
     for name, reference in wanted.items():
-        if found[name].shape != reference.shape:
-            raise ExportError(f"`{name}` of {who} is {found[name].shape}, PyTorch's is {reference.shape}; not written")
-        gap = difference(found[name], reference)
+        gap = relative_difference(found[name], reference)
         if not gap <= tolerance:
             raise ExportError(
                 f"`{name}` of {who} differs from PyTorch by {gap:.2g}, expected at most {tolerance:g}; nothing was "
@@ -222,11 +219,6 @@ def _compare(who: str, found: Mapping[str, np.ndarray], wanted: Mapping[str, np.
             )
         largest = max(largest, gap)
     return largest
-
-
-def difference(found: np.ndarray, reference: np.ndarray) -> float:
-    """Return max |found - reference| / max |reference|; NaN if any value is."""
-    return float(np.abs(found - reference).max() / np.abs(reference).max())
 
 
 def _properties(recipe: Recipe, request: Request, weights: str) -> dict[str, str]:
@@ -240,30 +232,6 @@ def _properties(recipe: Recipe, request: Request, weights: str) -> dict[str, str
     if request.tokens:
         properties["vggtgeo.tokens"] = str(request.tokens)
     return properties
-
-
-def _save_parity(path: Path, expected: _Expected) -> None:
-    arrays: dict[str, Any] = {f"input.{name}": array for name, array in expected.inputs.items()}
-    arrays |= {f"output.{name}": array for name, array in expected.outputs.items()}
-    np.savez(path, **arrays)
-
-
-def _check_output(output: Path) -> None:
-    if output.suffix != ".onnx":
-        raise ExportError(f"`--output` is {output}, expected a name that ends in .onnx")
-    if output.is_dir():
-        raise ExportError(f"`--output` {output} is a folder; give the name of a file in it")
-
-
-@contextlib.contextmanager
-def _folder_beside(output: Path) -> Iterator[Path]:
-    """Return a temporary folder on the same file system, so that moving its files out is one step each."""
-    output.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix=f".{output.stem}.", dir=output.parent))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _move(folder: Path, output: Path) -> None:

@@ -16,26 +16,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from vggtgeo.models.exporters.attention import as_module
-from vggtgeo.models.exporters.checkout import Checkout, import_from, stand_in
-from vggtgeo.models.exporters.request import Graph, Request, load
-from vggtgeo.models.exporters.weights import fill, require_random, seed
+from vggtgeo.models.exporters.request import Graph, Request, as_module, load, stand_in
+from vggtgeo.models.exporters.weights import fill
 
-CHECKOUT = Checkout("mlpc-ucsd/LETR", "models/letr_stack.py", ("models", "util", "args"), ("src", "."))
-_HINT = "install scipy and pillow"
 _SMALL = ("--enc_layers", "--dec_layers", "--second_enc_layers", "--second_dec_layers")
 
 
 def build(request: Request) -> Graph:
     """Return the network for one image of the request's size."""
     torch = load("torch")
-    require_random(request, ("test",))
-    with CHECKOUT.importable(request.source), _stand_ins(request):
-        seed(request)
-        code = import_from(request.source, "models.letr", _HINT)
-        options = import_from(request.source, "args", _HINT).get_args_parser().parse_args(_arguments(request))
+    backbone = "resnet50" if request.variant == "test" else request.variant
+    with request.code() as imported, _stand_ins(backbone):
+        code = imported("models.letr")
+        options = imported("args").get_args_parser().parse_args(_arguments(request, backbone))
         network = code.build(options)[0]
-        nested = import_from(request.source, "util.misc", _HINT).NestedTensor
+        nested = imported("util.misc").NestedTensor
     fill(network, request, f"LETR {request.variant}, both stages")
     image = torch.from_numpy(request.random_images(-2.0, 2.0))
     mask = torch.zeros(1, request.height, request.width, dtype=torch.bool)
@@ -51,8 +46,7 @@ def build(request: Request) -> Graph:
     return Graph(as_module(network, forward), {"image": image.numpy()}, published)
 
 
-def _arguments(request: Request) -> list[str]:
-    backbone = "resnet50" if request.variant == "test" else request.variant
+def _arguments(request: Request, backbone: str) -> list[str]:
     arguments = ["--LETRpost", "--backbone", backbone, "--no_aux_loss", "--device", "cpu"]
     if request.variant == "test":
         arguments += ["--num_queries", "50", *(word for name in _SMALL for word in (name, "1"))]
@@ -60,21 +54,17 @@ def _arguments(request: Request) -> list[str]:
 
 
 @contextmanager
-def _stand_ins(request: Request) -> Iterator[None]:
+def _stand_ins(backbone: str) -> Iterator[None]:
     """Provide what LETR imports: a torchvision with one backbone, and a class of torch under its old name."""
     linear = load("torch").nn.modules.linear
-
-    def backbone(norm_layer: Any, **_options: Any) -> Any:
-        name = "resnet50" if request.variant == "test" else request.variant
-        return residual_network(name, norm_layer)
-
+    make = lambda norm_layer, **_options: residual_network(backbone, norm_layer)
     linear._LinearWithBias = linear.NonDynamicallyQuantizableLinear
     try:
         with stand_in("torchvision.models._utils", IntermediateLayerGetter=layer_getter()):
             torchvision = load("torchvision")
             torchvision.__version__ = "0.99"
             torchvision._is_tracing = lambda: False
-            torchvision.models.resnet50 = torchvision.models.resnet101 = backbone
+            torchvision.models.resnet50 = torchvision.models.resnet101 = make
             yield
     finally:
         del linear._LinearWithBias

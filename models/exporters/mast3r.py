@@ -2,7 +2,7 @@
 
 Changes to the loaded module:
 
-- Rotary embedding looks `positions.max()` up in the data: angles become constants of the grid (`rotary`).
+- Rotary embedding looks `positions.max()` up in the data: angles become constants of the grid (`attention`).
 - Image shapes travel through the published code as tensors: encoder, decoder and heads are called one by one, with
   the size as plain numbers.
 - The checkpoint's configuration is a line of Python that upstream evaluates; here the published configuration is
@@ -15,15 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from vggtgeo.models.exporters.attention import as_module, fix_positions, grid, halve_blocks
-from vggtgeo.models.exporters.checkout import Checkout, import_from
-from vggtgeo.models.exporters.request import Graph, Request, load
-from vggtgeo.models.exporters.weights import fill, require_random, seed
+from vggtgeo.models.exporters.attention import fix_positions, grid, halve_blocks
+from vggtgeo.models.exporters.request import Graph, Request, as_module, load
+from vggtgeo.models.exporters.weights import fill
 
-CHECKOUT = Checkout(
-    "naver/mast3r", "mast3r/model.py", ("mast3r", "dust3r", "models", "utils"), (".", "thirdparty/mast3r")
-)
 PATCH = 16
 _BASE = 100.0
 _UNBOUNDED = float("inf")
@@ -47,12 +42,7 @@ _METRIC: dict[str, Any] = {
 }
 """`MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric`, for images that are not turned to landscape."""
 _SMALL = {"enc_embed_dim": 192, "enc_depth": 2, "enc_num_heads": 3, "dec_embed_dim": 192, "dec_num_heads": 3}
-_HEAD_OUTPUTS = {
-    "points": "pts3d",
-    "confidence": "conf",
-    "descriptors": "desc",
-    "descriptor_confidence": "desc_conf",
-}
+_HEAD_OUTPUTS = {"points": "pts3d", "confidence": "conf", "descriptors": "desc", "descriptor_confidence": "desc_conf"}
 
 
 def build_encoder(request: Request) -> Graph:
@@ -84,18 +74,20 @@ def build_decoder(request: Request) -> Graph:
     second["pts3d"] = second.pop("pts3d_in_other_view")
     _prepare(network, request)
     inputs = {f"features_{view + 1}": features[view] for view in range(2)}
-    return Graph(as_module(network, _decode(request)), inputs, _named((first, second)))
+    published = {
+        f"{name}_{number}": view[key].numpy()
+        for number, view in enumerate((first, second), start=1)
+        for name, key in _HEAD_OUTPUTS.items()
+    }
+    return Graph(as_module(network, _decode(request)), inputs, published)
 
 
 def _network(request: Request) -> Any:
     torch = load("torch")
-    require_random(request, ("test",))
     allowed = torch.backends.cuda.matmul.allow_tf32
-    with CHECKOUT.importable(request.source):
-        seed(request)
-        code = import_from(request.source, "mast3r.model", "install einops and huggingface-hub, fetch the submodules")
+    with request.code() as imported:
         small = _SMALL if request.variant == "test" else {}
-        network = code.AsymmetricMASt3R(**_METRIC | small)
+        network = imported("mast3r.model").AsymmetricMASt3R(**_METRIC | small)
     torch.backends.cuda.matmul.allow_tf32 = allowed
     fill(network, request, "MASt3R ViT-L metric")
     return network
@@ -129,11 +121,3 @@ def _decode(request: Request) -> Callable[..., tuple[Any, ...]]:
         return tuple(view[key] for view in views for key in _HEAD_OUTPUTS.values())
 
     return forward
-
-
-def _named(views: tuple[dict[str, Any], dict[str, Any]]) -> dict[str, np.ndarray]:
-    return {
-        f"{name}_{number + 1}": view[key].numpy()
-        for number, view in enumerate(views)
-        for name, key in _HEAD_OUTPUTS.items()
-    }

@@ -14,16 +14,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
-from vggtgeo.models.exporters.attention import as_module, halve_blocks
-from vggtgeo.models.exporters.checkout import Checkout, import_from, stand_in
-from vggtgeo.models.exporters.request import ExportError, Graph, Request, load
-from vggtgeo.models.exporters.weights import fill, read_checkpoint, seed
+from vggtgeo.models.exporters.attention import halve_blocks
+from vggtgeo.models.exporters.request import ExportError, Graph, Request, as_module, load, stand_in
+from vggtgeo.models.exporters.weights import fill, read_checkpoint
 
-CHECKOUT = Checkout("microsoft/MoGe", "moge/model/v2.py", ("moge",))
 _BLOCKS = {"vits": 12, "vitb": 12, "vitl": 24}
 _CHANNELS = {"vits": 384, "vitb": 768, "vitl": 1024}
 _CONFIGURATION = "configs/train/v2.json"
@@ -34,10 +31,9 @@ def build(request: Request) -> Graph:
     """Return the network for one image of the request's size, seen as about `request.tokens` patches."""
     torch = load("torch")
     configuration = _configuration(request)
-    with CHECKOUT.importable(request.source), stand_in("utils3d"), _without_xformers():
-        seed(request)
-        published_code = import_from(request.source, "moge.model.v2", "install huggingface-hub")
-        network = published_code.MoGeModel(**configuration)
+    without_xformers = mock.patch.dict(os.environ, {"XFORMERS_DISABLED": "1"})
+    with request.code() as imported, stand_in("utils3d"), without_xformers:
+        network = imported("moge.model.v2").MoGeModel(**configuration)
     fill(network, request, f"MoGe-2 {configuration['encoder']['backbone']}")
     image = request.random_images(0.0, 1.0)
     with torch.inference_mode():
@@ -64,7 +60,7 @@ def _configuration(request: Request) -> dict[str, Any]:
                 "(model.pt), which has its options and its weights"
             )
         return configuration
-    path = CHECKOUT.root(request.source) / _CONFIGURATION
+    path = request.checkout.root(request.source) / _CONFIGURATION
     if not path.is_file():
         raise ExportError(
             f"`--source` {request.source}: no `{_CONFIGURATION}` in it, from which random weights are "
@@ -81,16 +77,3 @@ def _fitted(configuration: dict[str, Any], variant: str) -> dict[str, Any]:
     encoder = configuration["encoder"] | {"backbone": f"dinov2_{variant}14", "intermediate_layers": levels}
     scale_head = {"dims": [_CHANNELS[variant], *configuration["scale_head"]["dims"][1:]]}
     return configuration | {"encoder": encoder, "scale_head": scale_head}
-
-
-@contextmanager
-def _without_xformers() -> Iterator[None]:
-    previous = os.environ.get("XFORMERS_DISABLED")
-    os.environ["XFORMERS_DISABLED"] = "1"
-    try:
-        yield
-    finally:
-        if previous is None:
-            del os.environ["XFORMERS_DISABLED"]
-        else:
-            os.environ["XFORMERS_DISABLED"] = previous

@@ -2,50 +2,34 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from vggtgeo.models.exporters.checkout import Checkout
-from vggtgeo.models.exporters.request import ExportError, Graph, Request
-
-_HERE = "vggtgeo.models.exporters"
+from vggtgeo.models.exporters import convolutional, dinov3, letr, mast3r, moge2, vggt
+from vggtgeo.models.exporters.request import Checkout, ExportError, Graph, Request
 
 
 @dataclass(frozen=True)
 class Recipe:
     """One network.
 
-    module, function: what builds it. variants: its sizes, the default first; `test` is small and has no checkpoint.
-    size: default height and width, pixels, for images of 640 x 480. multiple: both are multiples of this.
-    fixed_height, fixed_width: the only value there is, or None. views, tokens: their default, 0 where there are none.
-    half: whether it can be written in half precision.
+    checkout: its published code. build: makes the network that a request asks for. variants: its sizes, the default
+    first; `test` is small and has no checkpoint. size: default height and width, pixels, for images of 640 x 480.
+    multiple: both are multiples of this. fixed: options of the sizes that can only be the default. views, tokens: their
+    default, 0 where there are none. half: whether it can be written in half precision.
     """
 
     network: str
-    module: str
+    checkout: Checkout
+    build: Callable[[Request], Graph]
     variants: tuple[str, ...]
-    size: tuple[int, int]
-    function: str = "build"
+    size: tuple[int, int] = (480, 640)
     multiple: int = 1
-    fixed_height: int | None = None
-    fixed_width: int | None = None
+    fixed: tuple[str, ...] = ()
     views: int = 0
     tokens: int = 0
     half: bool = True
-
-    @property
-    def checkout(self) -> Checkout:
-        """Return where its code is looked for."""
-        found: Checkout = importlib.import_module(f"{_HERE}.{self.module}").CHECKOUT
-        return found
-
-    @property
-    def build(self) -> Callable[[Request], Graph]:
-        """Make the network that a request asks for."""
-        found: Callable[[Request], Graph] = getattr(importlib.import_module(f"{_HERE}.{self.module}"), self.function)
-        return found
 
     def request(
         self,
@@ -61,14 +45,24 @@ class Recipe:
     ) -> Request:
         """Return the request with defaults filled in; `ExportError` for what this network cannot be."""
         height, width = height or self.size[0], width or self.size[1]
-        self._check_size(height, width)
+        for option, size, default in zip(("--height", "--width"), (height, width), self.size, strict=True):
+            if option in self.fixed and size != default:
+                raise ExportError(f"`{option}` is {size}; {self.network} takes {default} alone, leave it out")
+            if size < 1 or size % self.multiple:
+                near = max(self.multiple, round(size / self.multiple) * self.multiple)
+                raise ExportError(
+                    f"`{option}` is {size}; {self.network} takes multiples of {self.multiple}: {near}, for instance"
+                )
         if variant is not None and variant not in self.variants:
             raise ExportError(
                 f"`--variant` {variant} is not known for {self.network}; expected one of {', '.join(self.variants)}"
             )
+        if checkpoint is not None and variant == "test":
+            raise ExportError("`--variant` test is for tests, with `--random-weights`; no checkpoint fits it")
         if half and not self.half:
             raise ExportError(f"`--half` does nothing for {self.network}, which is small; leave it out")
         return Request(
+            checkout=self.checkout,
             source=source,
             checkpoint=checkpoint,
             height=height,
@@ -80,16 +74,6 @@ class Recipe:
             allow_extra=allow_extra,
         )
 
-    def _check_size(self, height: int, width: int) -> None:
-        for option, size, fixed in (("--height", height, self.fixed_height), ("--width", width, self.fixed_width)):
-            if fixed is not None and size != fixed:
-                raise ExportError(f"`{option}` is {size}; {self.network} takes {fixed} alone, leave it out")
-            if size < 1 or size % self.multiple:
-                near = max(self.multiple, round(size / self.multiple) * self.multiple)
-                raise ExportError(
-                    f"`{option}` is {size}; {self.network} takes multiples of {self.multiple}: {near}, for instance"
-                )
-
     def _only_where(self, option: str, value: int | None, default: int) -> int:
         if value is not None and not default:
             raise ExportError(f"`{option}` means nothing to {self.network}; leave it out")
@@ -98,20 +82,35 @@ class Recipe:
         return default if value is None else value
 
 
-RECIPES = {
-    recipe.network: recipe
-    for recipe in (
-        Recipe("vggt", "vggt", ("1b", "test"), (392, 518), multiple=14, fixed_width=518, views=4),
-        Recipe("dinov3", "dinov3", ("vitl16", "vitb16", "vits16"), (480, 640), multiple=16),
-        Recipe("moge2", "moge2", ("vitl", "vitb", "vits"), (480, 640), tokens=1800),
-        Recipe("letr", "letr", ("resnet50", "resnet101", "test"), (480, 640), half=False),
-        Recipe("mast3r_encoder", "mast3r", ("vitl", "test"), (384, 512), "build_encoder", multiple=16),
-        Recipe("mast3r_decoder", "mast3r", ("vitl", "test"), (384, 512), "build_decoder", multiple=16),
-        Recipe("alike", "alike", ("normal", "tiny", "small", "large"), (480, 640), multiple=32, half=False),
-        Recipe("xfeat", "xfeat", ("published",), (480, 640), multiple=32, half=False),
-        Recipe("mlsd", "mlsd", ("tiny",), (512, 512), fixed_height=512, fixed_width=512, half=False),
-    )
-}
+_NEEDS = "install einops and huggingface-hub"
+_VGGT = Checkout("facebookresearch/vggt", "vggt/models/vggt.py", ("vggt",), (".", "base_models"), _NEEDS)
+_DINOV3 = Checkout("facebookresearch/dinov3", "dinov3/hub/backbones.py", ("dinov3",), hint="see its requirements.txt")
+_MOGE2 = Checkout("microsoft/MoGe", "moge/model/v2.py", ("moge",), hint="install huggingface-hub")
+_LETR = Checkout(
+    "mlpc-ucsd/LETR", "models/letr_stack.py", ("models", "util", "args"), ("src", "."), "install scipy and pillow"
+)
+_MAST3R = Checkout(
+    "naver/mast3r",
+    "mast3r/model.py",
+    ("mast3r", "dust3r", "models", "utils"),
+    (".", "thirdparty/mast3r"),
+    f"{_NEEDS}, fetch the submodules",
+)
+_ALIKE = Checkout("Shiaoming/ALIKE", "alnet.py", ("alnet",))
+_XFEAT = Checkout("verlab/accelerated_features", "modules/model.py", ("modules",))
+_MLSD = Checkout("lhwcv/mlsd_pytorch", "models/mbv2_mlsd_tiny.py", ("models",))
+_ALL = (
+    Recipe("vggt", _VGGT, vggt.build, ("1b", "test"), (392, 518), multiple=14, fixed=("--width",), views=4),
+    Recipe("dinov3", _DINOV3, dinov3.build, ("vitl16", "vitb16", "vits16"), multiple=16),
+    Recipe("moge2", _MOGE2, moge2.build, ("vitl", "vitb", "vits"), tokens=1800),
+    Recipe("letr", _LETR, letr.build, ("resnet50", "resnet101", "test"), half=False),
+    Recipe("mast3r_encoder", _MAST3R, mast3r.build_encoder, ("vitl", "test"), (384, 512), multiple=16),
+    Recipe("mast3r_decoder", _MAST3R, mast3r.build_decoder, ("vitl", "test"), (384, 512), multiple=16),
+    Recipe("alike", _ALIKE, convolutional.build_alike, ("normal", "tiny", "small", "large"), multiple=32, half=False),
+    Recipe("xfeat", _XFEAT, convolutional.build_xfeat, ("published",), multiple=32, half=False),
+    Recipe("mlsd", _MLSD, convolutional.build_mlsd, ("tiny",), (512, 512), fixed=("--height", "--width"), half=False),
+)
+RECIPES = {recipe.network: recipe for recipe in _ALL}
 """Every network that can be exported, by the name of its contract."""
 
 

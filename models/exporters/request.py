@@ -1,11 +1,19 @@
-"""The request and the result of an exporter, and the optional packages that it needs."""
+"""One export: its request, the published code and the optional packages that it needs, and the graph that it gives."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-from collections.abc import Mapping
+import io
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,16 +25,120 @@ class ExportError(ValueError):
     """A checkout, a checkpoint or a size does not fit the network; the message says what, and what to do."""
 
 
+def load(name: str) -> Any:
+    """Return the package `name`; raise `ExportError` naming the extra if it, or a dependency, is missing."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise ExportError(
+            f"exporting needs the package `{error.name}`, which is not installed; {install_hint('export')}"
+        ) from None
+
+
+@dataclass(frozen=True)
+class Checkout:
+    """Where a network's code lies.
+
+    repository: owner/name, for messages. marker: a file that a checkout has, relative to one of `roots`.
+    packages: top-level names that its code imports from there. roots: folders of the checkout, relative, in which
+    `marker` may lie; the first that has it is imported from. hint: what to do if something that it imports is missing.
+    """
+
+    repository: str
+    marker: str
+    packages: tuple[str, ...]
+    roots: tuple[str, ...] = (".",)
+    hint: str = ""
+
+    def root(self, source: Path) -> Path:
+        """Return the folder to import from; raises `ExportError` if `source` is no such checkout."""
+        for folder in self.roots:
+            if (source / folder / self.marker).is_file():
+                return (source / folder).resolve()
+        found = "no such folder" if not source.is_dir() else f"no `{self.marker}` in it"
+        raise ExportError(
+            f"`--source` {source}: {found}; expected a checkout of {self.repository}: "
+            f"git clone https://github.com/{self.repository}"
+        )
+
+    def find(self, folder: Path) -> Path | None:
+        """Return the checkout among the folders in `folder`, whatever it is called, or None."""
+        for candidate in sorted(path for path in folder.iterdir() if path.is_dir()):
+            if any((candidate / root / self.marker).is_file() for root in self.roots):
+                return candidate
+        return None
+
+    @contextlib.contextmanager
+    def importable(self, source: Path) -> Iterator[None]:
+        """Import `packages` from the checkout and from nowhere else, in the block."""
+        root = self.root(source)
+        search_path = list(sys.path)
+        for name in [name for name in sys.modules if name.split(".")[0] in self.packages]:
+            del sys.modules[name]
+        # a namespace package (croco's `models`, say) loses against any regular one of its name later on the path
+        sys.path[:] = [str(root), *(entry for entry in search_path if not _provides(entry, self.packages))]
+        importlib.invalidate_caches()
+        try:
+            with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+                warnings.simplefilter("ignore")
+                yield
+        finally:
+            sys.path[:] = search_path
+
+    def import_from(self, source: Path, module: str) -> Any:
+        """Return the module, inside `importable`; raise `ExportError` if something that it imports is missing."""
+        try:
+            return importlib.import_module(module)
+        except ImportError as error:
+            raise ExportError(f"`--source` {source}: importing `{module}` failed: {error}; {self.hint}") from None
+
+    def revision(self, source: Path) -> str:
+        """Return `repository@commit` of the checkout, the commit `unknown` outside git."""
+        try:
+            command = ["git", "-C", str(source), "rev-parse", "HEAD"]
+            commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        except (OSError, subprocess.CalledProcessError):
+            commit = "unknown"
+        return f"{self.repository}@{commit}"
+
+
+def _provides(entry: str, packages: Sequence[str]) -> bool:
+    folder = Path(entry or ".")
+    return any((folder / name).is_dir() or (folder / f"{name}.py").is_file() for name in packages)
+
+
+@contextlib.contextmanager
+def stand_in(name: str, **attributes: Any) -> Iterator[None]:
+    """Let `import name` give an empty module with `attributes` in the block.
+
+    For packages that the published code imports at the top and does not need for the forward pass.
+    """
+    parts = [".".join(name.split(".")[: depth + 1]) for depth in range(name.count(".") + 1)]
+    previous = {part: sys.modules.pop(part, None) for part in parts}
+    sys.modules.update({part: ModuleType(part) for part in parts})
+    for parent, child in pairwise(parts):
+        setattr(sys.modules[parent], child.rsplit(".", 1)[1], sys.modules[child])
+    vars(sys.modules[name]).update(attributes)
+    try:
+        yield
+    finally:
+        for part, module in previous.items():
+            sys.modules.pop(part, None)
+            if module is not None:
+                sys.modules[part] = module
+
+
 @dataclass(frozen=True)
 class Request:
     """One export, already checked against its recipe.
 
-    source: the checkout. checkpoint: the file of weights, or None for random ones drawn with `seed`.
-    height, width: pixels of the input image. views: images a window (VGGT). tokens: patches inside MoGe-2.
+    checkout, source: the code, and where it lies. checkpoint: the file of weights, or None for random ones drawn with
+    `seed`. height, width: pixels of the input image. views: images a window (VGGT). tokens: patches inside MoGe-2.
     variant: the size of the network, one of the recipe's. half: attention and perceptrons in float16.
     allow_extra: whether the checkpoint may hold weights that the network has no place for.
     """
 
+    checkout: Checkout
     source: Path
     checkpoint: Path | None
     height: int
@@ -43,6 +155,13 @@ class Request:
         draw = np.random.default_rng(self.seed).uniform(low, high, (count, 3, self.height, self.width))
         return draw.astype(np.float32)
 
+    @contextlib.contextmanager
+    def code(self) -> Iterator[Callable[[str], Any]]:
+        """Give a function that imports modules of the checkout, in the block; torch's random numbers are fixed."""
+        with self.checkout.importable(self.source):
+            load("torch").manual_seed(self.seed)
+            yield partial(self.checkout.import_from, self.source)
+
 
 @dataclass(frozen=True)
 class Graph:
@@ -57,18 +176,34 @@ class Graph:
     inputs: Mapping[str, np.ndarray]
     published: Mapping[str, np.ndarray]
 
-
-def load(name: str) -> Any:
-    """Return the package `name`; raise `ExportError` naming the extra if it, or a dependency, is missing."""
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise ExportError(
-            f"exporting needs the package `{error.name}`, which is not installed; {install_hint('export')}"
-        ) from None
+    @classmethod
+    def unchanged(
+        cls, network: Any, forward: Callable[..., Any], inputs: Mapping[str, np.ndarray], names: Sequence[str]
+    ) -> Graph:
+        """Return the graph of a network whose published outputs, by `names`, are what `forward` gives."""
+        module = as_module(network, forward)
+        return cls(module, inputs, evaluate(module, inputs, names))
 
 
-def check_all() -> None:
-    """Raise `ExportError` unless everything that an export needs is installed; before any work begins."""
-    for name in ("torch", "onnx", "onnxscript", "onnxruntime"):
-        load(name)
+def evaluate(module: Any, inputs: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the outputs of a torch module by `names`, in order."""
+    torch = load("torch")
+    with torch.inference_mode():
+        outputs = module(*(torch.from_numpy(array) for array in inputs.values()))
+    outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+    return {name: output.numpy() for name, output in zip(names, outputs, strict=True)}
+
+
+def as_module(network: Any, forward: Callable[..., Any]) -> Any:
+    """Return a torch module that owns `network` and computes `forward(network, *inputs)`."""
+    base: Any = load("torch").nn.Module
+
+    class Wrapped(base):
+        def __init__(self, owned: Any) -> None:  # an argument: a class that knows the network would outlive it
+            super().__init__()
+            self.network = owned
+
+        def forward(self, *inputs: Any) -> Any:
+            return forward(self.network, *inputs)
+
+    return Wrapped(network).eval()

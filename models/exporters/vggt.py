@@ -3,7 +3,7 @@
 Changes to the loaded module, each needed because the published code cannot be exported as it is:
 
 - The point and track heads are dropped: nothing here uses them.
-- Rotary embedding looks `positions.max()` up in the data: angles become constants of the grid (`rotary`). Special
+- Rotary embedding looks `positions.max()` up in the data: angles become constants of the grid (`attention`). Special
   tokens stand at (0, 0), patches at (row + 1, column + 1); global attention sees all views' tokens in one sequence.
 - The dense head computes its position embedding in float64 beside float32 (onnxruntime refuses the file): it is
   evaluated once for each size and kept as float32. Half of its channels depend on the column alone and half on the
@@ -20,34 +20,23 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from vggtgeo.models.exporters.attention import (
-    as_module,
-    attention_replaced,
-    fix_positions,
-    grid,
-    halve_blocks,
-    in_parts,
-)
-from vggtgeo.models.exporters.checkout import Checkout, import_from
-from vggtgeo.models.exporters.request import Graph, Request, load
-from vggtgeo.models.exporters.weights import fill, require_random, seed
+from vggtgeo.models.exporters.attention import attention_replaced, fix_positions, grid, halve_blocks, in_parts
+from vggtgeo.models.exporters.request import Graph, Request, as_module, load
+from vggtgeo.models.exporters.weights import fill
 
-CHECKOUT = Checkout("facebookresearch/vggt", "vggt/models/vggt.py", ("vggt",), (".", "base_models"))
 PATCH = 14
-_HINT = "install einops and huggingface-hub"
 
 
 def build(request: Request) -> Graph:
     """Return the network for `request.views` images of the request's size."""
     torch = load("torch")
-    require_random(request, ("test",))
-    with CHECKOUT.importable(request.source):
-        seed(request)
-        network = _small(request) if request.variant == "test" else _published(request)
+    with request.code() as imported:
+        code = imported("vggt.models.vggt")
+        network = _small(code) if request.variant == "test" else code.VGGT()
     fill(network, request, "VGGT-1B")
     network.point_head = network.track_head = None
     images = request.random_images(0.0, 1.0, request.views)
-    with torch.inference_mode(), CHECKOUT.importable(request.source):
+    with torch.inference_mode(), request.checkout.importable(request.source):
         outputs = network(torch.from_numpy(images))
     published = {
         "pose_enc": outputs["pose_enc"][0].numpy(),
@@ -58,13 +47,8 @@ def build(request: Request) -> Graph:
     return Graph(as_module(network, _forward), {"images": images}, published)
 
 
-def _published(request: Request) -> Any:
-    return import_from(request.source, "vggt.models.vggt", _HINT).VGGT()
-
-
-def _small(request: Request) -> Any:
+def _small(model: Any) -> Any:
     """Return the same network from its published parts, with one block of each kind in the place of eight."""
-    model = import_from(request.source, "vggt.models.vggt", _HINT)
     base: Any = model.VGGT
 
     class Small(base):

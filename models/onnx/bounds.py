@@ -91,7 +91,6 @@ class BoundedDepth(_Bounded[MetricDepth]):
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        """See `MetricDepth.estimate`."""
         found = self._asked(lambda: self.source.estimate(image, sensor_depth, intrinsics), image[..., 0].size)
         if found is None:
             return no_depth(image.shape[:2])
@@ -114,7 +113,6 @@ class BoundedConfidence(_Bounded[DenseConfidence]):
     """A `DenseConfidence` in [0, 1]; `AVERAGE` where that of the source is invalid."""
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
-        """See `DenseConfidence.confidence`."""
         average = np.full(image.shape[:2], AVERAGE, np.float32)
         found = self._asked(lambda: self.source.confidence(image), average.size)
         if found is None:
@@ -130,7 +128,6 @@ class BoundedLines(_Bounded[LineDetector]):
     """A `LineDetector` with segments inside the image."""
 
     def detect(self, image: np.ndarray) -> Segments:
-        """See `LineDetector.detect`."""
         found = self._asked(lambda: self.source.detect(image))
         if found is None:
             return _NO_SEGMENTS
@@ -145,7 +142,6 @@ class BoundedLineMatcher(_Bounded[LineMatcher]):
     """A `LineMatcher` without segments for an image on which its network failed."""
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
-        """See `LineMatcher.describe`."""
         found = self._asked(lambda: self.source.describe(image, segments))
         if found is None:
             return LineFeatures(_NO_SEGMENTS)
@@ -155,7 +151,6 @@ class BoundedLineMatcher(_Bounded[LineMatcher]):
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
-        """See `LineMatcher.match`."""
         if not len(features_i) or not len(features_j):
             return LineMatches(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
         return self.source.match(features_i, features_j, relative)
@@ -166,12 +161,10 @@ class BoundedPoints(_Bounded[PointMatcher]):
     """A `PointMatcher` without matches if its network fails; bounds are checked by `PointMatches`."""
 
     def describe(self, image: np.ndarray) -> Features:
-        """See `PointMatcher.describe`."""
         found = self._asked(lambda: self.source.describe(image))
         return Features(np.zeros((0, 2)), np.zeros(0)) if found is None else found
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """See `PointMatcher.match`."""
         if not (len(features_i) and len(features_j)):
             return PointMatches.none()
         found = self._asked(lambda: self.source.match(features_i, features_j, predicted))
@@ -186,7 +179,6 @@ class BoundedWindow(_Bounded[WindowGeometry]):
     """A `WindowGeometry` that fails for values that are not finite; views with values out of bounds are not found."""
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
-        """See `WindowGeometry.window`."""
         count, size = len(images), images[0].shape[:2]
         found = self._asked(lambda: self.source.window(images, intrinsics), count)
         if found is None:

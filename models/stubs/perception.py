@@ -36,9 +36,6 @@ class SimulatedMoge:
     memory: float = 1.0
     wobble: float = 0.02
 
-    def __post_init__(self) -> None:
-        check_settings(self, error=0, weak=0, glass=1, cycles=0, memory=1e-3, wobble=0)
-
     def estimate(
         self, image: np.ndarray, sensor_depth: np.ndarray | None = None, intrinsics: Sequence[float] | None = None
     ) -> DepthEstimate:
@@ -76,9 +73,6 @@ class SimulatedDino:
     reach: float = 12.0
     blind: float = 0.7
     patch: int = 16
-
-    def __post_init__(self) -> None:
-        check_settings(self, noise=0, floor=0, share=0, reach=1e-3, blind=0, patch=1)
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         """Return simulated Omega of `image`, float32 [H, W] in [0, 1]."""
@@ -150,14 +144,6 @@ def at_pixels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return image[rows, columns]
 
 
-def check_settings(stub: object, **lowest: float) -> None:
-    """Raise ValueError for the first setting of `stub` that is not finite or below its `lowest` value."""
-    for name, low in lowest.items():
-        value = getattr(stub, name)
-        if not np.isfinite(value) or value < low:
-            raise ValueError(f"`{name}` is {value}; it must be at least {low}: correct the error model")
-
-
 @dataclass(frozen=True)
 class SimulatedMast3r:
     """Error model, with w in [0, 1] the lack of texture at the key point and g = 1 behind glass, else 0.
@@ -182,11 +168,6 @@ class SimulatedMast3r:
     behind_glass: float = 0.35
     outlier_shift: float = 25.0
     imagined: float = 0.02
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self, count=1, spread=1e-6, noise=0, missed=0, outliers=0, behind_glass=0, outlier_shift=0, imagined=0
-        )
 
     def describe(self, image: np.ndarray) -> Features:
         """Return simulated key points of `image`; the descriptor is the frame's number."""
@@ -241,9 +222,6 @@ class SimulatedLetr:
     half: float = 2.0
     false: float = 6.0
     shortest: float = 20.0
-
-    def __post_init__(self) -> None:
-        check_settings(self, across=0, along=0, found=0, half=0, false=0, shortest=0)
 
     def detect(self, image: np.ndarray) -> Segments:
         """Return simulated segments of `image`, best first."""

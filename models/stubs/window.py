@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.roles import GeometryResult, WindowGuess
-from vggtgeo.models.stubs.perception import Oracle, SmoothField, check_settings, stream, weakness
+from vggtgeo.models.stubs.perception import Oracle, SmoothField, stream, weakness
 
 _GRID = (12, 9)
 
@@ -42,12 +42,6 @@ class SimulatedVggt:
     memory: float = 2.0
     focal: float = 0.01
     least_overlap: float = 0.10
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self, rotation=0, translation=0, jitter=0, scale=0, depth_error=0, weak=0, cycles=0, memory=1e-3, focal=0,
-            least_overlap=0,
-        )  # fmt: skip
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
         """Return simulated geometry of `images`; the first camera is the world."""

@@ -12,11 +12,9 @@ from invoked import invoke
 from reported import raises
 from vggtgeo.models.exporters import request
 from vggtgeo.models.exporters.attention import angle_tables, grid
-from vggtgeo.models.exporters.checkout import Checkout, import_from
-from vggtgeo.models.exporters.export import difference
 from vggtgeo.models.exporters.recipes import RECIPES, recipe_of
-from vggtgeo.models.exporters.request import ExportError
-from vggtgeo.models.onnx.contracts import CONTRACTS
+from vggtgeo.models.exporters.request import Checkout, ExportError
+from vggtgeo.models.onnx.contracts import CONTRACTS, relative_difference
 
 RANDOM = ("--random-weights", "-o", "file.onnx", "--source", "nowhere")
 
@@ -72,13 +70,13 @@ def test_code_is_imported_from_the_checkout_alone(tmp_path: Path, monkeypatch: p
         (tmp_path / folder / "clashing" / "who.py").write_text(text)
     (tmp_path / "mine" / "clashing" / "__init__.py").touch()
     monkeypatch.syspath_prepend(str(tmp_path / "mine"))
-    assert import_from(tmp_path, "clashing.who", "").WHO == "mine"
-    checkout = Checkout("owner/name", "clashing/who.py", ("clashing",))
+    checkout = Checkout("owner/name", "clashing/who.py", ("clashing",), hint="install this")
+    assert checkout.import_from(tmp_path, "clashing.who").WHO == "mine"
     before = list(sys.path)
     with checkout.importable(tmp_path / "code"):
-        assert import_from(tmp_path, "clashing.who", "").WHO == "checkout"
+        assert checkout.import_from(tmp_path, "clashing.who").WHO == "checkout"
         with pytest.raises(ExportError, match=r"clashing\.nothing.*install this"):
-            import_from(tmp_path, "clashing.nothing", "install this")
+            checkout.import_from(tmp_path, "clashing.nothing")
     assert sys.path == before
     assert checkout.find(tmp_path) == tmp_path / "code"
     assert Checkout("owner/name", "nothing.py", ()).find(tmp_path) is None
@@ -89,5 +87,5 @@ def test_code_is_imported_from_the_checkout_alone(tmp_path: Path, monkeypatch: p
 
 def test_difference_is_relative_to_the_largest_value() -> None:
     # Proves the measure of parity, and that it is never small when a value is NaN. Oracle: arithmetic.
-    assert difference(np.array([1.0, -4.5]), np.array([1.0, -4.0])) == 0.125
-    assert not difference(np.array([np.nan, 1.0]), np.array([1.0, 1.0])) <= 1e9
+    assert relative_difference(np.array([1.0, -4.5]), np.array([1.0, -4.0])) == 0.125
+    assert not relative_difference(np.array([np.nan, 1.0]), np.array([1.0, 1.0])) <= 1e9
