@@ -108,9 +108,7 @@ class WindowLocator:
 
 def _unproject(pixels: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which pixels [n, 2] have depth, bool [n], and their points in the camera's frame [n, 3], NaN = none."""
-    height, width = depth.shape
-    columns, rows = np.rint(pixels).astype(int).T
-    z = depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
+    z = pinhole.at_pixels(depth, pixels).astype(np.float64)
     known = z > 0
     return known, pinhole.rays(np.asarray(pixels, np.float64), intrinsics) * np.where(known, z, np.nan)[:, None]
 

@@ -15,7 +15,6 @@ from vggtgeo.models.classical.manhattan import ManhattanView as ManhattanView
 from vggtgeo.models.classical.manhattan import nearest_frame as nearest_frame
 from vggtgeo.models.classical.pixel_matcher import OrbMatcher as OrbMatcher
 from vggtgeo.models.classical.pixel_matcher import SiftMatcher as SiftMatcher
-from vggtgeo.models.classical.pixel_matcher import match_pixels as match_pixels
 from vggtgeo.models.classical.pixel_matcher import place_vector as place_vector
 from vggtgeo.models.classical.pnp import ConstantVelocity as ConstantVelocity
 from vggtgeo.models.classical.pnp import PnpGeometry as PnpGeometry

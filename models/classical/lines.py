@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.line_geometry import line_coefficients
-from vggtgeo.models.classical.nearest import mutual_nearest
+from vggtgeo.models.classical.nearest import mutual_nearest, unit
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
 
-from vggtgeo.geometry import pinhole
+from vggtgeo.geometry import pinhole, rigid
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,7 @@ def _band_statistics(strips: np.ndarray, bands: int) -> np.ndarray:
     mean = np.stack([piece.mean(axis=(2, 3)) for piece in pieces], axis=1).reshape(len(strips), -1)
     spread = np.stack([piece.mean(axis=3).std(axis=2) for piece in pieces], axis=1).reshape(len(strips), -1)
     # Normalised separately, so that neither mean nor deviation dominates.
-    return np.concatenate([_unit(mean), _unit(spread)], axis=1) / np.sqrt(np.float32(2.0))
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6)
+    return np.concatenate([unit(mean, 1e-6), unit(spread, 1e-6)], axis=1) / np.sqrt(np.float32(2.0))
 
 
 _SCALE = 0.8
@@ -196,9 +192,7 @@ def _on_epipolar_beam(
     if not len(ends_i):
         return np.zeros((0, len(ends_j)), dtype=bool)
     to_rays = np.linalg.inv(pinhole.matrix(relative.intrinsics))
-    x, y, z = relative.pose[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    fundamental = to_rays.T @ cross @ relative.pose[:3, :3] @ to_rays
+    fundamental = to_rays.T @ rigid.skew(relative.pose[:3, 3]) @ relative.pose[:3, :3] @ to_rays
     epipolar = np.concatenate([ends_i, np.ones_like(ends_i[..., :1])], axis=2) @ fundamental.T
     direction, length = _directions(ends_j)
     # Along end 0 + s * direction the epipolar line l is met at s = -l(end 0) / (l . direction).

@@ -15,6 +15,7 @@ from itertools import permutations, product
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_array
+from vggtgeo.models.classical.nearest import unit
 
 from vggtgeo.geometry import pinhole
 
@@ -118,7 +119,8 @@ class _Planes:
     def of(cls, endpoints: np.ndarray, intrinsics: np.ndarray) -> _Planes:
         rays = pinhole.rays(endpoints, intrinsics)
         lengths = np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=1)
-        return cls(_unit(np.cross(rays[:, 0], rays[:, 1])), _unit(rays.mean(axis=1)), lengths, float(intrinsics[0]))
+        normals, middles = unit(np.cross(rays[:, 0], rays[:, 1]), 1e-12), unit(rays.mean(axis=1), 1e-12)
+        return cls(normals, middles, lengths, float(intrinsics[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,20 +139,11 @@ def nearest_frame(rotation: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return max((rotation @ symmetry for symmetry in _SYMMETRIES), key=lambda turned: float(np.sum(turned * reference)))
 
 
-def _symmetries() -> list[np.ndarray]:
-    found = []
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        matrix = np.eye(3)[:, list(order)] * np.array(signs)
-        if np.linalg.det(matrix) > 0:
-            found.append(matrix)
-    return found
-
-
-_SYMMETRIES = _symmetries()
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+_SYMMETRIES = [
+    matrix
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))
+    if np.linalg.det(matrix := np.eye(3)[:, list(order)] * np.array(signs)) > 0
+]
 
 
 def _search(planes: _Planes, near: float, longest: int = 24, kept: int = 12) -> np.ndarray:

@@ -1,8 +1,13 @@
-"""Mutual nearest neighbours of unit descriptors, by one matrix product."""
+"""Unit descriptors and their mutual nearest neighbours, by one matrix product."""
 
 from __future__ import annotations
 
 import numpy as np
+
+
+def unit(vectors: np.ndarray, least: float = 1e-9) -> np.ndarray:
+    """Return `vectors` [..., C] normalised to length 1; those shorter than `least` stay shorter."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), least)
 
 
 def mutual_nearest(

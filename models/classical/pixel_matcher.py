@@ -45,34 +45,28 @@ class PixelMatcher:
         check_fields(self, count="[1, inf)", ratio="(0, 1]")
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """Return verified matches from view i to view j; see `PointMatcher.match`."""
-        return match_pixels(features_i, features_j, self.ratio, self.verifier, self.refinement, predicted, self.radius)
+        """Return refined mutual nearest neighbours that pass ratio test and verifier; see `PointMatcher.match`."""
+        first: PixelDescriptors = features_i.descriptors
+        second: PixelDescriptors = features_j.descriptors
+        similarity = first.vectors @ second.vectors.T
+        if predicted is not None:
+            check_array("predicted", predicted, (len(features_i), 2), finite=False)
+            exclude_far(similarity, predicted, features_j.pixels, self.radius)
+        index_i, index_j, clarity = mutual_nearest(similarity, self.ratio)
+        pixels_i, pixels_j = features_i.pixels[index_i], features_j.pixels[index_j]
+        keep = self.verifier.inliers(pixels_i, pixels_j)
+        matches = PointMatches(index_i, index_j, pixels_i, pixels_j, confidence_of(clarity)).select(keep)
+        return refined(self.refinement, first.gray, second.gray, matches)
 
 
-def match_pixels(
-    features_i: Features,
-    features_j: Features,
-    ratio: float,
-    verifier: EpipolarVerifier,
-    refinement: PatchAlignment | None = None,
-    predicted: np.ndarray | None = None,
-    radius: float = np.inf,
+def refined(
+    refinement: PatchAlignment | None, gray_i: np.ndarray, gray_j: np.ndarray, found: PointMatches
 ) -> PointMatches:
-    """Return mutual nearest neighbours that pass the ratio test and the verifier, refined if `refinement` is given."""
-    first: PixelDescriptors = features_i.descriptors
-    second: PixelDescriptors = features_j.descriptors
-    similarity = first.vectors @ second.vectors.T
-    if predicted is not None:
-        check_array("predicted", predicted, (len(features_i), 2), finite=False)
-        exclude_far(similarity, predicted, features_j.pixels, radius)
-    index_i, index_j, clarity = mutual_nearest(similarity, ratio)
-    pixels_i, pixels_j = features_i.pixels[index_i], features_j.pixels[index_j]
-    keep = verifier.inliers(pixels_i, pixels_j)
-    matches = PointMatches(index_i, index_j, pixels_i, pixels_j, confidence_of(clarity)).select(keep)
-    if refinement is None or not len(matches):
-        return matches
-    refined, _ = refinement.refine(first.gray, second.gray, matches.pixels_i, matches.pixels_j)
-    return replace(matches, pixels_j=refined)
+    """Return matches with targets refined to sub-pixels in two images, uint8 [H, W], if `refinement` is given."""
+    if refinement is None or not len(found):
+        return found
+    targets, _ = refinement.refine(gray_i, gray_j, found.pixels_i, found.pixels_j)
+    return replace(found, pixels_j=targets)
 
 
 def confidence_of(clarity: np.ndarray) -> np.ndarray:

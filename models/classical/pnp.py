@@ -82,7 +82,8 @@ class PnpGeometry(_TwoViewGeometry):
             if np.count_nonzero(self._inliers(refined, query)) >= max(self.sure * len(query.points), 3 * self.least):
                 return refined
         starts = [pose for pose in (query.predicted, self._sample(query)) if pose is not None]
-        return max(starts, key=lambda start: self._support(start, query)) if starts else None
+        support = lambda start: float(query.confidence[self._inliers(start, query)].sum())
+        return max(starts, key=support) if starts else None
 
     def _sample(self, query: PoseQuery) -> np.ndarray | None:
         order = self.order.of(len(query.points))
@@ -108,9 +109,6 @@ class PnpGeometry(_TwoViewGeometry):
 
     def _inliers(self, pose: np.ndarray, query: PoseQuery) -> np.ndarray:
         return _errors(pose, query) < self.threshold
-
-    def _support(self, pose: np.ndarray, query: PoseQuery) -> float:
-        return float(query.confidence[self._inliers(pose, query)].sum())
 
 
 @dataclass(frozen=True)

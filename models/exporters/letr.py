@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 from vggtgeo.models.exporters.request import Graph, Request, as_module, load, stand_in
 from vggtgeo.models.exporters.weights import fill
@@ -58,16 +59,13 @@ def _stand_ins(backbone: str) -> Iterator[None]:
     """Provide what LETR imports: a torchvision with one backbone, and a class of torch under its old name."""
     linear = load("torch").nn.modules.linear
     make = lambda norm_layer, **_options: residual_network(backbone, norm_layer)
-    linear._LinearWithBias = linear.NonDynamicallyQuantizableLinear
-    try:
-        with stand_in("torchvision.models._utils", IntermediateLayerGetter=layer_getter()):
-            torchvision = load("torchvision")
-            torchvision.__version__ = "0.99"
-            torchvision._is_tracing = lambda: False
-            torchvision.models.resnet50 = torchvision.models.resnet101 = make
-            yield
-    finally:
-        del linear._LinearWithBias
+    old_name = mock.patch.object(linear, "_LinearWithBias", linear.NonDynamicallyQuantizableLinear, create=True)
+    with old_name, stand_in("torchvision.models._utils", IntermediateLayerGetter=layer_getter()):
+        torchvision = load("torchvision")
+        torchvision.__version__ = "0.99"
+        torchvision._is_tracing = lambda: False
+        torchvision.models.resnet50 = torchvision.models.resnet101 = make
+        yield
 
 
 def _replace_attention(network: Any) -> None:

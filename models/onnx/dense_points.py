@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_image
+from vggtgeo.models.classical.nearest import unit
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher, spread
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.session import Session
@@ -88,5 +89,4 @@ def vectors_at(descriptors: np.ndarray, places: np.ndarray, size: tuple[int, int
     above = descriptors[:, y0, x0] * (1 - u) + descriptors[:, y0, x1] * u
     below = descriptors[:, y1, x0] * (1 - u) + descriptors[:, y1, x1] * u
     mixed = (above * (1 - v) + below * v).T.astype(np.float32)
-    unit: np.ndarray = mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-9)
-    return unit
+    return unit(mixed)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.lines import allowed_pairs
-from vggtgeo.models.classical.nearest import mutual_nearest
+from vggtgeo.models.classical.nearest import mutual_nearest, unit
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import DINOV3
 from vggtgeo.models.onnx.fit import Fit
@@ -57,17 +57,15 @@ class DinoFeatures:
     def confidence(self, image: np.ndarray) -> np.ndarray:
         """Return Omega, float32 [H, W] in [0, 1), of `image` (uint8 [H, W, 3])."""
         outputs, fit = self._outputs(image)
-        rows, columns = (side // DINOV3.multiple for side in fit.network_size)
-        omega = saliency(outputs["attention"]).reshape(rows, columns)
+        omega = saliency(outputs["attention"]).reshape(_grid(fit))
         fine = cv2.resize(omega, fit.network_size[::-1], interpolation=cv2.INTER_LINEAR)
         return fit.map_to_image(fine)
 
     def describe(self, image: np.ndarray) -> DescriptorGrid:
         """Return descriptors of the patches of `image`, less their mean, which all patches of an image share."""
         outputs, fit = self._outputs(image)
-        rows, columns = (side // DINOV3.multiple for side in fit.network_size)
         grid = outputs["patch_descriptors"].astype(np.float32)
-        return DescriptorGrid(unit(grid - grid.mean(axis=0)).reshape(rows, columns, -1), fit, DINOV3.multiple)
+        return DescriptorGrid(unit(grid - grid.mean(axis=0)).reshape(*_grid(fit), -1), fit, DINOV3.multiple)
 
     def _outputs(self, image: np.ndarray) -> tuple[Outputs, Fit]:
         check_image("image", image)
@@ -89,16 +87,15 @@ class DinoFeatures:
         }
 
 
+def _grid(fit: Fit) -> tuple[int, int]:
+    return fit.network_size[0] // DINOV3.multiple, fit.network_size[1] // DINOV3.multiple
+
+
 def saliency(attention: np.ndarray) -> np.ndarray:
     """Return omega of each patch, float32 [P], of the class token's attention float [heads, 5 + P]."""
     patches = attention[:, PREFIX:].astype(np.float32).mean(axis=0)
     relative = patches / np.maximum(patches.mean(), np.float32(1e-12))
     return relative / (1.0 + relative)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Return `vectors` [..., C] normalised to length 1; zero vectors stay zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.float32(1e-9))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_image
-from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
+from vggtgeo.models.onnx.cache import MemoryCache, OutputCache
 from vggtgeo.models.onnx.contracts import MLSD
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Segments
@@ -135,15 +135,12 @@ class MlsdDetector:
     def detect(self, image: np.ndarray) -> Segments:
         """Return segments of `image` (uint8 [H, W, 3]), best first."""
         check_image("image", image)
-        outputs = self.cache.get((self.session,), ("lines",), (image,), lambda: self._run(image))
+        run = lambda: {"maps": self.session.run({"image": prepare(image)[None]})["maps"][0, :5]}
+        outputs = self.cache.get((self.session,), ("lines",), (image,), run)
         ends, scores = decode_maps(outputs["maps"], self.score, self.least_length, self.count)
         # A pixel k of the map is the pixel 2 k of the input; the input is stretched by its edges, not its centres.
         stretch = np.array(image.shape[1::-1], np.float64) / _SIDE
         return tidy(image, (2.0 * ends + 0.5) * stretch - 0.5, scores, self.shortest, self.count)
-
-    def _run(self, image: np.ndarray) -> Outputs:
-        maps = self.session.run({"image": prepare(image)[None]})["maps"]
-        return {"maps": maps[0, :5]}
 
 
 def prepare(image: np.ndarray) -> np.ndarray:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields, check_image
+from vggtgeo.models.classical.pixel_matcher import refined
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
@@ -92,7 +93,8 @@ class Mast3rMatcher:
             confidence_of(found["certainty"][index]),
         )
         matches = matches.select(self.verifier.inliers(matches.pixels_i, matches.pixels_j))
-        return self._refined(first, second, matches)
+        gray_i, gray_j = (cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY) for view in (first, second))
+        return refined(self.refinement, gray_i, gray_j, matches)
 
     def _run(self, first: Mast3rView, second: Mast3rView) -> Outputs:
         if not len(first.starts):
@@ -109,25 +111,13 @@ class Mast3rMatcher:
         run = lambda: self.encoder.run_on_device({"image": self.encoder.prepare(view.image, view.fit)})
         return self._encoded.get((), (), (view.image,), run)["features"]
 
-    def _refined(self, first: Mast3rView, second: Mast3rView, matches: PointMatches) -> PointMatches:
-        if self.refinement is None or not len(matches):
-            return matches
-        grays = [cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY) for view in (first, second)]
-        refined, _ = self.refinement.refine(grays[0], grays[1], matches.pixels_i, matches.pixels_j)
-        return replace(matches, pixels_j=refined)
-
     def _check_pair(self) -> None:
-        given = self.encoder.inputs["image"].shape[2:]
-        if any(have is not None and have != want for have, want in zip(given, self.size, strict=True)):
+        given = (*self.encoder.inputs["image"].shape[2:], self.encoder.outputs["features"].shape[2])
+        taken = (*self.size, self.decoder.inputs["features_1"].shape[2])
+        if any(None not in sizes and sizes[0] != sizes[1] for sizes in zip(given, taken, strict=True)):
             raise NetworkFileError(
-                f"`{self.encoder.path}` takes images of {list(given)} (height, width) and `{self.decoder.path}` gives "
-                f"{list(self.size)}, expected one size; export both with the same height and width"
-            )
-        widths = self.encoder.outputs["features"].shape[2], self.decoder.inputs["features_1"].shape[2]
-        if None not in widths and widths[0] != widths[1]:
-            raise NetworkFileError(
-                f"`{self.encoder.path}` gives {widths[0]} channels and `{self.decoder.path}` takes {widths[1]}, "
-                "expected one number; export both from one checkpoint"
+                f"`{self.encoder.path}` has height, width and channels {list(given)} and `{self.decoder.path}` "
+                f"{list(taken)}, expected the same; export both from one checkpoint with one height and width"
             )
 
 

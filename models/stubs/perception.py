@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from vggtgeo.models.roles import DepthEstimate, Features, PointMatches, Segments
 
+from vggtgeo.geometry import pinhole
+
 
 @dataclass(frozen=True)
 class SimulatedMoge:
@@ -136,14 +138,6 @@ def weakness(oracle: Oracle, index: int) -> np.ndarray:
     return np.clip(1.0 - around / _FULL_TEXTURE, 0.0, 1.0)
 
 
-def at_pixels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return values of `image` [H, W] at the pixels nearest to `pixels` [n, 2] (x, y), clipped to the picture."""
-    height, width = image.shape
-    columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
-    rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
-    return image[rows, columns]
-
-
 @dataclass(frozen=True)
 class SimulatedMast3r:
     """Error model, with w in [0, 1] the lack of texture at the key point and g = 1 behind glass, else 0.
@@ -187,8 +181,8 @@ class SimulatedMast3r:
         rng = stream(self.seed, "mast3r", index_i, index_j)
         pixels = features_i.pixels
         target, seen = self.oracle.correspond(index_i, index_j, pixels)
-        weak = at_pixels(weakness(self.oracle, index_i), pixels)
-        glass = at_pixels(self.oracle.glass(index_i), pixels)
+        weak = pinhole.at_pixels(weakness(self.oracle, index_i), pixels)
+        glass = pinhole.at_pixels(self.oracle.glass(index_i), pixels)
         draw = rng.uniform(size=(3, len(pixels)))
         made = np.where(seen, draw[0] >= self.missed * (1 + 3 * weak), draw[0] < self.imagined)
         wrong = ~seen | (draw[1] < self.outliers * (1 + 9 * weak) + self.behind_glass * glass)

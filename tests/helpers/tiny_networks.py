@@ -18,12 +18,13 @@ def save(
     inputs: Mapping[str, Shape],
     outputs: Mapping[str, Shape],
     constants: Mapping[str, np.ndarray],
-    metadata: Mapping[str, str] | None = None,
+    network: str = "",
+    weights: str = "random",
     *,
     dtype: int = TensorProto.FLOAT,
     external: bool = False,
 ) -> Path:
-    """Writes a checked graph; `num_tokens` is an int64 input, all others have `dtype`."""
+    """Writes a checked graph that names its network; `num_tokens` is an int64 input, all others have `dtype`."""
 
     def info(name: str, shape: Shape) -> onnx.ValueInfoProto:
         kind = TensorProto.INT64 if name == "num_tokens" else dtype
@@ -37,7 +38,7 @@ def save(
         [numpy_helper.from_array(np.asarray(value, order="C"), name) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=9)
-    helper.set_model_props(model, dict(metadata or {}))
+    helper.set_model_props(model, {METADATA_NETWORK: network, METADATA_WEIGHTS: weights} if network else {})
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, path, save_as_external_data=external, location=f"{path.name}.data", size_threshold=0)
     return path
@@ -54,12 +55,11 @@ def constant(
     external: bool = False,
 ) -> Path:
     """A network that answers `outputs` whatever it is shown."""
-    metadata = {METADATA_NETWORK: network, METADATA_WEIGHTS: weights}
     nodes = [helper.make_node("Identity", [f"value of {name}"], [name]) for name in outputs]
     values = {f"value of {name}": np.asarray(value, dtype) for name, value in outputs.items()}
     shapes = {name: np.shape(value) for name, value in outputs.items()}
     element = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
-    return save(path, nodes, inputs, shapes, values, metadata, dtype=element, external=external)
+    return save(path, nodes, inputs, shapes, values, network, weights, dtype=element, external=external)
 
 
 def vggt(path: Path, views: int = 2, size: tuple[int, int] = (28, 42), **options: object) -> Path:
@@ -122,12 +122,9 @@ def dinov3(path: Path, size: tuple[int, int] = (48, 64), channels: int = 8, head
         "prefix": np.zeros((1, 1, 5), np.float32),
         "rows": np.array([1, heads, 5, 5 + rows * columns]),
     }
-    outputs = {
-        "patch_descriptors": (1, rows * columns, channels),
-        "attention": (1, heads, 5, 5 + rows * columns),
-    }
-    metadata = {METADATA_NETWORK: "dinov3", METADATA_WEIGHTS: "random"}
-    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, metadata)
+    count = rows * columns
+    outputs = {"patch_descriptors": (1, count, channels), "attention": (1, heads, 5, 5 + count)}
+    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, "dinov3")
 
 
 def mast3r_encoder(path: Path, size: tuple[int, int] = (48, 64)) -> Path:
@@ -138,18 +135,17 @@ def mast3r_encoder(path: Path, size: tuple[int, int] = (48, 64)) -> Path:
         helper.make_node("Reshape", ["grid", "flat"], ["channels first"]),
         helper.make_node("Transpose", ["channels first"], ["features"], perm=[0, 2, 1]),
     ]
-    metadata = {METADATA_NETWORK: "mast3r_encoder", METADATA_WEIGHTS: "random"}
     constants = {"flat": np.array([1, 768, rows * columns])}
-    return save(path, nodes, {"image": (1, 3, *size)}, {"features": (1, rows * columns, 768)}, constants, metadata)
+    return save(
+        path, nodes, {"image": (1, 3, *size)}, {"features": (1, rows * columns, 768)}, constants, "mast3r_encoder"
+    )
 
 
 def mast3r_decoder(path: Path, size: tuple[int, int] = (48, 64), reach: int = 7) -> Path:
     """Descriptors: 24 fixed random filters of the image around each pixel, of unit length: they match by appearance."""
     rows, columns = size[0] // 16, size[1] // 16
-    filters = np.random.default_rng(1).normal(0, 1, (24, 3, 2 * reach + 1, 2 * reach + 1))
-    filters -= filters.mean(axis=(2, 3), keepdims=True)
     constants = {
-        "filters": filters.astype(np.float32),
+        "filters": _filters(24, reach),
         "grid shape": np.array([1, 768, rows, columns]),
         "axis": np.array([1]),
         "points": np.ones((1, *size, 3), np.float32),
@@ -161,8 +157,7 @@ def mast3r_decoder(path: Path, size: tuple[int, int] = (48, 64), reach: int = 7)
         outputs |= {f"points_{view}": (1, *size, 3), f"confidence_{view}": (1, *size)}
         outputs |= {f"descriptors_{view}": (1, *size, 24), f"descriptor_confidence_{view}": (1, *size)}
     inputs = {f"features_{view}": (1, rows * columns, 768) for view in (1, 2)}
-    metadata = {METADATA_NETWORK: "mast3r_decoder", METADATA_WEIGHTS: "random"}
-    return save(path, nodes, inputs, outputs, constants, metadata)
+    return save(path, nodes, inputs, outputs, constants, "mast3r_decoder")
 
 
 def alike(path: Path, size: Sequence[int | str] = (96, 128), channels: int = 24) -> Path:
@@ -170,8 +165,7 @@ def alike(path: Path, size: Sequence[int | str] = (96, 128), channels: int = 24)
     constants = {**_spot(), "filters": _filters(channels)}
     nodes = [*_scores(), *_vectors("image", "descriptors")]
     outputs = {"scores": (1, 1, *size), "descriptors": (1, channels, *size)}
-    metadata = {METADATA_NETWORK: "alike", METADATA_WEIGHTS: "random"}
-    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, metadata)
+    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, "alike")
 
 
 def xfeat(path: Path, size: tuple[int, int] = (96, 128)) -> Path:
@@ -180,9 +174,8 @@ def xfeat(path: Path, size: tuple[int, int] = (96, 128)) -> Path:
     pool = helper.make_node("AveragePool", ["every pixel"], ["block_descriptors"], kernel_shape=[8, 8], strides=[8, 8])
     nodes = [*_scores(), *_vectors("image", "every pixel"), pool]
     outputs = {"scores": (1, 1, *size), "block_descriptors": blocks}
-    metadata = {METADATA_NETWORK: "xfeat", METADATA_WEIGHTS: "random"}
     constants = {**_spot(), "filters": _filters(64)}
-    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, metadata)
+    return save(path, nodes, {"image": (1, 3, *size)}, outputs, constants, "xfeat")
 
 
 def _spot() -> dict[str, np.ndarray]:
@@ -214,9 +207,7 @@ def _vectors(image: str, name: str) -> list[onnx.NodeProto]:
 
 
 def _decoded(view: int, reach: int) -> list[onnx.NodeProto]:
-    def name(what: str) -> str:
-        return f"{what} {view}"
-
+    name = lambda what: f"{what} {view}"
     return [
         helper.make_node("Transpose", [f"features_{view}"], [name("tokens")], perm=[0, 2, 1]),
         helper.make_node("Reshape", [name("tokens"), "grid shape"], [name("grid")]),

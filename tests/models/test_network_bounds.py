@@ -19,10 +19,8 @@ from vggtgeo.models.onnx.bounds import (
     Refusals,
 )
 from vggtgeo.models.onnx.contracts import MOGE2
-from vggtgeo.models.onnx.line_detectors import LetrDetector
 from vggtgeo.models.onnx.moge2 import MogeDepth
 from vggtgeo.models.onnx.session import NetworkValueError, open_session
-from vggtgeo.models.onnx.vggt import decode_cameras
 from vggtgeo.models.roles import DepthEstimate, Features, Segments
 
 from vggtgeo.slam.verdict.judge import check_refusals
@@ -84,6 +82,7 @@ def test_values_that_are_not_finite_cost_the_answer_only() -> None:
     assert (confidence.confidence(IMAGE) == AVERAGE).all()
     some = Features(np.ones((3, 2)), np.ones(3))
     assert len(points.match(some, some)) == 0
+    assert len(BoundedPoints(Broken()).describe(IMAGE)) == 0
     guess = window.window([IMAGE, IMAGE])
     assert not guess.found.any()
     assert not np.isfinite(guess.depth).any()
@@ -122,15 +121,3 @@ def test_what_is_in_bounds_passes_untouched_and_the_rest_is_counted() -> None:
         assert role.refusals.share == 0.5
         assert role.refusals.without == 0
     assert check_refusals({"depth": Refusals(asked=100, without=9, values=100, refused=9)}) == ()
-
-
-def test_cameras_and_segments_that_are_nowhere(tmp_path: Path) -> None:
-    """A camera 1e9 units away is not found, and a segment many images away is none; oracle: the file's numbers."""
-    encoding = np.zeros((3, 9))
-    encoding[:, 6:] = 1.0, 0.8, 1.1
-    encoding[1, 0], encoding[2, 1] = 1e9, np.inf
-    assert decode_cameras(encoding, SIZE)[2].tolist() == [True, False, False]
-    from vggtgeo.models.onnx.contracts import LETR
-
-    far = tiny.letr(tmp_path / "letr.onnx", SIZE, lines=[(0.1, 0.2, 0.8, 0.3), (-1e30, 0.5, 1e30, 0.5)])
-    assert len(LetrDetector(open_session(far, LETR)).detect(IMAGE)) == 1

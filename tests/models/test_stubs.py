@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from vggtgeo.models.roles import DenseConfidence, LineDetector, MetricDepth, PointMatcher, WindowGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
-from vggtgeo.models.stubs.perception import SmoothField, at_pixels, weakness
+from vggtgeo.models.stubs.perception import SmoothField, weakness
 
+from vggtgeo.geometry.pinhole import at_pixels
 from vggtgeo.simulation import IDEAL, SimulatedOracle, simulate
 
 SIZE = (160, 120)

@@ -89,11 +89,11 @@ def test_cameras_come_back_from_their_encoding() -> None:
 
 def test_a_view_without_a_rotation_is_not_found() -> None:
     # Proves that nonsense of one view costs that view only. Oracle: the views that were spoilt.
-    poses, focal = _cameras()
+    poses, focal = _cameras(5)
     encoding = _encode(poses, focal, (392, 518))
-    encoding[1, 3:7], encoding[2, 0], encoding[3, 7:] = 0.0, np.nan, (0.0, 7.0)
+    encoding[1, 3:7], encoding[2, 0], encoding[3, 7:], encoding[4, 1] = 0.0, np.nan, (0.0, 7.0), 1e9
     found, cameras, usable = decode_cameras(encoding, (392, 518))
-    np.testing.assert_array_equal(usable, [True, False, False, True])
+    np.testing.assert_array_equal(usable, [True, False, False, True, False])
     np.testing.assert_array_equal(found[1], found[0])
     assert np.isfinite(cameras).all()
     assert (cameras > 0).all()

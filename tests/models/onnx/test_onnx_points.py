@@ -9,13 +9,12 @@ import pytest
 import tiny_networks as tiny
 from reported import raises
 from vggtgeo.models.onnx import contracts
-from vggtgeo.models.onnx.bounds import BoundedPoints
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
 from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks, vectors_at
 from vggtgeo.models.onnx.dinov3 import DescriptorGrid, DinoFeatures, saliency
 from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.fit import Fit
-from vggtgeo.models.onnx.mast3r import Mast3rMatcher, confidence_of, corners, nearest, reciprocal
+from vggtgeo.models.onnx.mast3r import Mast3rMatcher, corners, nearest, reciprocal
 from vggtgeo.models.onnx.session import Session, open_session
 from vggtgeo.models.roles import DenseConfidence, PointMatcher
 
@@ -79,17 +78,6 @@ def test_key_points_of_maps_follow_the_known_motion(tmp_path: Path, size: tuple)
     blank = matcher.describe(np.full((*SIZE, 3), 90, np.uint8))
     assert len(blank) == 0
     assert len(matcher.match(blank, described[0])) == len(matcher.match(described[0], blank)) == 0
-
-
-def test_answers_that_are_no_maps_give_no_key_point(tmp_path: Path) -> None:
-    # Proves that scores of NaN cost the image, not the run, and are counted. Oracle: the count.
-    maps = {"scores": np.full((1, 1, 64, 64), np.nan), "descriptors": np.ones((1, 8, 64, 64))}
-    file = tiny.constant(tmp_path / "alike.onnx", "alike", {"image": (1, 3, 64, 64)}, maps)
-    matcher = BoundedPoints(DensePointMatcher(session=open_session(file, contracts.ALIKE)))
-    nothing = matcher.describe(np.zeros((64, 64, 3), np.uint8))
-    assert len(nothing) == 0
-    assert len(matcher.match(nothing, nothing)) == 0
-    assert (matcher.refusals.asked, matcher.refusals.without) == (1, 1)
 
 
 def test_peaks_and_vectors_lie_between_pixels() -> None:
@@ -179,11 +167,6 @@ def test_the_way_back_ends_at_its_start_only_for_true_matches() -> None:
     np.testing.assert_array_equal(targets[seen], starts[seen] - [4, 0])
     assert (gap[seen] == 0).all()
     assert (gap[~seen] > 2).all()
-
-
-def test_certainty_becomes_a_confidence() -> None:
-    # Proves the range and the order. Oracle: c / (1 + c).
-    np.testing.assert_allclose(confidence_of(np.array([0.0, 1.0, 3.0, np.inf])[:3]), [0, 0.5, 0.75])
 
 
 # --- DINOv3 ------------------------------------------------------------------------------------------------------
