@@ -1,21 +1,20 @@
 """Classical implementations of the five perception roles: OpenCV and numpy, no weights."""
 
-from vggtgeo.models.classical.flow import PatchFlow as PatchFlow
-from vggtgeo.models.classical.guided_search import can_search as can_search
-from vggtgeo.models.classical.guided_search import search_around as search_around
-from vggtgeo.models.classical.guided_search import search_near as search_near
-from vggtgeo.models.classical.guided_search import search_tree as search_tree
-from vggtgeo.models.classical.line_geometry import line_coefficients as line_coefficients
-from vggtgeo.models.classical.line_geometry import sample_segments as sample_segments
-from vggtgeo.models.classical.line_geometry import segment_depths as segment_depths
 from vggtgeo.models.classical.lines import BandLineMatcher as BandLineMatcher
 from vggtgeo.models.classical.lines import LsdDetector as LsdDetector
+from vggtgeo.models.classical.lines import line_coefficients as line_coefficients
+from vggtgeo.models.classical.lines import sample_segments as sample_segments
+from vggtgeo.models.classical.lines import segment_depths as segment_depths
 from vggtgeo.models.classical.manhattan import ManhattanEstimator as ManhattanEstimator
 from vggtgeo.models.classical.manhattan import ManhattanView as ManhattanView
 from vggtgeo.models.classical.manhattan import nearest_frame as nearest_frame
 from vggtgeo.models.classical.pixel_matcher import OrbMatcher as OrbMatcher
 from vggtgeo.models.classical.pixel_matcher import SiftMatcher as SiftMatcher
+from vggtgeo.models.classical.pixel_matcher import can_search as can_search
 from vggtgeo.models.classical.pixel_matcher import place_vector as place_vector
+from vggtgeo.models.classical.pixel_matcher import search_around as search_around
+from vggtgeo.models.classical.pixel_matcher import search_near as search_near
+from vggtgeo.models.classical.pixel_matcher import search_tree as search_tree
 from vggtgeo.models.classical.pnp import ConstantVelocity as ConstantVelocity
 from vggtgeo.models.classical.pnp import PnpGeometry as PnpGeometry
 from vggtgeo.models.classical.pnp import pose_information as pose_information
@@ -23,6 +22,7 @@ from vggtgeo.models.classical.sensor_depth import NoDepth as NoDepth
 from vggtgeo.models.classical.sensor_depth import SensorDepth as SensorDepth
 from vggtgeo.models.classical.structure_tensor import StructureTensor as StructureTensor
 from vggtgeo.models.classical.sub_pixel import PatchAlignment as PatchAlignment
+from vggtgeo.models.classical.sub_pixel import PatchFlow as PatchFlow
 from vggtgeo.models.classical.two_view import TwoViewStart as TwoViewStart
 from vggtgeo.models.classical.verification import EpipolarVerifier as EpipolarVerifier
 from vggtgeo.models.classical.verification import SampleOrder as SampleOrder

@@ -66,7 +66,7 @@ class Fit:
 
     def inside(self, pixels: np.ndarray) -> np.ndarray:
         """Return which pixels float [n, 2] of the image are between its outermost pixel centres, bool [n]."""
-        return ((pixels >= 0) & (pixels <= np.array(self.image_size[::-1]) - 1)).all(axis=1)
+        return np.asarray(((pixels >= 0) & (pixels <= np.array(self.image_size[::-1]) - 1)).all(axis=1))
 
     def map_to_image(self, values: np.ndarray) -> np.ndarray:
         """Return a map [*network_size, ...] as float32 [*image_size, ...], interpolated, without the border."""

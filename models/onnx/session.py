@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import onnxruntime
@@ -41,7 +41,7 @@ _DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(int
 _LARGE = 2**30
 """Bytes of weights above which they are mapped from the file instead of copied, on the CPU: with the 1.2 GB of DINOv3 L
 0.2 GB of memory stay in use, for 13 % of the time."""
-Input = np.ndarray | onnxruntime.OrtValue
+Input: TypeAlias = np.ndarray | onnxruntime.OrtValue
 
 
 class NetworkRunError(RuntimeError):
@@ -152,8 +152,8 @@ class Session:
 
         Raises `NetworkRunError` as `run` does, so that a network that cannot run is detected early.
         """
-        shapes = {name: signature.shape for name, signature in self.inputs.items()}
-        if all(shape and None not in shape for shape in shapes.values()):
+        shapes = {name: [size or 0 for size in signature.shape] for name, signature in self.inputs.items()}
+        if all(shape and all(shape) for shape in shapes.values()):
             noise = np.random.default_rng(seed)
             self.run({name: noise.uniform(size=shape) for name, shape in shapes.items()})
             self.tally.calls, self.tally.seconds = 0, 0.0
