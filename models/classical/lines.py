@@ -1,4 +1,4 @@
-"""Line segments: detection by LSD (Grompone von Gioi et al. 2010), matching by appearance and epipolar geometry, depth."""
+"""Line segments: detection by LSD (Grompone von Gioi et al. 2010), matching by appearance and geometry, and depth."""
 
 from __future__ import annotations
 
