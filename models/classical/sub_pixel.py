@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_array, check_fields, check_image
+from vggtgeo.models.checks import check_fields
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,6 @@ class PatchFlow:
 
         image_i, image_j: uint8 [H, W, 3] of one size. pixels, expected: float [m, 2], finite.
         """
-        check_image("image_i", image_i)
-        check_image("image_j", image_j)
-        check_array("expected", expected, pixels.shape)
         if not len(pixels):
             return np.zeros((0, 2)), np.zeros(0)
         first, second = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (image_i, image_j))

@@ -14,7 +14,6 @@ from vggtgeo.models.onnx.moge2 import MogeDepth, recover_focal_shift
 from vggtgeo.models.onnx.session import open_session
 from vggtgeo.models.onnx.vggt import VggtWindow, decode_cameras, robust_mean, shared_intrinsics
 from vggtgeo.models.roles import GeometryResult, MetricDepth, WindowGeometry
-from vggtgeo.models.window_locator import align_window
 
 SIZES = [((480, 640), (392, 518)), ((480, 640), (384, 512)), ((48, 96), (64, 64)), ((90, 30), (28, 42))]
 
@@ -145,23 +144,6 @@ def test_given_intrinsics_are_kept_and_too_many_views_refused(tmp_path: Path) ->
     np.testing.assert_array_equal(window.window(images, np.array([1.0, 2, 3, 4])).intrinsics, [1, 2, 3, 4])
     with raises("images", 3, 2, error=ValueError):
         window.window([*images, images[0]])
-
-
-def test_a_window_is_brought_to_metres(tmp_path: Path) -> None:
-    # Proves the scale from metric depth and the alignment with known poses. Oracle: the similarity that was applied.
-    window, poses, _ = _window(tmp_path, 3, (28, 42))
-    guess = window.window([np.zeros((28, 42, 3), np.uint8)] * 3)
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec([0.2, -0.1, 0.4]).as_matrix()
-    turn[:3, 3] = 1.0, 2.0, 3.0
-    world = poses.copy()
-    world[:, :3, 3] *= 2.5
-    world = world @ turn
-    depths = [np.where(np.arange(42) % 5 == 0, np.nan, 2.5 * depth) for depth in guess.depth[:2]]
-    aligned = align_window(guess, world[:2], depths)
-    assert aligned is not None
-    np.testing.assert_allclose(aligned.poses, world, atol=1e-5)
-    np.testing.assert_allclose(aligned.depth, 2.5 * guess.depth, rtol=1e-6)
 
 
 # --- MoGe-2 ------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from vggtgeo.models.onnx.line_detectors import (
     tidy,
 )
 from vggtgeo.models.onnx.session import open_session
-from vggtgeo.models.roles import LineDetector, LineMatcher, RelativeView, Segments
+from vggtgeo.models.roles import LineDetector, LineMatcher, Segments
 
 IMAGE = (240, 320)
 
@@ -128,12 +128,6 @@ def test_a_segment_is_cut_off_along_itself() -> None:
         assert kept == pytest.approx(inside.mean() * np.linalg.norm(segment[1] - segment[0]), abs=0.2)
 
 
-def test_nothing_found_is_an_answer(tmp_path: Path) -> None:
-    # Proves that a network that sees no segment gives none. Oracle: maps without a peak.
-    detector = MlsdDetector(open_session(tiny.mlsd(tmp_path / "mlsd.onnx", ()), contracts.MLSD))
-    assert len(detector.detect(np.zeros((*IMAGE, 3), np.uint8))) == 0
-
-
 # --- matching ----------------------------------------------------------------------------------------------------
 
 
@@ -179,19 +173,6 @@ def test_segments_of_one_image_match_themselves(matcher: DenseLineMatcher) -> No
     matches = matcher.match(first, second)
     assert len(matches) >= 10, f"{len(matches)} of 12"
     np.testing.assert_array_equal(order[matches.index_j], matches.index_i)
-
-
-def test_the_epipolar_gate_excludes(matcher: DenseLineMatcher) -> None:
-    # Proves that the geometry has the last word over appearance. Oracle: a motion under which each segment moves
-    # 250 pixels down, out of the image, so that no segment is where another would be.
-    ends = _fan()
-    features = matcher.describe(_textured(), Segments(ends, np.ones(12)))
-    still, moved = np.eye(4), np.eye(4)
-    moved[1, 3] = 2.5
-    camera = np.array([200.0, 200.0, 159.5, 119.5])
-    depths = np.full((12, 2), 2.0)
-    assert len(matcher.match(features, features, RelativeView(still, camera, depths))) >= 10
-    assert len(matcher.match(features, features, RelativeView(moved, camera, depths))) == 0
 
 
 def test_no_segments_no_matches(matcher: DenseLineMatcher) -> None:
