@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
-from collections.abc import Iterator
 from functools import cache
 from importlib import metadata
 from typing import Literal
@@ -23,7 +22,7 @@ CUDA_OPTIONS = {"arena_extend_strategy": "kSameAsRequested", "use_tf32": "0"}
 """The arena grows as needed, since several networks share one device. Products of float32 use float32, as on the CPU:
 in TF32, the default of onnxruntime, maps of M-LSD differ by 3 % of their range, others by 1e-3.
 """
-_FATAL, _WARNING = 4, 2
+FATAL, WARNING = 4, 2
 """Levels of onnxruntime's log; the second is its default."""
 
 
@@ -66,16 +65,6 @@ def load_cuda_libraries() -> str:
         with contextlib.redirect_stdout(said):
             onnxruntime.preload_dlls()
     return " ".join(said.getvalue().split())
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Suppress messages of onnxruntime for networks that do not start on the GPU."""
-    onnxruntime.set_default_logger_severity(_FATAL)
-    try:
-        yield
-    finally:
-        onnxruntime.set_default_logger_severity(_WARNING)
 
 
 def check_started(provider: Provider, device: str, used: str) -> None:

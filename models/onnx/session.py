@@ -6,7 +6,6 @@ import hashlib
 import logging
 import time
 from collections.abc import Iterable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -27,12 +26,13 @@ from vggtgeo.models.onnx.file_checks import (
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 from vggtgeo.models.onnx.providers import (
     CUDA_OPTIONS,
+    FATAL,
     NAMES,
+    WARNING,
     Provider,
     check_started,
     choose_provider,
     load_cuda_libraries,
-    quiet,
 )
 
 _log = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ class Session:
         for name in names:
             binding.bind_output(name, self.provider, 0)
         options = onnxruntime.RunOptions()
-        options.log_severity_level = 4  # the exception reports what is wrong, once
+        options.log_severity_level = FATAL  # the exception reports what is wrong, once
         try:
             self.session.run_with_iobinding(binding, options)
         except Exception as error:  # onnxruntime's errors have no base class of their own
@@ -208,7 +208,7 @@ def digest_of(path: Path) -> str:
 
 def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int | None) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # The exception reports what is wrong, once.
+    options.log_severity_level = FATAL  # The exception reports what is wrong, once.
     # An arena would keep the working memory of every network: 1.5 times the memory, for 10 % of the time.
     options.enable_cpu_mem_arena = False
     if sum(part.stat().st_size for part in file_parts(path)) > _LARGE:
@@ -220,17 +220,18 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
         load_cuda_libraries()
         limit = {} if memory_limit_gb is None else {"gpu_mem_limit": int(memory_limit_gb * 2**30)}
         providers.insert(0, (NAMES["cuda"], {**CUDA_OPTIONS, **limit}))
+    onnxruntime.set_default_logger_severity(FATAL)  # for networks that do not start on the GPU
     try:
         # Without CUDA there is no fallback, and onnxruntime would print that it tries.
-        again = int(device == "cuda")
-        with quiet() if device == "cuda" else nullcontext():
-            return onnxruntime.InferenceSession(str(path), options, providers, enable_fallback=again)
+        return onnxruntime.InferenceSession(str(path), options, providers, enable_fallback=int(device == "cuda"))
     except Exception as error:  # onnxruntime's errors have no base class of their own
         reason = " ".join(str(error).split())
         raise NetworkFileError(
             f"`{path}` cannot be opened by onnxruntime {onnxruntime.__version__}: {reason}; fetch it again with all "
             "its files, or export it for this version"
         ) from error
+    finally:
+        onnxruntime.set_default_logger_severity(WARNING)
 
 
 def _described(opened: onnxruntime.InferenceSession) -> tuple[Signatures, Signatures, Mapping[str, str]]:
