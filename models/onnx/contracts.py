@@ -228,4 +228,4 @@ def relative_difference(found: np.ndarray, reference: np.ndarray) -> float:
     """Return max |found - reference| / max |reference|; NaN if any value is, infinity for other shapes."""
     if found.shape != reference.shape:
         return float("inf")
-    return float(np.abs(found - reference).max()) / max(float(np.abs(reference).max()), 1e-30)
+    return float(np.abs(found - reference).max() / max(float(np.abs(reference).max()), 1e-30))
