@@ -71,8 +71,12 @@ def vggt(path: Path, views: int = 2, size: tuple[int, int] = (28, 42), **options
     return constant(path, "vggt", {"images": (views, 3, *size)}, outputs, **options)
 
 
-def moge2(path: Path, size: tuple[int, int] = (48, 64), tokens: bool = False, mask: float = 1.0) -> Path:
-    """A wall at z = 2 with a wrong shift, seen by a camera 60 degrees wide; depth is valid with probability `mask`."""
+def moge2(
+    path: Path, size: tuple[int, int] = (48, 64), tokens: bool = False, mask: float = 1.0, scale: float = 1.0
+) -> Path:
+    """A wall at z = 2 times `scale` with a wrong shift, seen by a camera 60 degrees wide; depth is valid with
+    probability `mask`.
+    """
     height, width = size
     focal = 0.866 * width
     x, y = np.meshgrid(np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1))
@@ -80,7 +84,7 @@ def moge2(path: Path, size: tuple[int, int] = (48, 64), tokens: bool = False, ma
     inputs: dict[str, Shape] = {"image": (1, 3, *size)}
     if tokens:
         inputs["num_tokens"] = ()
-    outputs = {"points": points[None], "mask": np.full((1, *size), mask), "metric_scale": np.ones(1)}
+    outputs = {"points": points[None], "mask": np.full((1, *size), mask), "metric_scale": np.full(1, scale)}
     return constant(path, "moge2", inputs, outputs)
 
 

@@ -29,32 +29,17 @@ SIZE = (48, 64)
 IMAGE = np.random.default_rng(0).integers(0, 255, (*SIZE, 3)).astype(np.uint8)
 
 
-def moge(path: Path, scale: float, mask: float = 1.0, size: tuple[int, int] = SIZE) -> Path:
-    """A file of MoGe-2 that answers a wall at 2 m times `scale`, valid with probability `mask`."""
-    y, x = np.mgrid[: size[0], : size[1]] - np.array(size)[:, None, None] / 2
-    points = np.stack([x / 15, y / 15, np.full(size, 2.0)], axis=-1)[None]
-    outputs = {"points": points, "mask": np.full((1, *size), mask), "metric_scale": np.full(1, scale)}
-    return tiny.constant(path, "moge2", {"image": (1, 3, *size)}, outputs, "test")
-
-
 @pytest.mark.parametrize(
     ("scale", "mask", "left"),
-    [
-        (1.0, 1.0, True),
-        (1e30, 1.0, False),
-        (-1.0, 1.0, False),
-        (0.0, 1.0, False),
-        (1.0, 0.0, False),
-        (1e-4, 1.0, False),
-    ],
-    ids=["right", "1e30", "negative", "zero", "masked", "of a doll's house"],
+    [(1.0, 1.0, True), (1e30, 1.0, False), (-1.0, 1.0, False), (1.0, 0.0, False), (1e-4, 1.0, False)],
+    ids=["right", "1e30", "negative", "masked", "of a doll's house"],
 )
 def test_depth_that_cannot_be_is_left_out_and_counted(tmp_path: Path, scale: float, mask: float, left: bool) -> None:
-    """A real ONNX file whose depth is right, or 1e30, negative, zero, masked or a tenth of a millimetre: only the right
-    one gives depth, and the others make the verdict worse. Oracle: the values in the file.
+    """A real ONNX file whose depth is right, or 1e30, negative, masked or a fifth of a millimetre: only the right one
+    gives depth, and the others make the verdict worse. Oracle: the values in the file.
     """
-    role = BoundedDepth(MogeDepth(open_session(moge(tmp_path / "m.onnx", scale, mask), MOGE2)))
-    found = role.estimate(IMAGE, None, (30.0, 30.0, 31.5, 23.5))
+    role = BoundedDepth(MogeDepth(open_session(tiny.moge2(tmp_path / "m.onnx", SIZE, mask=mask, scale=scale), MOGE2)))
+    found = role.estimate(IMAGE, None, (55.4, 55.4, 31.5, 23.5))
     assert np.isfinite(found.depth).any() == left
     assert (found.confidence[~np.isfinite(found.depth)] == 0).all()
     findings = check_refusals({"depth": role.refusals})
