@@ -85,8 +85,8 @@ class Contract:
     """Inputs and outputs of a network's file, and preparation of an image.
 
     role: as text. plays: the fields of `vggtgeo.Roles` that it can fill, alone or with another file. multiple: H and W
-    are multiples of this. optional tensors may be missing; other tensors beside those named may be outputs (they are
-    not read) but not inputs.
+    are multiples of this. width: of the input where the file leaves it open, None for that of the image. optional
+    tensors may be missing; other tensors beside those named may be outputs (they are not read) but not inputs.
     """
 
     network: str
@@ -95,6 +95,7 @@ class Contract:
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
     multiple: int = 1
+    width: int | None = None
     normalisation: Normalisation = field(default_factory=Normalisation)
 
 
@@ -109,9 +110,10 @@ VGGT = Contract(
         Tensor("depth_conf", ("views", "H", "W")),
     ),
     multiple=14,
+    width=518,
 )
-"""RGB in [0, 1], normalised inside; W = 518. `pose_enc` is translation, quaternion x y z w, vertical and horizontal
-field of view (radians), world -> camera, of views in the frame of the first. `depth_conf` is at least 1."""
+"""RGB in [0, 1], normalised inside; trained with W = 518. `pose_enc` is translation, quaternion x y z w, vertical and
+horizontal field of view (radians), world -> camera, of views in the frame of the first. `depth_conf` is at least 1."""
 
 DINOV3 = Contract(
     network="dinov3",

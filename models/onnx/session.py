@@ -85,10 +85,10 @@ class Session:
 
     def fit(self, image: np.ndarray, wanted: tuple[int, int] | None = None) -> Fit:
         """Return the fit of `image` (uint8 [H, W, 3]) to the input; `wanted`: (height, width) where the file leaves it
-        open, by default that of the image in multiples of the contract's.
+        open, by default that of the image, with multiples and width of the contract.
         """
         rows, columns = self.inputs[self.contract.inputs[0].name].shape[2:]
-        height, width = wanted or at_multiples(image.shape[:2], self.contract.multiple)
+        height, width = wanted or at_multiples(image.shape[:2], self.contract.multiple, self.contract.width)
         return Fit.of(image.shape[:2], (rows or height, columns or width))
 
     def prepare(self, image: np.ndarray, fit: Fit) -> np.ndarray:

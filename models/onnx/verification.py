@@ -11,10 +11,8 @@ from pathlib import Path
 import numpy as np
 from vggtgeo.models.onnx.contracts import HALF_TOLERANCE, TOLERANCE, Patches, Tensor, relative_difference
 from vggtgeo.models.onnx.file_checks import NetworkFileError
-from vggtgeo.models.onnx.fit import at_multiples
 from vggtgeo.models.onnx.line_detectors import prepare
 from vggtgeo.models.onnx.session import Session
-from vggtgeo.models.onnx.vggt import WIDTH
 
 
 @dataclass(frozen=True)
@@ -81,9 +79,7 @@ def _example(session: Session, tensor: Tensor, image: np.ndarray, rng: np.random
         return rng.standard_normal([size or 1 for size in signature.shape], np.float32)
     if session.contract.network == "mlsd":
         return prepare(image)[None]
-    width = WIDTH if session.contract.network == "vggt" else None
-    fit = session.fit(image, at_multiples(image.shape[:2], session.contract.multiple, width))
-    return np.repeat(session.prepare(image, fit), signature.shape[0] or 1, axis=0)
+    return np.repeat(session.prepare(image, session.fit(image)), signature.shape[0] or 1, axis=0)
 
 
 def _summary(array: np.ndarray) -> Output:

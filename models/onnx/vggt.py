@@ -9,15 +9,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.checks import check_image
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
-from vggtgeo.models.onnx.contracts import VGGT
-from vggtgeo.models.onnx.fit import Fit, at_multiples
+from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import GeometryResult, WindowGuess
 
 FARTHEST = 1e6
 """Scenes are of about unit size in the network's own scale; a camera beyond this is nowhere."""
-WIDTH = 518
-"""The width at which the network was trained, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +36,7 @@ class VggtWindow:
         beyond all scenes, is not found.
         """
         self._check(images)
-        fit = self.session.fit(images[0], at_multiples(images[0].shape[:2], VGGT.multiple, WIDTH))
+        fit = self.session.fit(images[0])
         outputs = self.cache.get((self.session,), ("window",), images, lambda: self._run(images, fit))
         count = len(images)
         poses, cameras, found = decode_cameras(outputs["pose_enc"][:count], fit.network_size)
@@ -58,8 +55,6 @@ class VggtWindow:
         )
 
     def _check(self, images: Sequence[np.ndarray]) -> None:
-        if not images:
-            raise ValueError("`images` is empty; give at least one image")
         for image in images:
             check_image("images", image)
         if self.views is not None and len(images) > self.views:
