@@ -96,7 +96,7 @@ def test_the_recording_holds_every_entity(recording: Path) -> None:
 def logged(states: Sequence[Slam], path: Path, cloud: PointCloud | None = None) -> Path:
     """A recording of what `RerunCallback` shows of the map in these states, state n at frame n."""
     from vggtgeo.viewing import entities
-    from vggtgeo.viewing.live_map import LiveMap
+    from vggtgeo.viewing.callback import LiveMap
     from vggtgeo.viewing.target import open_target
 
     stream = open_target(str(path), "test", path).stream
@@ -128,7 +128,7 @@ def test_a_keyframe_that_moves_takes_its_cloud_along(run: RecordedRun, tmp_path:
     """Points are logged once, as the final map has them; a keyframe that is half a metre wrong and then put right has
     its transform logged again, and no other keyframe has. Oracle: the poses, and the true depth's bounds.
     """
-    from vggtgeo.viewing.live_map import MAX_CLOUDS, MAX_POINTS
+    from vggtgeo.viewing.callback import MAX_CLOUDS, MAX_POINTS
 
     slam = run.slam
     assert 3 <= len(slam.keyframes) <= MAX_CLOUDS

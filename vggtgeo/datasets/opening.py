@@ -15,8 +15,7 @@ from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
-from vggtgeo.datasets.phone_exports import Polycam, Scanner3d
-from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
+from vggtgeo.datasets.phones import ArkitScenes, Polycam, Scanner3d, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
 from vggtgeo.datasets.replica import Replica
 from vggtgeo.datasets.rgbd_folders import RgbdFolders
