@@ -11,7 +11,6 @@ the images (topics `aligned_depth_to_color`, `depth_registered`), or leave it as
 """
 
 import re
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from vggtgeo.datasets.bag_images import Chosen, is_registered
 from vggtgeo.datasets.intrinsics import is_fisheye, pinhole_of, warn_of_other_size
 from vggtgeo.datasets.pose_files import poses_of
 from vggtgeo.geometry.camera import Camera, check_distortion
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _LENSES, _FISHEYE = (0, 4, 5, 8), 4
@@ -63,17 +62,17 @@ def camera_of(
         if size not in sizes:
             if beside:
                 found = " or ".join(f"{width} x {height}" for width, height in sorted(sizes))
-                _warn(f"{where} has a camera for {found} pixels; the images are {size[0]} x {size[1]}: not used")
+                warn(f"{where} has a camera for {found} pixels; the images are {size[0]} x {size[1]}: not used")
             continue
         if not _matrix(first)[0, 0]:  # as the message's definition has it
             if beside:
-                _warn(f"{where} is not calibrated (its focal length is 0): not used")
+                warn(f"{where} is not calibrated (its focal length is 0): not used")
             continue
         if not beside:
-            _warn(f"{where} is taken for the camera of `{colour}`; give --intrinsics fx,fy,cx,cy if it is another's")
+            warn(f"{where} is taken for the camera of `{colour}`; give --intrinsics fx,fy,cx,cy if it is another's")
         whole = (first.width, first.height) == size
         if whole and (_size(first) != size or _shift(first).any()):
-            _warn(
+            warn(
                 f"{where} has a region of interest or binning, but the images have the full size: used for the full "
                 "size"
             )
@@ -81,7 +80,7 @@ def camera_of(
         warn_of_other_size(where, camera)
         focal = np.array([_matrix(message)[0, 0] for message in messages])
         if np.abs(focal - focal[0]).max() > _STEADY * abs(focal[0]):
-            _warn(
+            warn(
                 f"{where}: the focal length goes from {focal.min():g} to {focal.max():g} pixels; the first, "
                 f"{focal[0]:g}, is taken for all images"
             )
@@ -140,10 +139,6 @@ def _without_zeros(lens: list[float], counts: Sequence[int]) -> list[float]:
     if len(lens) in counts and any(lens):
         return lens
     return next((lens[:count] for count in counts if count <= len(lens) and not any(lens[count:])), lens)
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, InputWarning, stacklevel=5)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from vggtgeo.datasets.depth_files import metres_of_floats
-from vggtgeo.datasets.image_files import ImageFile, decoded, eight_bits, image_in
+from vggtgeo.datasets.image_files import ImageFile, decoded, eight_bits, image_in, metres_of_floats
 from vggtgeo.io.errors import InputError
 
 

@@ -3,7 +3,6 @@
 import math
 import re
 import time
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Self
@@ -14,7 +13,7 @@ from vggtgeo.datasets.frame import Frame, check_range
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 
 _WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
 """Digits of a webcam's number."""
@@ -50,11 +49,9 @@ class LiveCamera:
             raise InputError(f"`{_public(source)}` gives no frame: is the camera connected, and not in use?")
         height, width = image.shape[:2]
         if _ADDRESS.fullmatch(source) and math.isfinite(count) and count > 0:  # a live camera has no length
-            warnings.warn(
+            warn(
                 f"`{_public(source)}` is a recording of {count:.0f} frames, whose times would be those of arrival: "
-                "download it first (`curl -O ADDRESS`), and give the file",
-                InputWarning,
-                stacklevel=3,
+                "download it first (`curl -O ADDRESS`), and give the file"
             )
         return cls(source, guess_with_warning(_public(source), width, height))
 

@@ -1,7 +1,6 @@
 """Choice of the reader of a path."""
 
 import os
-import warnings
 from pathlib import Path
 from typing import Protocol
 
@@ -10,7 +9,7 @@ from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim, IclNuimRaw
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES, is_there
-from vggtgeo.datasets.images import ImageFolder
+from vggtgeo.datasets.images import ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.live import LiveCamera, is_live
@@ -18,14 +17,13 @@ from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.phones import ArkitScenes, Polycam, Scanner3d, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
 from vggtgeo.datasets.replica import Replica
-from vggtgeo.datasets.rgbd_folders import RgbdFolders
 from vggtgeo.datasets.scannet import ScanNet
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.views import with_rate
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.given import path_of
 
 
@@ -150,7 +148,7 @@ def _open_folder(place: Path, kind: str | None) -> Sequence:
     for reader in FOLDER_KINDS.values():
         if reader.matches(place):
             if dead:
-                warnings.warn(f"`{place}`: {dead}", InputWarning, stacklevel=4)
+                warn(f"`{place}`: {dead}")
             return reader.open(place)
     names = sorted(path.name for path in place.iterdir())
     other = next((name for name in names if Path(name).suffix.lower() in OTHER_PICTURES | ARCHIVES), None)

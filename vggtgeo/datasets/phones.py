@@ -26,9 +26,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.depth_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.folder import FolderSequence, existing
-from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.frame import MAX_DELAY, Frame, check_selection
+from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
@@ -36,7 +36,7 @@ from vggtgeo.datasets.pose_files import parsing, poses_of, read_json, read_matri
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, warn
 from vggtgeo.io.text_files import whole_text
 
 LARGEST = 960
@@ -46,7 +46,6 @@ _MIN_CONFIDENCE = 1
 _CONFIDENCE = "confidence"
 _LISTS = "odometry.csv", "camera_matrix.csv"
 """Files of Stray Scanner beside the video."""
-_MAX_DELAY = 0.02
 _FRAME = re.compile(r"frame_(\d{1,9})\.(jpe?g|png)", re.IGNORECASE)
 _MICROSECOND = 1e-6
 
@@ -86,11 +85,9 @@ class StrayScanner:
         camera = Camera(intrinsics, width // reduction, height // reduction)
         times = tuple(_odometry(folder)[:, 0].tolist())
         if len(video) and len(times) != len(video):
-            warnings.warn(
+            warn(
                 f"`{folder}`: `rgb.mp4` has {len(video)} frames, `odometry.csv` {len(times)} times; frames behind "
-                f"{min(len(video), len(times))} are left out",
-                InputWarning,
-                stacklevel=3,
+                f"{min(len(video), len(times))} are left out"
             )
         has_depth = bool(files_like(folder / "depth", "*.png"))
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
@@ -123,7 +120,7 @@ class StrayScanner:
             depth = cv2.resize(depth, (self.camera.width, self.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
             return np.asarray(depth, np.float32)
         except InputError as error:
-            warnings.warn(f"{error}; the frame is used without depth", InputWarning, stacklevel=3)
+            warn(f"{error}; the frame is used without depth")
             return np.full((self.camera.height, self.camera.width), np.nan, np.float32)
 
 
@@ -134,7 +131,7 @@ def remove_doubtful(depth: np.ndarray, file: Path) -> None:
         if trust.shape != depth.shape:
             raise InputError(f"`{file}` has shape {trust.shape}, its depth {depth.shape}")
     except InputError as error:
-        warnings.warn(f"{error}; all depth of the frame is used", InputWarning, stacklevel=4)
+        warn(f"{error}; all depth of the frame is used")
     else:
         depth[trust < _MIN_CONFIDENCE] = np.nan
 
@@ -195,7 +192,7 @@ def _timed(folder: Path) -> list[tuple[float, Path]]:
 
 def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
     other, path = min(depths, key=lambda entry: abs(entry[0] - time), default=(np.inf, None))
-    return path if abs(other - time) <= _MAX_DELAY else None
+    return path if abs(other - time) <= MAX_DELAY else None
 
 
 def _pincam(folder: Path, width: int, height: int) -> Camera:
@@ -272,7 +269,7 @@ class PhoneExport(FolderSequence):
             try:
                 views.append(_View(image, depth, confidence, *cls.stated(file)))
             except InputError as error:
-                warnings.warn(LeftOutWarning(f"{error}; `{image.name}` is left out"), stacklevel=3)
+                warn(LeftOutWarning(f"{error}; `{image.name}` is left out"))
         if not views:
             raise InputError(f"`{folder}` has no image with a valid file of its camera")
         times = _times(folder, [view.time for view in views])
@@ -339,7 +336,7 @@ def _times(folder: Path, stated: list[float]) -> list[float]:
     if np.isfinite(stated).all() and all(before < after for before, after in pairwise(stated)):
         return stated
     text = f"the times of its images do not increase; {FRAMES_PER_SECOND:g} frames a second are assumed"
-    warnings.warn(f"`{folder}`: {text}", InputWarning, stacklevel=4)
+    warn(f"`{folder}`: {text}")
     return [index / FRAMES_PER_SECOND for index in range(len(stated))]
 
 

@@ -14,7 +14,6 @@ independent ground truth.
 
 import math
 import re
-import warnings
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,9 +24,8 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from vggtgeo.datasets.depth_files import metres_of_floats, read_depth
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, image_in
+from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, image_in, metres_of_floats, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_of_record3d, guess_with_warning
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
@@ -35,7 +33,7 @@ from vggtgeo.datasets.pose_files import json_in, parsing, poses_of, same_size, t
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
-from vggtgeo.io.errors import InputError, InputWarning, install_hint
+from vggtgeo.io.errors import InputError, install_hint, warn
 from vggtgeo.io.text_files import MAX_BYTES as MAX_TEXT
 from vggtgeo.io.text_files import content_of
 
@@ -229,11 +227,7 @@ def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -
     """Return the camera of the metadata; None without one, or, with a warning, for another image size."""
     size = metadata.get("w"), metadata.get("h")
     if None not in size and not same_size(size, (width, height)):
-        warnings.warn(
-            f"`{where}` has a camera for {size[0]} x {size[1]} pixels; the images are {width} x {height}: not used",
-            InputWarning,
-            stacklevel=4,
-        )
+        warn(f"`{where}` has a camera for {size[0]} x {size[1]} pixels; the images are {width} x {height}: not used")
         return None
     if not {"K", "perFrameIntrinsicCoeffs"} & metadata.keys():
         return None

@@ -10,7 +10,6 @@ import math
 import os
 import re
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,17 +19,15 @@ from typing import Any, Self
 import av
 import cv2
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import UInt8
 
-from vggtgeo.datasets.depth_files import MILLIMETRES, metres_of_codes
-from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.frame import Frame, NearestInTime, check_selection
+from vggtgeo.datasets.image_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.intrinsics import MAX_ASPECT, camera_from_folder, guess_with_warning
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
+from vggtgeo.io.errors import InputError, LeftOutWarning, NoteWarning, warn
 
-DELAY = 0.02
-"""Seconds between an image and its depth at most."""
 FASTEST = 1000
 """Frames a second that a header may state."""
 _FALLBACK_RATE = 30.0
@@ -162,7 +159,7 @@ class VideoFile:
         if not stream.has_times:
             text = "is a stream without times: is its header damaged?"
             rate = f"{stream.rate:g} frames a second are assumed: give `--fps` if it has others"
-            _warn(InputWarning(f"`{path}` {text} {rate}"))
+            warn(f"`{path}` {text} {rate}")
         rate = stream.rate if 0 < stream.rate < FASTEST else _FALLBACK_RATE
         return cls(path, path.name, camera, rate, max(stream.count, 1), tracks, tracks.depth is not None)
 
@@ -209,27 +206,29 @@ class VideoFile:
             self._warn_of_damage(chosen, damaged, index)
         if others:
             text = f"{len(others)} frames are not {size[0]} x {size[1]} pixels as the first ({others[0]})"
-            _warn(LeftOutWarning(f"`{self.name}`: {text}; they are skipped", len(others)))
+            warn(LeftOutWarning(f"`{self.name}`: {text}; they are skipped", len(others)))
         if index < min(chosen.stop, self.count):
             counts = f"ends after {index} frames; its header says {self.count}"
             text = f"`{self.name}` {counts}: is the file cut off, or damaged, or was it trimmed?"
-            _warn(InputWarning(text))  # not as left out: the count of an MKV is an estimate where the rate varies
+            warn(text)  # not as left out: the count of an MKV is an estimate where the rate varies
 
     @contextmanager
-    def _streams(self) -> Iterator[tuple[_Stream, _DepthStream | None]]:
+    def _streams(self) -> Iterator[tuple[_Stream, NearestInTime | None]]:
         """Return the images, and the depth where it is read."""
         with _open_stream(self.path, self.tracks.images) as images:
             if self.tracks.depth is None or not self.has_depth:
                 yield images, None
                 return
             with _open_stream(self.path, self.tracks.depth) as depth:
-                yield images, _DepthStream(depth, images.start)
+                later = depth.start - images.start
+                yield images, NearestInTime((depth.time(frame) + later, frame) for _, frame in depth.frames())
 
-    def _depth(self, depths: _DepthStream, time: float) -> np.ndarray:
+    def _depth(self, depths: NearestInTime, time: float) -> np.ndarray:
         """Return depth at a time of the stream, metres, NaN for none."""
-        codes = depths.at(time)
-        shape = self.camera.height, self.camera.width
-        return np.full(shape, np.nan, np.float32) if codes is None else metres_of_codes(codes, MILLIMETRES)
+        frame = depths.at(time)
+        if frame is None:
+            return np.full((self.camera.height, self.camera.width), np.nan, np.float32)
+        return metres_of_codes(frame.to_ndarray(format="gray16le"), MILLIMETRES)
 
     def _missed(self, failed: int, seconds: float, index: int) -> int:
         """Return frames that are missing before one: those that failed, or those that the time since the last one
@@ -249,7 +248,7 @@ class VideoFile:
     def _warn_of_damage(self, chosen: range, first: int, behind: int) -> None:
         if count := sum(index in chosen for index in range(first, behind)):
             text = f"frames {first} to {behind - 1} cannot be decoded, or are predicted from such"
-            _warn(LeftOutWarning(f"`{self.name}` is damaged: {text}; they are skipped", count))
+            warn(LeftOutWarning(f"`{self.name}` is damaged: {text}; they are skipped", count))
 
 
 class _Stream:
@@ -318,26 +317,6 @@ def _shown_size(frame: Any) -> tuple[int, int]:
     return (frame.height, frame.width) if round(frame.rotation / 90) % 2 else (frame.width, frame.height)
 
 
-class _DepthStream:
-    """Depth of a stream of 16-bit grey, asked for by rising times."""
-
-    def __init__(self, stream: _Stream, start: float) -> None:
-        """start: the time of the images' first frame, seconds of the file."""
-        later = stream.start - start
-        self._frames = ((stream.time(frame) + later, frame) for _, frame in stream.frames())
-        self._near = [next(self._frames, None)]
-
-    def at(self, time: float) -> UInt16[np.ndarray, "h w"] | None:
-        """Return the values nearest to a time, seconds since the images' first; None if none is within `DELAY`."""
-        while self._near[-1] is not None and self._near[-1][0] < time:
-            self._near = [self._near[-1], next(self._frames, None)]
-        near = [one for one in self._near if one is not None and abs(one[0] - time) <= DELAY]
-        if not near:
-            return None
-        _, frame = min(near, key=lambda one: abs(one[0] - time))
-        return np.asarray(frame.to_ndarray(format="gray16le"))
-
-
 @contextmanager
 def _open_container(path: Path) -> Iterator[Any]:
     """Open a video file; raise InputError if FFmpeg cannot."""
@@ -376,14 +355,12 @@ def _tracks(path: Path, depth: bool) -> ChosenTracks:
         return chosen
     beside = f", depth in millimetres of {chosen.depth}" if chosen.depth else ""
     left = ", ".join(map(str, chosen.others))
-    _warn(NoteWarning(f"`{path}`: images of {chosen.images}{beside}" + (f"; not read: {left}" if left else "")))
+    warn(f"`{path}`: images of {chosen.images}{beside}" + (f"; not read: {left}" if left else ""), NoteWarning)
     if depth and (maybe := chosen.maybe_depth):
-        _warn(
-            InputWarning(
-                f"`{path}`: {', '.join(map(str, maybe))} may be depth (16 bits of grey), and has no title that says so:"
-                f" not used; `ffmpeg -i FILE -map 0 -c copy -metadata:s:v:{maybe[0].number} title=DEPTH NEW.mkv` gives "
-                "the title, for depth in millimetres"
-            )
+        warn(
+            f"`{path}`: {', '.join(map(str, maybe))} may be depth (16 bits of grey), and has no title that says so:"
+            f" not used; `ffmpeg -i FILE -map 0 -c copy -metadata:s:v:{maybe[0].number} title=DEPTH NEW.mkv` gives "
+            "the title, for depth in millimetres"
         )
     return chosen
 
@@ -402,7 +379,3 @@ def _check_content(path: Path) -> None:
         head = file.read(_HEAD)
     if not _NO_TEXT.search(head):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
-
-
-def _warn(warning: InputWarning) -> None:
-    warnings.warn(warning, stacklevel=3)

@@ -18,7 +18,7 @@ from vggtgeo.datasets.image_files import image_header
 from vggtgeo.export.surfaces import EmptyRunError
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, warn
 from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import MASK, Scene
 from vggtgeo.results.summary import POSES
@@ -40,11 +40,9 @@ def scene_of(source: Path) -> Scene:
     times = np.concatenate([poses.timestamps for poses in known])
     mismatch = scene.mismatch(times, np.concatenate([poses.positions for poses in known]))
     if mismatch:
-        warnings.warn(
+        warn(
             f"`{source / 'scene.npz'}` does not match the pose files beside it (edited, or of another run): {mismatch}"
-            "; those of `scene.npz` are exported",
-            InputWarning,
-            stacklevel=4,
+            "; those of `scene.npz` are exported"
         )
     return scene
 

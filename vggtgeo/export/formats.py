@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.depth_files import read_codes
+from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.export.colmap import copy_pictures, scene_of, write_colmap
 from vggtgeo.export.surfaces import EmptyRunError, cloud_of, write_glb, write_las, write_ply
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import atomic_path, whole_path, write_json, write_picture, write_text
 from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import not_written
@@ -52,7 +51,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
         frames.append(frame)
     if not deep:
         text = f"`{source / 'depth'}` does not exist, the export has no depth; run again with `--save-depth`"
-        warnings.warn(text, InputWarning, stacklevel=3)
+        warn(text)
     cloud.save_ply(target / "points.ply")
     fx, fy, cx, cy = (float(value) for value in scene.intrinsics)
     camera = {"camera_model": "PINHOLE", "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
@@ -141,7 +140,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     except EmptyRunError as error:
         raise InputError(f"{error} ({failed})" if failed else str(error)) from None
     if failed:
-        warnings.warn(f"`{place}`: {failed}", InputWarning, stacklevel=2)
+        warn(f"`{place}`: {failed}")
     return written
 
 

@@ -53,6 +53,11 @@ class LeftOutWarning(InputWarning):
         self.frames = frames
 
 
+def warn(message: str | InputWarning, category: type[InputWarning] = InputWarning) -> None:
+    """Warn about the input, at the place that called the function in which this is called."""
+    warnings.warn(message, category, stacklevel=3)
+
+
 MAX_LENGTH = 1200
 """Characters of a line; a message may quote a whole damaged file."""
 _LONG_WORD = re.compile(r"[^\s]{500,}")

@@ -8,7 +8,6 @@ when submaps are merged.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.io.errors import InputWarning
+from vggtgeo.io.errors import warn
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -175,7 +174,7 @@ class RerunCallback(Callback):
         entities.log_note(self.stream, f"finished: {counts}", level="INFO")
         if problem := flush(self.stream, self._file):
             self.cut_short = self._file is not None
-            warnings.warn(problem, InputWarning, stacklevel=2)
+            warn(problem)
 
     @in_double_precision
     def _log_adjusted(self, slam: Slam) -> None:

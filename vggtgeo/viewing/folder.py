@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vggtgeo.datasets.depth_files import read_codes
+from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError

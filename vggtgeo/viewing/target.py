@@ -8,13 +8,12 @@ import sys
 import sysconfig
 import tempfile
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import make_parent
 
 ORIGINS = (
@@ -132,11 +131,9 @@ def _spawn(stream: Any, instead: Path) -> Path | None:
         stream.connect_grpc(default_blueprint=blueprint())
         return None
     _save(stream, instead)
-    warnings.warn(
+    warn(
         f"{reason}, so the recording goes to `{instead}`; view it with `rerun {instead}` on a machine with a screen, "
-        "or with `--rerun serve` in a browser",
-        InputWarning,
-        stacklevel=2,
+        "or with `--rerun serve` in a browser"
     )
     return instead
 
