@@ -268,14 +268,6 @@ def test_kitti_raw(tmp_path: Path) -> None:
     assert raw.distortion == pytest.approx((-0.369, 0.197, 0.001, 0.0006, -0.07))
 
 
-def test_bonn_has_its_published_camera(tmp_path: Path) -> None:
-    # Proves that the Bonn benchmark, which has the layout of TUM RGB-D, gets its own camera.
-    sequence = open_sequence(tiny.bonn(tmp_path / "rgbd_bonn_balloon"))
-    assert type(sequence).__name__ == "TumRgbd"
-    assert sequence.camera.intrinsics[0] == 542.822841
-    assert len(sequence.camera.distortion) == 4
-
-
 def test_seven_scenes_as_published_is_registered(tmp_path: Path) -> None:
     # Proves that depth and poses of the depth camera are moved to the colour camera where the folder has no intrinsics
     # or those of the depth camera,
