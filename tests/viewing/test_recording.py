@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_suites
+from conftest import ROOT
 from recorded_run import RecordedRun, recorded_run
 from rrd_files import components_of, entities_of
 from typer.testing import CliRunner
@@ -82,11 +84,12 @@ def test_a_run_of_a_batch_leaves_its_recording_where_one_is_asked_for(run: Recor
 
 
 def test_the_recording_holds_every_entity(recording: Path) -> None:
-    """Each listed entity is in the file, on the timeline it belongs to; oracle: rerun's own reader."""
-    from vggtgeo.viewing.entities import ENTITIES
-
+    """Each entity of the page on views is in the file, on its timeline; oracle: the page, rerun's own reader."""
     found = entities_of(recording)
-    assert set(ENTITIES) - set(found) == set()
+    rows = [line for line in (ROOT / "docs/guides/views.md").read_text().splitlines() if line.startswith("| `")]
+    listed = re.findall(r"`((?:world|window|keyframe|plots)/\w+|notes)`", "\n".join(rows))
+    assert len(listed) > 15
+    assert [path for path in listed if not any(entity.startswith(f"/{path}") for entity in found)] == []
     for path in ("/world/camera", "/world/trajectory", "/keyframe/image/matches", "/plots/residuals/points"):
         assert {"frame", "time"} <= found[path], path
     for path in ("/plots/solver/energy", "/plots/convergence/step", "/world/iteration", "/world/covariance"):
@@ -208,14 +211,19 @@ def test_loops_and_lost_frames_are_shown(run: RecordedRun, tmp_path: Path) -> No
 
 
 def test_the_blueprint_shows_what_is_logged(recording: Path) -> None:
-    """Every view's origin holds something, and the file carries the arrangement; oracle: the entities, the reader."""
+    """Every view's origin holds something, and the file carries the arrangement; oracle: rerun's own reader."""
     import rerun as rr
+    import rerun.blueprint as rrb
 
-    from vggtgeo.viewing.entities import ENTITIES
-    from vggtgeo.viewing.target import ORIGINS, blueprint
+    from vggtgeo.viewing.target import blueprint
 
-    assert [origin for origin in ORIGINS if not any(path.startswith(origin) for path in ENTITIES)] == []
-    assert blueprint().root_container is not None
+    containers, views = [blueprint().root_container], []
+    while containers:
+        for part in containers.pop().contents:
+            (containers if isinstance(part, rrb.Container) else views).append(part)
+    assert len(views) > 8
+    found = entities_of(recording)
+    assert [view.origin for view in views if not any(path.startswith(view.origin) for path in found)] == []
     assert len(rr.chunk.RrdReader(recording).blueprints()) >= 1
 
 

@@ -183,7 +183,15 @@ def depth_camera_of(
     motion = extrinsics if motion is None else motion
     motion = np.eye(4) if motion is None and is_registered(chosen.depth) else motion
     if own is None or image is None or motion is None:
-        raise InputError(_refusal(path, chosen, frames, (own, image), motion))
+        topics = {chosen.depth: own, chosen.colour: image}
+        missing = [f"the `CameraInfo` of `{topic}`" for topic, camera in topics.items() if camera is None]
+        missing += ["how its frame lies in that of the images (`/tf_static`)"] if motion is None else []
+        raise InputError(
+            f"`{path}`: the depth of `{chosen.depth}` is that of another camera than the images of `{chosen.colour}`, "
+            f"and cannot be registered to them: {' and '.join(missing)} is missing; record depth that is registered to "
+            "the images (RealSense: `align_depth`, `/camera/aligned_depth_to_color/image_raw`), or what is missing, "
+            "too; or leave it out with --rgb-only"
+        )
     return DepthCamera(own, motion)
 
 
@@ -192,36 +200,6 @@ def _may_be_of_depth(info: str, messages: Sequence[Any], chosen: Chosen, frame: 
     if not messages or not is_beside(info, chosen.depth):
         return False
     return not is_beside(info, chosen.colour) or frame_name(messages[0].header.frame_id) in ("", frame)
-
-
-def _refusal(
-    path: Path,
-    chosen: Chosen,
-    frames: Sequence[str],
-    cameras: tuple[Camera | None, Camera | None],
-    motion: np.ndarray | None,
-) -> str:
-    missing = [
-        f"the `CameraInfo` of `{topic}`"
-        for topic, camera in zip((chosen.depth, chosen.colour), cameras, strict=True)
-        if camera is None
-    ]
-    missing += ["how its frame lies in that of the images (`/tf_static`)"] if motion is None else []
-    depth, image = (_described(*one) for one in zip(cameras, frames, strict=True))
-    return (
-        f"`{path}`: the depth of `{chosen.depth}` is that of another camera ({depth}) than the images of "
-        f"`{chosen.colour}` ({image}), and cannot be registered to them: {' and '.join(missing)} is missing; record "
-        "depth that is registered to the images (RealSense: `align_depth`, "
-        "`/camera/aligned_depth_to_color/image_raw`), or what is missing, too; or leave it out with --rgb-only"
-    )
-
-
-def _described(camera: Camera | None, frame: str) -> str:
-    lens = "intrinsics not stated"
-    if camera is not None:
-        fx, fy, cx, cy = camera.intrinsics
-        lens = f"f = {fx:.1f}, {fy:.1f}, centre {cx:.1f}, {cy:.1f}"
-    return f"{lens}, frame `{frame}`" if frame else lens
 
 
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")

@@ -113,7 +113,8 @@ class RosBag:
             size = (other.camera.width, other.camera.height) if other else (width, height)
             has_depth = depth and bool(chosen.depth) and _depth_is_usable(reader, path, chosen.depth, times, size)
             if has_depth and other:
-                warn(f"`{path}`: {_registration_note(chosen, other)}", NoteWarning)
+                text = f"is of a camera of its own, {1e3 * float(np.linalg.norm(other.motion[:3, 3])):.0f} mm beside"
+                warn(f"`{path}`: the depth of `{chosen.depth}` {text}: registered to `{chosen.colour}`", NoteWarning)
         return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, tuple(times), has_depth, other)
 
     def __len__(self) -> int:
@@ -260,14 +261,6 @@ def _whole(reader: Any, connections: list[Any]) -> Iterator[Any]:
     for connection, _, raw in reader.messages(connections=connections) if connections else ():
         with suppress(Exception):  # a damaged message may raise anything
             yield reader.deserialize(raw, connection.msgtype)
-
-
-def _registration_note(chosen: Chosen, other: DepthCamera) -> str:
-    distance = 1e3 * float(np.linalg.norm(other.motion[:3, 3]))
-    return (
-        f"the depth of `{chosen.depth}` is of a camera of its own (f = {other.camera.intrinsics[0]:.1f}, "
-        f"{distance:.0f} mm from that of the images): it is registered to the images of `{chosen.colour}`"
-    )
 
 
 @contextmanager

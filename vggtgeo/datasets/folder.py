@@ -142,20 +142,19 @@ class FolderSequence:
 
     def common_size(self) -> tuple[int, int]:
         """Return width and height of most of a few readable images; raise InputError if none can be read."""
-        sizes: list[tuple[int, int]] = []
+        shapes: Counter[tuple[int, ...]] = Counter()
         reason = ""
         for file in _spread(self.files):
             try:
-                height, width = self.stored_image(file.image).image.shape[:2]
+                shapes[self.stored_image(file.image).image.shape] += 1
             except InputError as error:
                 reason = reason or str(error)
-                continue
-            sizes.append((width, height))
-            if len(sizes) == _SAMPLES:
+            if shapes.total() == _SAMPLES:
                 break
-        if not sizes:
+        if not shapes:
             raise InputError(f"none of the {len(self)} images of `{self.folder}` can be read; the first: {reason}")
-        return Counter(sizes).most_common(1)[0][0]
+        height, width, _ = shapes.most_common(1)[0][0]
+        return width, height
 
     def depth_is_usable(self) -> bool:
         """Return whether a depth file has a valid pixel, with an UnusableDepthWarning if none has.

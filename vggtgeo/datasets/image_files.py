@@ -37,7 +37,10 @@ BITS = (8, 10, 12, 14, 16)
 """Bits of the values in a 16-bit file: cameras of 10 and 12 bits write such files without filling them."""
 _FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "PPM", "TIFF")
 _ORIENTATION = 274
-_BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, struct.error, OverflowError)
+_BROKEN = (
+    *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, struct.error, OverflowError),
+    Image.DecompressionBombError,
+)
 """What Pillow raises for damaged files."""
 # Of damaged EXIF data and directories: what is wrong with a file is the error below.
 warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
@@ -106,8 +109,6 @@ def image_header(content: bytes, path: Path) -> ImageHeader:
         InputError: the file is empty, truncated, too large, or of a format that is not read.
 
     """
-    if not content:
-        raise InputError(f"`{path}` is empty")
     try:
         with Image.open(io.BytesIO(content), formats=_FORMATS) as image:  # its own `getexif` of a PNG decodes the image
             orientation = (
@@ -120,8 +121,6 @@ def image_header(content: bytes, path: Path) -> ImageHeader:
             image.verify()  # the check sums of a PNG, up to its end
     except InputError:
         raise
-    except Image.DecompressionBombError as error:
-        raise InputError(f"`{path}` has too many pixels: {error}") from None
     except UnidentifiedImageError:
         raise InputError(
             f"`{path}` begins with {content[:16]!r}; it must be a PNG, JPEG, TIFF, WebP, BMP or PNM: convert it, or "

@@ -24,8 +24,6 @@ MAX_ASPECT = 4.0
 _OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
 _FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
 """Names of the two lens models in ROS, Kalibr, EuRoC and RealSense."""
-MAX_BYTES = 100_000
-"""Maximum size of a file with a few numbers and comments."""
 CALIBRATION, DISTORTION = "calibration.txt", "distortion.txt"
 FISHEYE = "fisheye"
 """Last word of such a file, after four coefficients of Kannala and Brandt."""
@@ -240,10 +238,7 @@ def _numbers(text: str) -> tuple[float, ...]:
 
 
 def _without_comments(file: Path) -> str:
-    if file.stat().st_size > MAX_BYTES:
-        raise InputError(f"`{file}` has {file.stat().st_size} bytes; expected a few numbers")
-    lines = whole_text(file).splitlines()
-    return " ".join(line.split("#", 1)[0] for line in lines)
+    return " ".join(line.split("#", 1)[0] for line in whole_text(file).splitlines())
 
 
 def warn_of_other_size(where: str, camera: Camera) -> None:

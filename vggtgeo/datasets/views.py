@@ -13,6 +13,7 @@ import itertools
 import math
 import sys
 from collections.abc import Iterable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, overload
 
@@ -22,7 +23,7 @@ import numpy as np
 from vggtgeo.datasets.bags import RosBag
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence, check_depth, check_frame, check_selection, described
-from vggtgeo.datasets.image_files import MAX_DEPTH, MAX_PIXELS, MIN_DEPTH
+from vggtgeo.datasets.image_files import MAX_DEPTH, MIN_DEPTH
 from vggtgeo.datasets.images import ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.nerfstudio import Nerfstudio
@@ -250,16 +251,9 @@ def _frame(item: Any, index: int, rate: float) -> Frame:
     if depth is not None:
         check_depth(f"the depth of `frames[{index}]`", depth, image)
         depth = depth.astype(np.float32)
-    return Frame(index, index / rate, _own(f"frame {index}", image), depth, f"frame {index}")
+    return Frame(index, index / rate, image.copy(), depth, f"frame {index}")
 
 
 def copied(frame: Frame) -> Frame:
-    """Return the frame with copies of its arrays; raise InputError if they are too large."""
-    return replace(frame, image=_own(frame.name, frame.image), depth=_own(frame.name, frame.depth))
-
-
-def _own(name: str, given: Any) -> Any:
-    """Return a copy of an image or of depth; raise InputError if it is too large."""
-    if isinstance(given, np.ndarray) and given[..., :1].size > MAX_PIXELS:
-        raise InputError(f"`{name}` has the shape {given.shape}, more than {MAX_PIXELS // 10**6} million pixels")
-    return given.copy() if isinstance(given, np.ndarray) else given
+    """Return the frame with copies of its arrays."""
+    return replace(frame, image=copy(frame.image), depth=copy(frame.depth))

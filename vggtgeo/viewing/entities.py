@@ -20,40 +20,6 @@ from vggtgeo.slam.submaps import lost_stretches
 from vggtgeo.slam.window_recorder import WindowRecord
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
-ENTITIES = (
-    "/world",
-    "/world/camera",
-    "/world/camera/image",
-    "/world/trajectory",
-    "/world/keyframes",
-    "/world/covariance",
-    "/world/covisibility",
-    "/world/loops",
-    "/world/lost",
-    "/world/unjoined",
-    "/world/iteration",
-    "/world/points",
-    "/world/live/0",
-    "/world/map",
-    "/keyframe/image",
-    "/keyframe/image/matches",
-    "/keyframe/image/motion",
-    "/keyframe/image/lines",
-    "/keyframe/depth",
-    "/keyframe/confidence",
-    "/window/graph",
-    "/plots/residuals/points",
-    "/plots/residuals/lines",
-    "/plots/residuals/depth",
-    "/plots/solver/energy",
-    "/plots/convergence/damping",
-    "/plots/convergence/gradient",
-    "/plots/convergence/step",
-    "/plots/tracking/inliers",
-    "/plots/tracking/lost",
-    "/notes",
-)
-"""All entity paths in the recording of a run with depth and lines."""
 SIGMAS = 20.0
 """Size of the ellipsoids, standard deviations: one is only millimetres in a good window."""
 _BLUE, _ORANGE, _GREEN, _GREY = (31, 95, 191), (224, 123, 26), (58, 143, 92), (150, 150, 150)

@@ -16,11 +16,6 @@ from urllib.parse import quote
 from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import make_parent
 
-ORIGINS = (
-    *("/world", "/world/camera/image", "/keyframe/image", "/keyframe/depth", "/keyframe/confidence", "/window"),
-    *("/plots/residuals", "/plots/solver", "/plots/convergence", "/plots/tracking", "/notes"),
-)
-"""Entities that the views of the blueprint show."""
 APPLICATION = "vggtgeo"
 STAND_IN = "run.rrd"
 """In the run's folder: the recording in place of a viewer that could not be opened."""
