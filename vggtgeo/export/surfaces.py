@@ -113,7 +113,7 @@ def write_las(source: Path, target: Path) -> dict[str, float]:
     header.offsets = np.floor(points.min(axis=0))
     record = laspy.LasData(header)
     record.x, record.y, record.z = points.T
-    record.red, record.green, record.blue = srgb_16_bits(cloud.colours).T
+    record.red, record.green, record.blue = (cloud.colours.astype(np.uint16) * (FULL_SCALE // 255)).T
     with atomic_path(target / "map.las") as temporary:
         record.write(str(temporary))
     return {"points": len(cloud)}
@@ -125,11 +125,6 @@ def _package(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise InputError(f"this export needs the package `{name}`; {install_hint('maps')}") from None
-
-
-def srgb_16_bits(colours: UInt8[np.ndarray, "n 3"]) -> UInt16[np.ndarray, "n 3"]:
-    """Return sRGB colours in 16 bits, for LAS."""
-    return colours.astype(np.uint16) * (FULL_SCALE // 255)
 
 
 def linear_16_bits(colours: UInt8[np.ndarray, "n 3"]) -> UInt16[np.ndarray, "n 3"]:

@@ -14,7 +14,6 @@ from typing import Any
 from urllib.parse import quote
 
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.files import make_parent
 
 APPLICATION = "vggtgeo"
 STAND_IN = "run.rrd"
@@ -108,7 +107,7 @@ def has_screen() -> bool:
 
 def _save(stream: Any, path: Path) -> Path:
     """Record to a file, after a test that the disk is writable: else Rerun may never return, on a full disk."""
-    make_parent(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with tempfile.TemporaryFile(dir=path.parent) as probe:
             probe.write(bytes(_PROBE_SIZE))
