@@ -81,14 +81,6 @@ def test_seven_scenes_finds_the_sequence_in_a_scene(tmp_path: Path) -> None:
         assert open_sequence(tmp_path).name == "seq-01"
 
 
-def test_seven_scenes_without_intrinsics_takes_the_published_ones(tmp_path: Path) -> None:
-    # Proves the published camera for the published size, and a word about depth and poses.
-    tiny.write_image(tmp_path / "frame-000000.color.png", tiny.image(0, 640, 480))
-    with warns(tmp_path.name, 525.0):
-        camera = open_sequence(tmp_path).camera
-    assert camera == Camera((525.0, 525.0, 320.0, 240.0), 640, 480)
-
-
 def test_tum(tmp_path: Path) -> None:
     # Proves pairing, times, depth / 5000 (0 alone is none), calibration and truth. Oracle: what was written.
     sequence = open_sequence(tiny.tum(tmp_path))
@@ -133,20 +125,21 @@ def _with_depth(sequence: Sequence) -> list[Frame]:
         ("rgbd_dataset_freiburg1_desk", 517.3, 5),
         ("rgbd_dataset_freiburg2_xyz", 520.9, 5),
         ("rgbd_dataset_freiburg3_long_office_household", 535.4, 0),
-        ("fr1_xyz", 517.3, 5),
+        ("rgbd_fr1_xyz", 517.3, 5),
         ("rgbd_bonn_balloon", 542.822841, 4),
     ],
 )
 def test_tum_published_cameras(tmp_path: Path, name: str, focal: float, distortion: int) -> None:
-    # Proves that the folder's name gives the published camera with its distortion, and that a file in it wins.
-    folder = tmp_path / name
-    tiny.write_image(folder / "1.0.png", tiny.image(0, 640, 480))
-    (folder / "rgb.txt").write_text("1.0 1.0.png\n")
-    sequence = open_sequence(folder)
-    assert sequence.camera.intrinsics[0] == focal
-    assert len(sequence.camera.distortion) == distortion
-    assert sequence.camera.known
-    assert not sequence.has_depth
+    # Proves that the name of the folder, or of its recording in the head of its list, gives the published camera with
+    # its distortion, and that a file in it wins.
+    for folder, head in ((tmp_path / "renamed", f"# file: '{name}.bag'\n"), (tmp_path / name, "")):
+        tiny.write_image(folder / "1.0.png", tiny.image(0, 640, 480))
+        (folder / "rgb.txt").write_text(f"# color images\n{head}1.0 1.0.png\n")
+        sequence = open_sequence(folder)
+        assert sequence.camera.intrinsics[0] == focal
+        assert len(sequence.camera.distortion) == distortion
+        assert sequence.camera.known
+        assert not sequence.has_depth
     tiny.write_calibration(folder, (500.0, 500.0, 320.0, 240.0))
     assert open_sequence(folder).camera == Camera((500.0, 500.0, 320.0, 240.0), 640, 480)
 

@@ -12,7 +12,7 @@ import av
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tiny_sequences import HEIGHT, INTRINSICS, WIDTH, depth_codes, image, pose, tum_line, write_image
+from tiny_sequences import HEIGHT, INTRINSICS, WIDTH, depth_codes, image, pose, write_image
 
 from vggtgeo import datasets
 from vggtgeo.io.errors import InputWarning
@@ -181,26 +181,6 @@ def tanks(folder: Path, poses: Sequence[np.ndarray] = POSES) -> Path:
     corners = [[0, 0, 0], [2, 0, 0], [2, 0, 2], [1, 0, 1], [0, 0, 2]]
     crop = {"orthogonal_axis": "Y", "axis_min": -1.0, "axis_max": 1.0, "bounding_polygon": corners}
     (folder / f"{folder.name}.json").write_text(json.dumps(crop))
-    return folder
-
-
-def eth3d(folder: Path) -> Path:
-    """A training sequence of ETH3D SLAM, its mono and its RGB-D archive unpacked over each other: colour and depth of
-    one time, 5000 per metre; truth of 100 poses a second that begins later than the images.
-    """
-    rgb, depth, both = [], [], []
-    for number in range(COUNT):
-        time = f"{3894.207 + 0.0369 * number:.6f}"
-        write_image(folder / f"rgb/{time}.png", image(number))
-        write_image(folder / f"depth/{time}.png", depth_codes(number))
-        rgb.append(f"{time} rgb/{time}.png\n")
-        depth.append(f"{time} depth/{time}.png\n")
-        both.append(f"{time} rgb/{time}.png {time} depth/{time}.png\n")
-    for name, lines in (("rgb", rgb), ("depth", depth), ("associated", both)):
-        (folder / f"{name}.txt").write_text("".join(lines))
-    (folder / "calibration.txt").write_text(" ".join(map(str, INTRINSICS)))
-    truth = [tum_line(3894.22 + 0.01 * number, number) for number in range(5)]
-    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(truth))
     return folder
 
 
