@@ -19,7 +19,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import MAX_DELAY
 from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, OTHER_PICTURES
-from vggtgeo.datasets.intrinsics import camera_from_folder, camera_or_guess
+from vggtgeo.datasets.intrinsics import camera_from_folder, camera_or_guess, guess_with_warning
 from vggtgeo.io.errors import InputError, LeftOutWarning, warn
 
 FRAMES_PER_SECOND = 30.0
