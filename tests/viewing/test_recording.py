@@ -21,7 +21,6 @@ from vggtgeo.benchmark.page import write_page
 from vggtgeo.benchmark.worker import recording as recorded
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.results.files import write_depth, write_trajectories
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -96,7 +95,7 @@ def test_the_recording_holds_every_entity(recording: Path) -> None:
         assert "iteration" in found[path], path
 
 
-def logged(states: Sequence[Slam], path: Path, cloud: PointCloud | None = None) -> Path:
+def logged(states: Sequence[Slam], path: Path) -> Path:
     """A recording of what `RerunCallback` shows of the map in these states, state n at frame n."""
     from vggtgeo.viewing import entities
     from vggtgeo.viewing.callback import LiveMap
@@ -109,9 +108,6 @@ def logged(states: Sequence[Slam], path: Path, cloud: PointCloud | None = None) 
         live.update(slam)
         entities.log_loops(stream, slam, apart=2)
         entities.log_lost(stream, slam)
-    if cloud is not None:
-        live.clear()
-        entities.log_map(stream, cloud)
     stream.disconnect()
     return path
 

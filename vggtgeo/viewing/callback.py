@@ -17,7 +17,7 @@ import numpy as np
 from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import warn
 from vggtgeo.slam.callback import Callback
@@ -36,8 +36,6 @@ MAX_CLOUDS = 4
 """Clouds logged per frame: a run in a known map, or a resumed one, starts with many keyframes."""
 MIN_CONFIDENCE = 128
 """Of depth that is shown, of 255: as in the map."""
-RADIUS = 0.011
-"""Metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +60,13 @@ class LiveMap:
         for keyframe in slam.adjusted_keyframes:
             before = self._logged.get(keyframe.number)
             if room and _is_stale(keyframe, before, slam):
-                self._log_cloud(keyframe, slam)
+                points, colours = own_cloud(keyframe, slam.intrinsics, dense=slam.metric)
+                entities.log_cloud(self._stream, f"world/live/{keyframe.number}", points, colours)
                 room -= 1
-                self._log_pose(keyframe)
+                entities.log_pose(self._stream, f"world/live/{keyframe.number}", keyframe.pose)
                 self._logged[keyframe.number] = _Logged(keyframe.frame, keyframe.pose, keyframe.points)
             elif before is not None and keyframe.pose is not before.pose:
-                self._log_pose(keyframe)
+                entities.log_pose(self._stream, f"world/live/{keyframe.number}", keyframe.pose)
                 self._logged[keyframe.number] = replace(before, pose=keyframe.pose)
 
     def clear(self) -> None:
@@ -77,19 +76,6 @@ class LiveMap:
         for path in ("world/live", "world/points"):
             self._stream.log(path, rr.Clear(recursive=True))
         self._logged.clear()
-
-    def _log_cloud(self, keyframe: Keyframe, slam: Slam) -> None:
-        import rerun as rr
-
-        points, colours = own_cloud(keyframe, slam.intrinsics, dense=slam.metric)
-        self._stream.log(f"world/live/{keyframe.number}", rr.Points3D(points, colors=colours, radii=RADIUS))
-
-    def _log_pose(self, keyframe: Keyframe) -> None:
-        import rerun as rr
-
-        to_world = rigid.invert(keyframe.pose)
-        transform = rr.Transform3D(translation=to_world[:3, 3], mat3x3=to_world[:3, :3])
-        self._stream.log(f"world/live/{keyframe.number}", transform)
 
 
 def _is_stale(keyframe: Keyframe, before: _Logged | None, slam: Slam) -> bool:
@@ -169,7 +155,7 @@ class RerunCallback(Callback):
         """Log the path after the last adjustment, and replace the live map by the dense map."""
         self._log_path(slam)
         self._live.clear()
-        entities.log_map(self.stream, cloud)
+        entities.log_cloud(self.stream, "world/map", cloud.points, cloud.colours)
         counts = f"{len(slam.frames)} frames, {len(slam.keyframes)} keyframes, {len(cloud)} points in the map"
         entities.log_note(self.stream, f"finished: {counts}", level="INFO")
         if problem := flush(self.stream, self._file):

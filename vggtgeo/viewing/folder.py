@@ -51,7 +51,8 @@ def log_folder(stream: Any, folder: Path) -> None:
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.set_time("frame", sequence=0)
     entities.log_path(stream, trajectory, load_poses(folder, "keyframes.txt"))
-    entities.log_map(stream, PointCloud.load_ply(folder / "map.ply"))
+    cloud = PointCloud.load_ply(folder / "map.ply")
+    entities.log_cloud(stream, "world/map", cloud.points, cloud.colours)
     if (folder / "mesh.ply").is_file():
         entities.log_mesh(stream, Mesh.load_ply(folder / "mesh.ply"))
     for file in sorted(folder.glob("depth/*.depth.png")):
