@@ -96,11 +96,7 @@ def image_of(message: Any, place: Path, min_bits: int = 8) -> ImageFile:
         )
     rows = message.height * 3 // 2 if message.encoding in _OF_SQUARES else message.height
     kind = np.dtype(np.uint8 if coding.bits == 8 else np.uint16)
-    image = _pixels(message, place, kind.newbyteorder(">" if message.is_bigendian else "<"), coding.channels, rows)
-    return _in_colour(image, coding, min_bits)
-
-
-def _in_colour(codes: np.ndarray, coding: Coding, min_bits: int) -> ImageFile:
+    codes = _pixels(message, place, kind.newbyteorder(">" if message.is_bigendian else "<"), coding.channels, rows)
     image, bits = eight_bits(codes, min_bits)
     return ImageFile(image if coding.change is None else np.asarray(cv2.cvtColor(image, coding.change)), bits, 1)
 
