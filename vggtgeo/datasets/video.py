@@ -157,9 +157,10 @@ class VideoFile:
             )
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
         if not stream.has_times:
-            text = "is a stream without times: is its header damaged?"
-            rate = f"{stream.rate:g} frames a second are assumed: give `--fps` if it has others"
-            warn(f"`{path}` {text} {rate}")
+            warn(
+                f"`{path}` is a stream without times: is its header damaged? {stream.rate:g} frames a second are "
+                "assumed: give `--fps` if it has others"
+            )
         rate = stream.rate if 0 < stream.rate < FASTEST else _FALLBACK_RATE
         return cls(path, path.name, camera, rate, max(stream.count, 1), tracks, tracks.depth is not None)
 

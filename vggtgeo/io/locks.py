@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from filelock import FileLock
-from filelock import Timeout as LockedError
+from filelock import FileLock, Timeout
 
 from vggtgeo.io.errors import InputError
+
+LockedError = Timeout
+"""Another process holds the lock."""
 
 
 @contextmanager
