@@ -2,7 +2,7 @@
 
 Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage`; colour before grey and infrared),
 depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
-any other; depth with a camera of its own is registered by what the bag states of it, `bag_cameras.py`), the camera's
+any other; depth with a camera of its own is registered by what the bag states of it, `bag_messages.py`), the camera's
 `CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
 name contains `truth`, `gt`, `vicon` or `mocap`. A choice among several is reported.
 """
@@ -16,13 +16,18 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from vggtgeo.datasets.bag_cameras import CAMERA_INFO, TRANSFORMS, DepthCamera, camera_of, depth_camera_of, frame_name
-from vggtgeo.datasets.bag_images import (
+from vggtgeo.datasets.bag_messages import (
+    CAMERA_INFO,
     IMAGES,
+    TRANSFORMS,
     Chosen,
+    DepthCamera,
     Unread,
+    camera_of,
     chosen_topics,
+    depth_camera_of,
     described_choice,
+    frame_name,
     image_of,
     metres_of,
     truth_topic,

@@ -1,4 +1,5 @@
-"""A video file, decoded frame by frame by PyAV, and its tracks: which are the images, which their depth.
+"""A video file, decoded frame by frame by PyAV, and its tracks: which are the images, which their depth; and live
+cameras: a webcam (`webcam:0`) or a stream by its address (`rtsp://...`, `http://...`), read by OpenCV.
 
 Action cameras write a small preview beside the recording; k4arecorder writes COLOR, DEPTH and IR into one Matroska
 file.
@@ -14,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import monotonic
 from typing import Any, Self
 
 import av
@@ -21,7 +23,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from vggtgeo.datasets.frame import Frame, NearestInTime, check_selection
+from vggtgeo.datasets.frame import Frame, NearestInTime, check_range, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.intrinsics import MAX_ASPECT, camera_from_folder, guess_with_warning
 from vggtgeo.geometry.camera import Camera
@@ -45,6 +47,11 @@ _INFRARED = re.compile(r"(^|[^a-z])(ir|infrared)([^a-z]|$)", re.IGNORECASE)
 _ATTACHED_PICTURE = 0x400
 _UNNAMED = "VideoHandler"
 """Title that FFmpeg gives a track without one."""
+
+
+_WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
+"""Digits of a webcam's number."""
+_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://.+", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -380,3 +387,95 @@ def _check_content(path: Path) -> None:
         head = file.read(_HEAD)
     if not _NO_TEXT.search(head):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
+
+
+def is_live(text: str) -> bool:
+    """Return whether `text` names a webcam or a stream, not a file."""
+    return _WEBCAM.fullmatch(text) is not None or _ADDRESS.fullmatch(text) is not None
+
+
+@dataclass(frozen=True)
+class LiveCamera:
+    """Frames of a live camera, without depth and ground truth, until the stream ends or the run is interrupted.
+
+    The length is unknown (0). Times are those of arrival.
+    """
+
+    source: str
+    camera: Camera
+    has_depth: bool = False
+
+    @classmethod
+    def open(cls, source: str) -> Self:
+        """Open a camera and read one frame for the size; raise InputError if no camera answers."""
+        capture = _capture(source)
+        try:
+            there, image = capture.read()
+            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        finally:
+            capture.release()
+        if not there:
+            raise InputError(f"`{_public(source)}` gives no frame: is the camera connected, and not in use?")
+        height, width = image.shape[:2]
+        if _ADDRESS.fullmatch(source) and math.isfinite(count) and count > 0:  # a live camera has no length
+            warn(
+                f"`{_public(source)}` is a recording of {count:.0f} frames, whose times would be those of arrival: "
+                "download it first (`curl -O ADDRESS`), and give the file"
+            )
+        return cls(source, guess_with_warning(_public(source), width, height))
+
+    @property
+    def name(self) -> str:
+        """Return the source without its password."""
+        return _public(self.source)
+
+    def __len__(self) -> int:
+        return 0
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """Return the frames start, start + stride, ... below end as they arrive; frames that are not requested in time
+        are lost.
+        """
+        check_range(start, end, stride)
+        return self._read(start, end, stride)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return None: there is no ground truth."""
+        return None
+
+    def _read(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
+        capture = _capture(self.source)
+        began = last = monotonic()
+        index = 0
+        try:
+            while (end is None or index < end) and capture.grab():
+                now = max(monotonic(), last + 1e-6)
+                if index >= start and (index - start) % stride == 0:
+                    there, image = capture.retrieve()
+                    if there:
+                        yield Frame(
+                            index, now - began, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), None, f"{self.name}, {index}"
+                        )
+                last = now
+                index += 1
+        finally:
+            capture.release()
+
+
+def _public(source: str) -> str:
+    """Return an address without the user's name and password."""
+    return re.sub(r"//[^/?#]*@", "//", source)
+
+
+def _capture(source: str) -> cv2.VideoCapture:
+    webcam = _WEBCAM.fullmatch(source)
+    logging: Any = cv2.utils.logging
+    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the error below replaces its warnings
+    try:
+        capture = cv2.VideoCapture(int(webcam.group(1) or 0) if webcam else source)
+    finally:
+        logging.setLogLevel(level)
+    if not capture.isOpened():
+        capture.release()
+        raise InputError(f"`{_public(source)}` cannot be opened: is the camera connected, and the address right?")
+    return capture
