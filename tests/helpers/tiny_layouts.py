@@ -366,7 +366,7 @@ def matroska(path: Path, milliseconds: tuple[int, ...], aspect: Fraction = Fract
     aspect: width of a pixel over its height.
     """
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("mjpeg", rate=30)
+        stream = container.add_stream("mjpeg", rate=Fraction(1000 * (len(milliseconds) - 1), milliseconds[-1]))
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
         stream.codec_context.time_base = Fraction(1, 1000)
         stream.codec_context.sample_aspect_ratio = aspect
