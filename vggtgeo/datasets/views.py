@@ -24,7 +24,7 @@ from vggtgeo.datasets.bags import RosBag
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence, check_depth, check_frame, check_selection, described
 from vggtgeo.datasets.image_files import MAX_DEPTH, MIN_DEPTH
-from vggtgeo.datasets.images import ImageFolder, RgbdFolders
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.video import VideoFile
@@ -180,14 +180,13 @@ class FrameStream:
         return itertools.islice(self.source, start, end, stride)
 
 
-def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: float = 30.0) -> FrameStream:
+def frame_stream(frames: Iterable[Any], camera: Camera | None = None) -> FrameStream:
     """Return frames of any iterable, which is read one frame ahead.
 
     Args:
-        frames: of `Frame`; or images, uint8 [H, W, 3] RGB; or pairs of an image and depth, float [H, W] metres with NaN
-            for none. They are copied: a camera may reuse one array.
+        frames: of `Frame`; or images, uint8 [H, W, 3] RGB, 30 a second; or pairs of an image and depth, float [H, W]
+            metres with NaN for none. They are copied: a camera may reuse one array.
         camera: of all frames; None: a guess from the size of the first image, and intrinsics are estimated.
-        rate: frames a second, for images without a time of their own.
 
     Raises:
         InputError: there is no frame, or one has another type.
@@ -195,7 +194,7 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None, rate: floa
     """
     if not isinstance(frames, Iterable):
         raise InputError(f"`frames` is {described(frames)}; give a folder, a video file, or images one after another")
-    counted = (_frame(item, index, rate) for index, item in enumerate(frames))
+    counted = (_frame(item, index) for index, item in enumerate(frames))
     first = next(counted, None)
     if first is None:
         raise InputError("`frames` is empty; give at least one frame")
@@ -237,7 +236,7 @@ def _warn_of_unit(frame: Frame) -> None:
         )
 
 
-def _frame(item: Any, index: int, rate: float) -> Frame:
+def _frame(item: Any, index: int) -> Frame:
     if isinstance(item, Frame):
         given: Any = item.image
         if not isinstance(given, np.ndarray) or given.ndim != 3:
@@ -251,7 +250,7 @@ def _frame(item: Any, index: int, rate: float) -> Frame:
     if depth is not None:
         check_depth(f"the depth of `frames[{index}]`", depth, image)
         depth = depth.astype(np.float32)
-    return Frame(index, index / rate, image.copy(), depth, f"frame {index}")
+    return Frame(index, index / FRAMES_PER_SECOND, image.copy(), depth, f"frame {index}")
 
 
 def copied(frame: Frame) -> Frame:
