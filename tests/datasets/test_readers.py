@@ -174,13 +174,6 @@ def test_images_named_by_time(tmp_path: Path, names: tuple[str, ...], times: lis
     assert _numbers(frames) == list(range(len(names)))
 
 
-def test_a_guess_is_marked_and_said(tmp_path: Path) -> None:
-    # Proves that without intrinsics the camera is the guess, marked unknown, with a warning that tells what to do.
-    with warns("--intrinsics"):
-        sequence = open_sequence(tiny.images(tmp_path, calibration=False))
-    assert sequence.camera == Camera.guess(tiny.WIDTH, tiny.HEIGHT)
-
-
 def test_distortion_of_a_calibration(tmp_path: Path) -> None:
     # Proves that coefficients are in OpenCV's order, in `distortion.txt` or after the intrinsics, which go before.
     tiny.images(tmp_path, calibration=False)
@@ -335,10 +328,10 @@ def test_12_bits_in_a_file_of_16_are_not_black(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_is_given_is_not_guessed(tmp_path: Path) -> None:
-    # Proves that the word about a guess is said where there is one, and not where a flag gives the camera.
-    for number in range(2):
-        tiny.write_image(tmp_path / f"{number}.png", tiny.image(number))
-    with pytest.warns(GuessedCameraWarning):
-        assert not open_input(tmp_path, InputOptions()).camera.known
+    # Proves that without intrinsics the camera is the guess, marked unknown, with a warning that tells what to do, and
+    # none where a flag gives the camera.
+    tiny.images(tmp_path, calibration=False)
+    with warns("--intrinsics", warning=GuessedCameraWarning):
+        assert open_input(tmp_path, InputOptions()).camera == Camera.guess(tiny.WIDTH, tiny.HEIGHT)
     sequence = open_input(tmp_path, InputOptions(intrinsics="50,50,31.5,23.5"))  # a warning is an error here
     assert sequence.camera.intrinsics == (50.0, 50.0, 31.5, 23.5)

@@ -86,7 +86,8 @@ def read_image_file(path: Path, min_bits: int = 8) -> ImageFile:
 def image_in(content: bytes, path: Path, min_bits: int = 8) -> ImageFile:
     """Return the image in the content of a file; path: for messages. Otherwise as `read_image_file`."""
     header = image_header(content, path)
-    image = _pixels(content, header, path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = decoded(content, path, flags, header)
     if image.dtype not in (np.uint8, np.uint16) or image.ndim != 3:
         raise InputError(f"`{path}` is {image.dtype} of shape {image.shape}; images must have 8 or 16 bits")
     image, bits = eight_bits(image, min_bits)
@@ -139,23 +140,20 @@ def is_there(path: Path) -> bool:
         return False
 
 
-def decoded(content: bytes, path: Path, flags: int) -> np.ndarray:
+def decoded(content: bytes, path: Path, flags: int, header: ImageHeader | None = None) -> np.ndarray:
     """Return the pixels in the content of an image file, as OpenCV has them (BGR).
 
     Args:
         content: the file.
         path: its name, for messages.
         flags: of `cv2.imdecode`; without effect on a JPEG.
+        header: that of the file, if it has been read.
 
     Raises:
         InputError: the file is damaged, too large, or not an image.
 
     """
-    return _pixels(content, image_header(content, path), path, flags)
-
-
-def _pixels(content: bytes, header: ImageHeader, path: Path, flags: int) -> np.ndarray:
-    if header.format in ("JPEG", "MPO"):
+    if (header or image_header(content, path)).format in ("JPEG", "MPO"):
         try:
             return simplejpeg.decode_jpeg(content, "BGR")
         except ValueError as error:

@@ -109,11 +109,8 @@ def is_readable(place: Path) -> bool:
 def check_there(path: str | os.PathLike[str]) -> None:
     """Raise InputError if the path does not exist or may not be read, before anything is opened."""
     place = path_of("path", path)
-    if not is_live(os.fspath(path)):
-        _check_place(place)
-
-
-def _check_place(place: Path) -> None:
+    if is_live(os.fspath(path)):
+        return
     if not is_there(place):
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
     if not os.access(place, os.R_OK | os.X_OK if place.is_dir() else os.R_OK):
@@ -124,7 +121,7 @@ def _check_place(place: Path) -> None:
 
 
 def _open_place(place: Path, kind: str | None, depth: bool) -> Sequence:
-    _check_place(place)
+    check_there(place)
     if kind == "bag" or (kind is None and is_bag(place)):
         return RosBag.open(place, depth)
     if place.is_file() and (kind == "record3d" or (kind is None and Record3d.matches(place))):

@@ -30,7 +30,7 @@ from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.frame import MAX_DELAY, Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
-from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of
+from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
 from vggtgeo.datasets.pose_files import parsing, poses_of, read_json, read_matrices, read_matrix, trajectory_of
 from vggtgeo.datasets.video import VideoFile
@@ -344,6 +344,4 @@ def _camera(folder: Path, views: list[_View], width: int, height: int) -> Camera
     """Return the median of the intrinsics of all frames; autofocus changes them by a few tenths of a per cent."""
     size = views[0].size or (width, height)
     middle = intrinsics_of(folder, np.median([view.camera for view in views], axis=0))
-    camera = Camera(middle, round(size[0]), round(size[1])).resized(width, height)
-    check_plausible(f"`{folder}`", camera)
-    return camera
+    return Camera(middle, round(size[0]), round(size[1])).resized(width, height)

@@ -126,7 +126,8 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
         raise InputError(f"`to` must be one of {', '.join(FORMATS)}, got {to!r}")
     check_is_run(place)
     output = path_of("target", target) if target is not None else place / EXPORTS / to
-    _check_target(output, place)
+    if whole_path(output) == whole_path(place):
+        raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
     verdict = read_summary(place)[1]
     failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""
     try:
@@ -161,15 +162,6 @@ def _staged(output: Path) -> Iterator[Path]:
         for folder in made:  # innermost first
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
-
-
-def _check_target(output: Path, run: Path) -> None:
-    """Raise InputError if the export would mix with the run's own files or a recording."""
-    if whole_path(output) == whole_path(run):
-        raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
-    for name in ("images", "depth"):
-        if whole_path(output).is_relative_to(whole_path(run / name)):
-            raise InputError(f"`{output}` is in `{run / name}`, which is the run's own; give another for the export")
 
 
 def _record(output: Path, names: list[str], ours: bool) -> None:
