@@ -56,12 +56,12 @@ def of_two_cameras(frames: tuple[str, str] = FRAMES, motion: np.ndarray = MOTION
     }
 
 
-def steps(moving: bool = False) -> Topic:
+def steps() -> Topic:
     """The two cameras on one body, whose frame is turned as a robot's is."""
     body = np.eye(4)
     body[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     body[:3, 3] = 0.1, 0.2, 0.3
-    return transforms(("link", f"/{FRAMES[1]}", body), ("link", FRAMES[0], body @ MOTION), moving=moving)
+    return transforms(("link", f"/{FRAMES[1]}", body), ("link", FRAMES[0], body @ MOTION))
 
 
 def extrinsics() -> Topic:

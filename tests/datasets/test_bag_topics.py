@@ -10,8 +10,7 @@ import pytest
 import tiny_sequences
 from reported import raises
 
-from vggtgeo.datasets.bag_cameras import camera_of
-from vggtgeo.datasets.bag_images import Chosen, chosen_topics, image_of, metres_of
+from vggtgeo.datasets.bag_messages import Chosen, camera_of, chosen_topics, image_of, metres_of
 
 PLACE = Path("a.bag, /c, 0")
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tiny_bags as bags
 import tiny_layouts as tiny
 import tiny_sequences
 from distorted_sequence import Bent
@@ -95,9 +96,12 @@ def test_what_files_call_a_fisheye_is_one(tmp_path: Path, write: Callable[[Path]
 def test_a_bag_of_a_fisheye(tmp_path: Path) -> None:
     # Proves the same of a `CameraInfo`, and that a lens of neither kind is an error that names it.
     pytest.importorskip("rosbags", reason="rosbags is not installed")
-    assert open_sequence(tiny.bag(tmp_path / "a.bag", ros2=False, lens="equidistant")).camera.fisheye
-    with raises("b.bag", ": "):
-        open_sequence(tiny.bag(tmp_path / "b.bag", ros2=False, lens="ftheta"))
+    paths = {lens: tmp_path / f"{lens}.bag" for lens in ("equidistant", "ftheta")}
+    for lens, path in paths.items():
+        bags.write(path, c_image=bags.image(), c_info=bags.info(lens=lens, distortion=COEFFICIENTS))
+    assert open_sequence(paths["equidistant"]).camera.fisheye
+    with raises("ftheta.bag", ": "):
+        open_sequence(paths["ftheta"])
 
 
 @pytest.mark.slow  # a minute: a run, its last adjustment

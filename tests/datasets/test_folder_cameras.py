@@ -13,17 +13,6 @@ from vggtgeo.datasets import open_sequence
 from vggtgeo.geometry.camera import Camera
 
 
-def test_a_renamed_folder_of_tum_says_in_its_list_what_it_is(tmp_path: Path) -> None:
-    # Proves that the published camera is found by the head of `rgb.txt`. Oracle: the published numbers.
-    for number in range(2):
-        tiny_sequences.write_image(tmp_path / f"rgb/{number}.png", tiny_sequences.image(number, 640, 480))
-    head = "# color images\n# file: 'rgbd_dataset_freiburg1_desk.bag'\n# timestamp filename\n"
-    (tmp_path / "rgb.txt").write_text(head + "1.0 rgb/0.png\n1.1 rgb/1.png\n")
-    camera = open_sequence(tmp_path).camera
-    assert camera.intrinsics == (517.3, 516.5, 318.6, 255.3)
-    assert camera.known
-
-
 def test_the_camera_of_an_export_of_record3d(tmp_path: Path) -> None:
     # Proves the matrix by columns of images of this size, and that another program's `metadata.json` is left alone.
     folder = tiny.rgbd(tmp_path / "phone")

@@ -182,24 +182,6 @@ def test_a_truth_in_a_unit_of_its_own_is_told(tmp_path: Path) -> None:
             assert not open_source(sequence, None, SlamSettings()).truth_in_metres
 
 
-@pytest.mark.parametrize("lists", ["rgb.txt depth.txt associated.txt", "rgb.txt depth.txt", "associated.txt"])
-def test_eth3d_slam(tmp_path: Path, lists: str) -> None:
-    # Proves that ETH3D's SLAM benchmark is read as it is downloaded: the folder's camera, 5000 per metre, times, truth
-    # at times of its own; with `associated.txt` alone, too. Oracle: what was written.
-    folder = tiny.eth3d(tmp_path / "cables_1")
-    for name in {"rgb.txt", "depth.txt", "associated.txt"} - set(lists.split()):
-        (folder / name).unlink()
-    sequence = open_sequence(folder)
-    frames = checked(sequence, "TumRgbd")
-    assert [frame.timestamp for frame in frames] == pytest.approx([3894.207, 3894.2439, 3894.2808])
-    assert [frame.depth[3, 7] for frame in frames] == pytest.approx([1007 / 5000, 1017 / 5000, 1027 / 5000])
-    assert sequence.camera.known
-    assert sequence.camera.distortion == ()
-    truth = sequence.ground_truth()
-    np.testing.assert_allclose(truth.timestamps[[0, -1]], [3894.22, 3894.26])
-    assert truth.positions[:, 0].tolist() == [0, 1, 2, 3, 4]
-
-
 def test_kitti(tmp_path: Path) -> None:
     # Proves the rectified camera, times, and that the grey camera's poses are moved to the colour camera. Oracle: 6 cm.
     sequence = tiny.quietly_opened(tiny.kitti(tmp_path / "dataset"))
@@ -268,18 +250,10 @@ def test_kitti_raw(tmp_path: Path) -> None:
     assert raw.distortion == pytest.approx((-0.369, 0.197, 0.001, 0.0006, -0.07))
 
 
-def test_bonn_has_its_published_camera(tmp_path: Path) -> None:
-    # Proves that the Bonn benchmark, which has the layout of TUM RGB-D, gets its own camera.
-    sequence = open_sequence(tiny.bonn(tmp_path / "rgbd_bonn_balloon"))
-    assert type(sequence).__name__ == "TumRgbd"
-    assert sequence.camera.intrinsics[0] == 542.822841
-    assert len(sequence.camera.distortion) == 4
-
-
 def test_seven_scenes_as_published_is_registered(tmp_path: Path) -> None:
-    # Proves that depth and poses of the depth camera are moved to the colour camera where the folder has no intrinsics
-    # or those of the depth camera,
-    # and nowhere else. Oracle: the world point of a pixel of depth, seen by either camera.
+    # Proves the published camera, and that depth and poses of the depth camera are moved to it where the folder has no
+    # intrinsics or those of the depth camera, and nowhere else. Oracle: the world point of a pixel of depth, seen by
+    # either camera.
     depth = np.full((480, 640), 65535, np.uint16)
     depth[200:260, 300:360] = 1500
     for number in range(2):
@@ -289,6 +263,7 @@ def test_seven_scenes_as_published_is_registered(tmp_path: Path) -> None:
         np.savetxt(stem.with_suffix(".pose.txt"), tiny_sequences.pose(number))
     with warns("seq-01"):
         sequence = open_sequence(tmp_path / "seq-01")
+    assert sequence.camera == Camera((525.0, 525.0, 320.0, 240.0), 640, 480)
     frame = list(sequence.frames())[1]
     point = np.array([(330 - 320) / 585 * 1.5, (230 - 240) / 585 * 1.5, 1.5])
     world = point + [1.0, 0, 0]

@@ -5,13 +5,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tiny_bags as bags
 import tiny_layouts as tiny
 import tiny_sequences
 from layout_checks import CAMERA, checked
 from reported import raises, warns
 
 from vggtgeo.datasets import open_sequence
-from vggtgeo.datasets.live import LiveCamera, is_live
+from vggtgeo.datasets.video import LiveCamera, is_live
 from vggtgeo.results.source import Source
 
 
@@ -20,12 +21,19 @@ def test_bags_of_ros(tmp_path: Path, ros2: bool) -> None:
     # Proves images, depth paired by time, camera with its distortion, and truth, of both generations of ROS. Oracle:
     # what was written.
     pytest.importorskip("rosbags", reason="rosbags is not installed")
-    sequence = open_sequence(tiny.bag(tmp_path / ("bag" if ros2 else "a.bag"), ros2))
-    frames = checked(sequence, "RosBag")
+    lens = (0.1, -0.02, 0.0, 0.0, 0.0)
+    topics = {
+        "camera_color_image__raw": bags.image(),
+        "camera_color_camera__info": bags.info(distortion=lens),
+        "camera_aligned__depth_image__raw": bags.image(tiny_sequences.depth_codes, "16UC1", later=0.005),
+        "mocap_pose": (bags.POSE, lambda n: {"time": bags.stamp(n), "place": (float(n), 0, 0), "turn": (0, 0, 0, 1)}),
+    }
+    sequence = open_sequence(bags.write(tmp_path / ("bag" if ros2 else "a.bag"), ros2, **topics))
+    frames = checked(sequence, "RosBag", (50.0, 50.0, 20.0, 15.0))
     np.testing.assert_array_equal(frames[2].image, tiny_sequences.image(2))
     assert frames[1].depth[3, 7] == pytest.approx(1.017)
     assert np.isnan(frames[0].depth[0, 0])
-    assert sequence.camera.distortion == (0.1, -0.02, 0.0, 0.0, 0.0)
+    assert sequence.camera.distortion == lens
     assert sequence.ground_truth().positions[:, 0].tolist() == [0, 1, 2]
     assert [frame.timestamp for frame in frames] == pytest.approx([50.0, 50.1, 50.2])
 

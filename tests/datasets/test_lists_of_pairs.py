@@ -1,4 +1,4 @@
-"""Lists of pairs of images and depth, as ORB-SLAM2 takes them."""
+"""Lists of pairs of images and depth, as ORB-SLAM2 takes them and ETH3D SLAM has them."""
 
 from pathlib import Path
 
@@ -8,39 +8,35 @@ import tiny_sequences
 from reported import warns
 
 from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets.tum import TumRgbd
 
 COUNT = 12
 
 
-def _folder(folder: Path, times: list[float], name: str = "rgb/rgb{:05d}.png") -> Path:
-    lines = [f"{time:.6f} {name.format(number)}" for number, time in enumerate(times)]
-    for number in range(COUNT):
-        tiny_sequences.write_image(folder / name.format(number), tiny_sequences.image(number))
-        tiny_sequences.write_image(folder / f"depth/depth{number:05d}.png", tiny_sequences.depth_codes(number))
-    (folder / "rgb.txt").write_text("# timestamp filename\n" + "\n".join(lines) + "\n")
-    (folder / "depth.txt").write_text("\n".join(lines).replace("rgb", "depth") + "\n")
+def _pairs(folder: Path, times: list[str], name: str = "associations.txt") -> Path:
+    lines = []
+    for number, time in enumerate(times):
+        names = f"rgb/rgb{number:05d}.png", f"depth/depth{number:05d}.png"
+        tiny_sequences.write_image(folder / names[0], tiny_sequences.image(number))
+        tiny_sequences.write_image(folder / names[1], tiny_sequences.depth_codes(number))
+        lines.append(f"{time} {names[0]} {time} {names[1]}\n")
+    (folder / name).write_text("".join(lines))
     tiny_sequences.write_calibration(folder, tiny_sequences.INTRINSICS)
     return folder
 
 
-def _pairs(folder: Path, times: list[str], name: str = "associations.txt") -> Path:
-    """A recording with one list of pairs in the place of two lists."""
-    _folder(folder, [float(time) for time in times])
-    for other in ("rgb.txt", "depth.txt"):
-        (folder / other).unlink()
-    lines = [f"{t} rgb/rgb{n:05d}.png {t} depth/depth{n:05d}.png" for n, t in enumerate(times)]
-    (folder / name).write_text("\n".join(lines) + "\n")
-    return folder
-
-
-@pytest.mark.parametrize("name", ["associations.txt", "association.txt", "associate.txt"])
+@pytest.mark.parametrize("name", ["associations.txt", "association.txt", "associate.txt", "associated.txt"])
 def test_a_list_of_pairs_with_times_is_nobody_elses_benchmark(tmp_path: Path, name: str) -> None:
-    # Proves that a recording for ORB-SLAM2 keeps its own camera and times. Oracle: what was written; it was taken for
-    # ICL-NUIM, with the camera of that.
+    # Proves that a recording for ORB-SLAM2 keeps its own camera and times (it was taken for ICL-NUIM), and that the
+    # unit is told, but for ETH3D's `associated.txt`. Oracle: what was written.
     times = [f"{1305031102 + 0.04 * number:.6f}" for number in range(COUNT)]
-    with warns("1", "5000", name):
-        sequence = open_sequence(_pairs(tmp_path / "own", times, name))
-    assert type(sequence).__name__ == "TumRgbd"
+    folder = _pairs(tmp_path / "own", times, name)
+    if name == "associated.txt":
+        sequence = open_sequence(folder)
+    else:
+        with warns("1", "5000", name):
+            sequence = open_sequence(folder)
+    assert isinstance(sequence, TumRgbd)
     np.testing.assert_allclose(sequence.camera.intrinsics, tiny_sequences.INTRINSICS)
     frames = list(sequence.frames())
     np.testing.assert_allclose([frame.timestamp for frame in frames], np.float64(times), rtol=0, atol=1e-6)
@@ -53,7 +49,7 @@ def test_a_list_of_pairs_that_counts_frames_has_thirty_a_second_and_millimetres(
     folder = _pairs(tmp_path / "own", [str(number) for number in range(1, COUNT + 1)])
     with warns("associations.txt", "30"):
         sequence = open_sequence(folder)
-    assert type(sequence).__name__ == "TumRgbd"
+    assert isinstance(sequence, TumRgbd)
     frames = list(sequence.frames())
     np.testing.assert_allclose(np.diff([frame.timestamp for frame in frames]), 1 / 30)
     assert frames[1].depth[3, 7] == pytest.approx(1.017)

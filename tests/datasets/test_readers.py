@@ -1,13 +1,15 @@
 """The readers, on tiny folders whose pixels tell which frame and pixel they are."""
 
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import bad_files as bad
 import cv2
 import numpy as np
-import picture_bytes as bytes_of
 import pytest
 import tiny_sequences as tiny
+from PIL import ExifTags, Image
 from reported import raises, warns
 from tiny_layouts import matroska
 
@@ -79,14 +81,6 @@ def test_seven_scenes_finds_the_sequence_in_a_scene(tmp_path: Path) -> None:
         assert open_sequence(tmp_path).name == "seq-01"
 
 
-def test_seven_scenes_without_intrinsics_takes_the_published_ones(tmp_path: Path) -> None:
-    # Proves the published camera for the published size, and a word about depth and poses.
-    tiny.write_image(tmp_path / "frame-000000.color.png", tiny.image(0, 640, 480))
-    with warns(tmp_path.name, 525.0):
-        camera = open_sequence(tmp_path).camera
-    assert camera == Camera((525.0, 525.0, 320.0, 240.0), 640, 480)
-
-
 def test_tum(tmp_path: Path) -> None:
     # Proves pairing, times, depth / 5000 (0 alone is none), calibration and truth. Oracle: what was written.
     sequence = open_sequence(tiny.tum(tmp_path))
@@ -131,19 +125,21 @@ def _with_depth(sequence: Sequence) -> list[Frame]:
         ("rgbd_dataset_freiburg1_desk", 517.3, 5),
         ("rgbd_dataset_freiburg2_xyz", 520.9, 5),
         ("rgbd_dataset_freiburg3_long_office_household", 535.4, 0),
-        ("fr1_xyz", 517.3, 5),
+        ("rgbd_fr1_xyz", 517.3, 5),
+        ("rgbd_bonn_balloon", 542.822841, 4),
     ],
 )
 def test_tum_published_cameras(tmp_path: Path, name: str, focal: float, distortion: int) -> None:
-    # Proves that the folder's name gives the published camera with its distortion, and that a file in it wins.
-    folder = tmp_path / name
-    tiny.write_image(folder / "1.0.png", tiny.image(0, 640, 480))
-    (folder / "rgb.txt").write_text("1.0 1.0.png\n")
-    sequence = open_sequence(folder)
-    assert sequence.camera.intrinsics[0] == focal
-    assert len(sequence.camera.distortion) == distortion
-    assert sequence.camera.known
-    assert not sequence.has_depth
+    # Proves that the name of the folder, or of its recording in the head of its list, gives the published camera with
+    # its distortion, and that a file in it wins.
+    for folder, head in ((tmp_path / "renamed", f"# file: '{name}.bag'\n"), (tmp_path / name, "")):
+        tiny.write_image(folder / "1.0.png", tiny.image(0, 640, 480))
+        (folder / "rgb.txt").write_text(f"# color images\n{head}1.0 1.0.png\n")
+        sequence = open_sequence(folder)
+        assert sequence.camera.intrinsics[0] == focal
+        assert len(sequence.camera.distortion) == distortion
+        assert sequence.camera.known
+        assert not sequence.has_depth
     tiny.write_calibration(folder, (500.0, 500.0, 320.0, 240.0))
     assert open_sequence(folder).camera == Camera((500.0, 500.0, 320.0, 240.0), 640, 480)
 
@@ -178,28 +174,14 @@ def test_images_named_by_time(tmp_path: Path, names: tuple[str, ...], times: lis
     assert _numbers(frames) == list(range(len(names)))
 
 
-def test_a_guess_is_marked_and_said(tmp_path: Path) -> None:
-    # Proves that without intrinsics the camera is the guess, marked unknown, with a warning that tells what to do.
-    with warns("--intrinsics"):
-        sequence = open_sequence(tiny.images(tmp_path, calibration=False))
-    assert sequence.camera == Camera.guess(tiny.WIDTH, tiny.HEIGHT)
-
-
-def test_calibration_with_distortion(tmp_path: Path) -> None:
-    # Proves that the four coefficients after the intrinsics arrive in OpenCV's order. Oracle: the file.
-    tiny.images(tmp_path, calibration=False)
-    tiny.write_calibration(tmp_path, (*tiny.INTRINSICS, 0.1, -0.2, 0.003, -0.004))
-    assert open_sequence(tmp_path).camera.distortion == (0.1, -0.2, 0.003, -0.004)
-
-
-def test_distortion_in_a_file_beside_the_calibration(tmp_path: Path) -> None:
-    # Proves that `distortion.txt` completes a calibration that has no coefficients of its own. Oracle: the files.
+def test_distortion_of_a_calibration(tmp_path: Path) -> None:
+    # Proves that coefficients are in OpenCV's order, in `distortion.txt` or after the intrinsics, which go before.
     tiny.images(tmp_path, calibration=False)
     tiny.write_calibration(tmp_path, tiny.INTRINSICS)
     (tmp_path / "distortion.txt").write_text("0.1 -0.2 0.003 -0.004\n")
     assert open_sequence(tmp_path).camera.distortion == (0.1, -0.2, 0.003, -0.004)
-    tiny.write_calibration(tmp_path, (*tiny.INTRINSICS, 0.05, 0.0, 0.0, 0.0))
-    assert open_sequence(tmp_path).camera.distortion == (0.05, 0.0, 0.0, 0.0)
+    tiny.write_calibration(tmp_path, (*tiny.INTRINSICS, 0.05, 0.0, 0.001, 0.0))
+    assert open_sequence(tmp_path).camera.distortion == (0.05, 0.0, 0.001, 0.0)
 
 
 def test_video(tmp_path: Path) -> None:
@@ -221,31 +203,24 @@ def test_video(tmp_path: Path) -> None:
 
 def test_video_colours_are_rgb(tmp_path: Path) -> None:
     # Proves the order of channels. Oracle: a red video.
-    red = np.zeros((tiny.HEIGHT, tiny.WIDTH, 3), np.uint8)
-    red[..., 0] = 200
-    writer = cv2.VideoWriter(str(tmp_path / "red.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, red.shape[1::-1])
-    for _ in range(3):
-        writer.write(np.ascontiguousarray(red[..., ::-1]))
-    writer.release()
     tiny.write_calibration(tmp_path, tiny.INTRINSICS)
-    frame = next(iter(open_sequence(tmp_path / "red.avi").frames()))
+    frame = next(iter(open_sequence(_video(tmp_path / "red.avi", [(0, 0, 200)] * 3)).frames()))
     assert frame.image[..., 0].mean() > 150
     assert frame.image[..., 2].mean() < 50
 
 
-@pytest.mark.parametrize(
-    ("shown", "across"), [(None, 64), ((64, 48), 64), ((96, 48), 96), ((48, 48), 48), ((9000, 1), 64)]
-)
-def test_the_guess_of_a_video_has_its_pixels(tmp_path: Path, shown: tuple[int, int] | None, across: int) -> None:
+@pytest.mark.parametrize(("aspect", "across"), [(1, 64), (Fraction(3, 2), 96), (Fraction(3, 4), 48), (9000, 64)])
+def test_the_guess_of_a_video_has_its_pixels(tmp_path: Path, aspect: Fraction, across: int) -> None:
     # Proves that pixels which the container says to be wider than high make a guess of two focal lengths, and that an
     # impossible word on them counts as none. Oracle: the guess of the picture as a player shows it, `across` wide.
     with pytest.warns(GuessedCameraWarning):
-        camera = open_sequence(matroska(tmp_path / "clip.mkv", (0, 100, 200), shown)).camera
+        camera = open_sequence(matroska(tmp_path / "clip.mkv", (0, 100, 200), Fraction(aspect))).camera
     assert not camera.known
     assert camera.intrinsics == pytest.approx(Camera.guess(across, 48).resized(64, 48).intrinsics, rel=1e-6)
 
 
-def _video(path: Path, levels: list[int]) -> Path:
+def _video(path: Path, levels: list[Any]) -> Path:
+    """A video of images of one grey level, or one colour (BGR)."""
     size = (tiny.WIDTH, tiny.HEIGHT)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size)
     assert writer.isOpened()
@@ -329,36 +304,34 @@ def test_a_given_rate_makes_the_times(tmp_path: Path) -> None:
         with_rate(images, -1.0)
 
 
-def test_images_are_used_as_they_are_stored(tmp_path: Path) -> None:
-    # Proves that an EXIF orientation turns no image, and that 12-bit values in a 16-bit file are not black. Oracle: the
-    # pixels that were written.
-    (tmp_path / "turned.jpg").write_bytes(bad.turned_jpeg())
-    (tmp_path / "plain.jpg").write_bytes(bad.encoded(".jpg"))
-    turned, plain = (read_image_file(tmp_path / f"{name}.jpg") for name in ("turned", "plain"))
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_an_exif_orientation_is_not_applied(tmp_path: Path, suffix: str) -> None:
+    # Proves that an EXIF orientation is known and turns no image. Oracle: the same image without it.
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    for name, options in (("turned", {"exif": exif}), ("plain", {})):
+        Image.fromarray(bad.picture(1)).save(tmp_path / f"{name}{suffix}", **options)
+    turned, plain = (read_image_file(tmp_path / f"{name}{suffix}") for name in ("turned", "plain"))
     assert (turned.orientation, plain.orientation) == (6, 1)
     np.testing.assert_array_equal(turned.image, plain.image)
-    size = (bad.WIDTH, bad.HEIGHT)
-    turns = {".png": bytes_of.turned_png, ".webp": lambda whole: bytes_of.turned_webp(whole, size)}
-    for suffix, turn in turns.items():
-        (tmp_path / f"turned{suffix}").write_bytes(turn(bad.encoded(suffix)))
-        (tmp_path / f"plain{suffix}").write_bytes(bad.encoded(suffix))
-        turned, plain = (read_image_file(tmp_path / f"{name}{suffix}") for name in ("turned", "plain"))
-        assert (turned.orientation, plain.orientation) == (6, 1)
-        np.testing.assert_array_equal(turned.image, plain.image)
+
+
+def test_12_bits_in_a_file_of_16_are_not_black(tmp_path: Path) -> None:
+    # Proves the scale of such values, alone and beside images that use all 16 bits. Oracle: the pixels written.
     picture = bad.picture(1)
     picture[0, 0] = 255
     (tmp_path / "twelve.png").write_bytes(bad.encoded(".png", picture[..., ::-1].astype(np.uint16) << 4))
     twelve = read_image_file(tmp_path / "twelve.png")
     assert twelve.bits == 12
     np.testing.assert_array_equal(twelve.image, picture)
-    assert read_image_file(tmp_path / "twelve.png", 16).image.max() == 15  # beside images that use all 16 bits
+    assert read_image_file(tmp_path / "twelve.png", 16).image.max() == 15
 
 
 def test_a_camera_that_is_given_is_not_guessed(tmp_path: Path) -> None:
-    # Proves that the word about a guess is said where there is one, and not where a flag gives the camera.
-    for number in range(2):
-        tiny.write_image(tmp_path / f"{number}.png", tiny.image(number))
-    with pytest.warns(GuessedCameraWarning):
-        assert not open_input(tmp_path, InputOptions()).camera.known
+    # Proves that without intrinsics the camera is the guess, marked unknown, with a warning that tells what to do, and
+    # none where a flag gives the camera.
+    tiny.images(tmp_path, calibration=False)
+    with warns("--intrinsics", warning=GuessedCameraWarning):
+        assert open_input(tmp_path, InputOptions()).camera == Camera.guess(tiny.WIDTH, tiny.HEIGHT)
     sequence = open_input(tmp_path, InputOptions(intrinsics="50,50,31.5,23.5"))  # a warning is an error here
     assert sequence.camera.intrinsics == (50.0, 50.0, 31.5, 23.5)

@@ -14,7 +14,7 @@ import pytest
 from reported import warns
 
 from vggtgeo.datasets import open_sequence, with_rate, without_depth
-from vggtgeo.datasets.video_stream import Track, choose_tracks
+from vggtgeo.datasets.video import Track, choose_tracks
 from vggtgeo.io.errors import GuessedCameraWarning, NoteWarning
 
 COUNT, RATE = 6, 10

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import tiny_sequences as tiny
-from picture_bytes import TURN
 from problem_files import SCENE, arrays_of
 
 WIDTH, HEIGHT = 64, 48
@@ -48,13 +46,6 @@ def with_image(content: Callable[[], bytes], suffix: str = ".png") -> Callable[[
 def encoded(suffix: str, image: np.ndarray | None = None, *options: int) -> bytes:
     """A whole file of an image."""
     return cv2.imencode(suffix, picture(1) if image is None else image, list(options))[1].tobytes()
-
-
-def turned_jpeg() -> bytes:
-    """A JPEG that asks to be turned by 90 degrees."""
-    part = b"Exif\0\0" + TURN
-    whole = encoded(".jpg")
-    return whole[:2] + b"\xff\xe1" + struct.pack(">H", len(part) + 2) + part + whole[2:]
 
 
 def rgbd(change: Callable[[Path], Any]) -> Callable[[Path], Path]:

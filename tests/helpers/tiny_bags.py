@@ -10,8 +10,9 @@ import numpy as np
 import tiny_layouts as tiny
 from scipy.spatial.transform import Rotation
 
-IMAGE, COMPRESSED, INFO, POSE, TRANSFORM, EXTRINSICS = (
-    *(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo")),
+IMAGE, INFO, POSE, TRANSFORM, EXTRINSICS = (
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CameraInfo",
     "geometry_msgs/msg/PoseStamped",
     "tf2_msgs/msg/TFMessage",
     "realsense2_camera/msg/Extrinsics",
@@ -22,11 +23,10 @@ _OTHERS = {
 }
 """Types that the package has not for ROS 1: their definitions."""
 SIZE = tiny.WIDTH, tiny.HEIGHT
-COUNT = 4
 MATRIX = (50, 0, 20, 0, 50, 15, 0, 0, 1)
 Fields = Mapping[str, Any]
-Topic = tuple[str, Callable[[int], Fields | bytes | None]]
-"""Type of its messages, and what of each number is in the message: fields, or its bytes; None for no message."""
+Topic = tuple[str, Callable[[int], Fields]]
+"""Type of its messages, and the fields of the message of each number."""
 
 
 def stamp(number: int, later: float = 0.0) -> float:
@@ -34,34 +34,30 @@ def stamp(number: int, later: float = 0.0) -> float:
     return 50.0 + 0.1 * number + later
 
 
-def write(path: Path, **topics: Topic) -> Path:
-    """A bag of these topics, `_` in their names for `/`, `__` for `_`."""
-    from rosbags.rosbag1 import Writer
+def write(path: Path, ros2: bool = False, **topics: Topic) -> Path:
+    """A bag of these topics, `_` in their names for `/`, `__` for `_`; of ROS 1 unless `ros2`."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    store = get_typestore(Stores.ROS1_NOETIC)
-    for other, definition in _OTHERS.items():
+    store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
+    for other, definition in ({} if ros2 else _OTHERS).items():
         store.register(get_types_from_msg(definition, other))
-    with Writer(path) as writer:
+    serialize = store.serialize_cdr if ros2 else store.serialize_ros1
+    with Writer2(path, version=9) if ros2 else Writer1(path) as writer:
         for name, (kind, content) in topics.items():
             place = "/" + name.replace("__", " ").replace("_", "/").replace(" ", "_")
             connection = writer.add_connection(place, kind, typestore=store)
-            for number in range(COUNT):
-                fields = content(number)
-                if fields is not None:
-                    raw = (
-                        fields if isinstance(fields, bytes) else store.serialize_ros1(_made(store, kind, fields), kind)
-                    )
-                    writer.write(connection, int(1e9 * stamp(number)), raw)
+            for number in range(tiny.COUNT):
+                message = _made(store.types, kind, content(number), () if ros2 else (0,))
+                writer.write(connection, int(1e9 * stamp(number)), serialize(message, kind))
     return path
 
 
-def _made(store: Any, kind: str, fields: Fields) -> Any:
-    kinds = store.types
-    seconds = fields["time"]
-    parts = (int(seconds), round(seconds % 1 * 1e9)) if isinstance(seconds, float) else seconds
-    time = kinds["builtin_interfaces/msg/Time"](*parts)
-    header = kinds["std_msgs/msg/Header"](0, time, fields.get("frame", "c"))
+def _made(kinds: Any, kind: str, fields: Fields, head: tuple[int, ...]) -> Any:
+    """head: what comes before time and frame in a header."""
+    time = kinds["builtin_interfaces/msg/Time"](int(fields["time"]), round(fields["time"] % 1 * 1e9))
+    header = kinds["std_msgs/msg/Header"](*head, time, fields.get("frame", "c"))
     rest = [value for name, value in fields.items() if name not in ("time", "frame")]
     if kind == TRANSFORM:
         return kinds[kind]([_transform(kinds, time, *one) for one in fields["transforms"]])
@@ -70,7 +66,7 @@ def _made(store: Any, kind: str, fields: Fields) -> Any:
         parts = kinds["geometry_msgs/msg/Point"](*place), kinds["geometry_msgs/msg/Quaternion"](*turn)
         rest = [kinds["geometry_msgs/msg/Pose"](*parts)]
     if kind == INFO:
-        rest.append(kinds["sensor_msgs/msg/RegionOfInterest"](*rest.pop(), False))
+        rest.append(kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False))
     return kinds[kind](header, *rest)
 
 
@@ -83,21 +79,15 @@ def _transform(kinds: Any, time: Any, parent: str, child: str, motion: np.ndarra
     return kinds["geometry_msgs/msg/TransformStamped"](header, child, transform)
 
 
-def transforms(*steps: tuple[str, str, np.ndarray], moving: bool = False) -> Topic:
-    """tf: parent, child, and child -> parent, [4, 4]. moving: each message has the child 1 cm further."""
-
-    def fields(number: int) -> Fields:
-        along = np.eye(4)
-        along[0, 3] = 0.01 * number * moving
-        return {"time": stamp(number), "transforms": [(one, other, along @ motion) for one, other, motion in steps]}
-
-    return TRANSFORM, fields
+def transforms(*steps: tuple[str, str, np.ndarray]) -> Topic:
+    """tf: parent, child, and child -> parent, [4, 4]."""
+    return TRANSFORM, lambda number: {"time": stamp(number), "transforms": steps}
 
 
 def of_frame(topic: Topic, frame: str) -> Topic:
     """The same topic, whose messages state this frame."""
     kind, fields = topic
-    return kind, lambda number: {**fields(number), "frame": frame}  # type: ignore[dict-item]
+    return kind, lambda number: {**fields(number), "frame": frame}
 
 
 def image(pixels: Callable[[int], np.ndarray] = tiny.image, encoding: str = "rgb8", **other: Any) -> Topic:
@@ -118,11 +108,9 @@ def info(
     matrix: Callable[[int], Any] = lambda number: MATRIX,
     distortion: tuple[float, ...] = (0.0,) * 5,
     lens: str = "plumb_bob",
-    binning: int = 0,
-    region: tuple[int, int, int, int] = (0, 0, 0, 0),
     projection: tuple[float, ...] = (0.0,) * 12,
 ) -> Topic:
-    """The camera. region: x, y, height, width."""
+    """The camera."""
     fields = lambda number: {
         "time": stamp(number),
         "height": size[1],
@@ -132,8 +120,7 @@ def info(
         "k": np.array(matrix(number), float),
         "r": np.eye(3).ravel(),
         "p": np.array(projection, float),
-        "binning_x": binning,
-        "binning_y": binning,
-        "region": region,
+        "binning_x": 0,
+        "binning_y": 0,
     }
     return INFO, fields

@@ -5,12 +5,14 @@ import shutil
 import warnings
 import zipfile
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tiny_sequences import HEIGHT, INTRINSICS, WIDTH, depth_codes, image, pose, tum_line, write_image
+from tiny_sequences import HEIGHT, INTRINSICS, WIDTH, depth_codes, image, pose, write_image
 
 from vggtgeo import datasets
 from vggtgeo.io.errors import InputWarning
@@ -179,26 +181,6 @@ def tanks(folder: Path, poses: Sequence[np.ndarray] = POSES) -> Path:
     corners = [[0, 0, 0], [2, 0, 0], [2, 0, 2], [1, 0, 1], [0, 0, 2]]
     crop = {"orthogonal_axis": "Y", "axis_min": -1.0, "axis_max": 1.0, "bounding_polygon": corners}
     (folder / f"{folder.name}.json").write_text(json.dumps(crop))
-    return folder
-
-
-def eth3d(folder: Path) -> Path:
-    """A training sequence of ETH3D SLAM, its mono and its RGB-D archive unpacked over each other: colour and depth of
-    one time, 5000 per metre; truth of 100 poses a second that begins later than the images.
-    """
-    rgb, depth, both = [], [], []
-    for number in range(COUNT):
-        time = f"{3894.207 + 0.0369 * number:.6f}"
-        write_image(folder / f"rgb/{time}.png", image(number))
-        write_image(folder / f"depth/{time}.png", depth_codes(number))
-        rgb.append(f"{time} rgb/{time}.png\n")
-        depth.append(f"{time} depth/{time}.png\n")
-        both.append(f"{time} rgb/{time}.png {time} depth/{time}.png\n")
-    for name, lines in (("rgb", rgb), ("depth", depth), ("associated", both)):
-        (folder / f"{name}.txt").write_text("".join(lines))
-    (folder / "calibration.txt").write_text(" ".join(map(str, INTRINSICS)))
-    truth = [tum_line(3894.22 + 0.01 * number, number) for number in range(5)]
-    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(truth))
     return folder
 
 
@@ -378,104 +360,22 @@ def _small_depth(depth: Path, confidence: Path, number: int, high: int) -> None:
     write_image(confidence, trust)
 
 
-def bonn(folder: Path) -> Path:
-    """One image in the layout of TUM RGB-D, of the size that the published camera has."""
-    for name in ("rgb", "depth"):
-        pixels = image(0, 640, 480) if name == "rgb" else depth_codes(0, 640, 480)
-        write_image(folder / name / "1.0.png", pixels)
-        (folder / f"{name}.txt").write_text(f"1.0 {name}/1.0.png\n")
-    (folder / "groundtruth.txt").write_text(tum_line(1.0, 0))
-    return folder
-
-
-def bag(path: Path, ros2: bool, calibrated: bool = True, lens: str = "plumb_bob", more: Sequence[str] = ()) -> Path:
-    """Images 0.1 s apart, depth in millimetres 5 ms later, the camera, and the truth of a marker. more: topics of depth
-    that is not registered.
-    """
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
-    kinds = store.types
-    writer = Writer2(path, version=9) if ros2 else Writer1(path)
-    header = lambda time: _header(kinds, time, ros2)
-    with writer:
-        topics = {
-            "/camera/color/image_raw": "sensor_msgs/msg/Image",
-            "/camera/color/camera_info": "sensor_msgs/msg/CameraInfo",
-            "/camera/aligned_depth/image_raw": "sensor_msgs/msg/Image",
-            "/mocap/pose": "geometry_msgs/msg/PoseStamped",
-            **dict.fromkeys(more, "sensor_msgs/msg/Image"),
-        }
-        connections = {name: writer.add_connection(name, kind, typestore=store) for name, kind in topics.items()}
-
-        def write(topic: str, time: float, message: object) -> None:
-            kind = topics[topic]
-            raw = store.serialize_cdr(message, kind) if ros2 else store.serialize_ros1(message, kind)
-            writer.write(connections[topic], int(time * 1e9), raw)
-
-        for number in range(COUNT):
-            time = 50.0 + 0.1 * number
-            for topic, later, encoding, pixels in (
-                ("/camera/color/image_raw", 0.0, "rgb8", image(number)),
-                ("/camera/aligned_depth/image_raw", 0.005, "16UC1", depth_codes(number)),
-                *((topic, 0.005, "16UC1", depth_codes(number)[::-1]) for topic in more),
-            ):
-                data = np.frombuffer(pixels.tobytes(), np.uint8)
-                step = len(data) // HEIGHT
-                image_kind = kinds["sensor_msgs/msg/Image"]
-                write(topic, time + later, image_kind(header(time + later), HEIGHT, WIDTH, encoding, 0, step, data))
-            write("/camera/color/camera_info", time, _camera_info(kinds, header(time), (calibrated, lens)))
-            place = kinds["geometry_msgs/msg/Point"](float(number), 0.0, 0.0)
-            turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-            value = kinds["geometry_msgs/msg/Pose"](place, turn)
-            write("/mocap/pose", time, kinds["geometry_msgs/msg/PoseStamped"](header(time), value))
-    return path
-
-
-def _header(kinds: dict, time: float, ros2: bool) -> object:
-    stamp = kinds["builtin_interfaces/msg/Time"](int(time), round((time % 1) * 1e9))
-    return kinds["std_msgs/msg/Header"](stamp, "c") if ros2 else kinds["std_msgs/msg/Header"](0, stamp, "c")
-
-
-def _camera_info(kinds: dict, header: object, camera: tuple[bool, str]) -> object:
-    fx, fy, cx, cy = INTRINSICS
-    calibrated, lens = camera
-    matrix = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]) * calibrated
-    region = kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    distortion = np.array([0.1, -0.02, 0.0, 0.0, 0.0])[: 5 if lens == "plumb_bob" else 4]
-    values = (distortion, matrix, np.eye(3).ravel(), np.zeros(12))
-    return kinds["sensor_msgs/msg/CameraInfo"](header, HEIGHT, WIDTH, lens, *values, 0, 0, region)
-
-
-def matroska(path: Path, milliseconds: tuple[int, ...], shown: tuple[int, int] | None = None) -> Path:
+def matroska(path: Path, milliseconds: tuple[int, ...], aspect: Fraction = Fraction(1)) -> Path:
     """A video of 64 x 48 pixels with frames at just these times, as phones record them: brightness tells the number.
 
-    shown: width and height that players are to draw it with. Written by hand (Matroska with Motion JPEG), as OpenCV's
-    writer knows one rate only.
+    aspect: width of a pixel over its height.
     """
-
-    def element(name: str, content: bytes) -> bytes:
-        return bytes.fromhex(name) + (0x01 << 56 | len(content)).to_bytes(8, "big") + content
-
-    def number(name: str, value: int) -> bytes:
-        return element(name, value.to_bytes(4, "big"))
-
-    head = number("4286", 1) + number("42F7", 1) + number("42F2", 4) + number("42F3", 8)
-    head += element("4282", b"matroska") + number("4287", 4) + number("4285", 2)
-    info = number("2AD7B1", 1_000_000) + element("4D80", b"t") + element("5741", b"t")
-    picture = number("B0", 64) + number("BA", 48)
-    picture += b"" if shown is None else number("54B0", shown[0]) + number("54BA", shown[1])
-    track = number("D7", 1) + number("73C5", 1) + number("83", 1) + element("86", b"V_MJPEG") + element("E0", picture)
-    blocks = b""
-    for row, time in enumerate(milliseconds):
-        done, code = cv2.imencode(".jpg", np.full((48, 64, 3), 30 + 40 * row, np.uint8))
-        assert done
-        blocks += element("A3", b"\x81" + time.to_bytes(2, "big") + b"\x80" + code.tobytes())
-    segment = element("1549A966", info) + element("1654AE6B", element("AE", track))
-    segment += element("1F43B675", number("E7", 0) + blocks)
-    path.write_bytes(element("1A45DFA3", head) + element("18538067", segment))
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=Fraction(1000 * (len(milliseconds) - 1), milliseconds[-1]))
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        stream.codec_context.sample_aspect_ratio = aspect
+        for row, time in enumerate(milliseconds):
+            picture = np.full((48, 64, 3), 30 + 40 * row, np.uint8)
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuvj420p")
+            frame.pts, frame.time_base = time, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
     return path
 
 

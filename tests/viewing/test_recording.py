@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_suites
+from conftest import ROOT
 from recorded_run import RecordedRun, recorded_run
 from rrd_files import components_of, entities_of
 from typer.testing import CliRunner
@@ -19,7 +21,6 @@ from vggtgeo.benchmark.page import write_page
 from vggtgeo.benchmark.worker import recording as recorded
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.results.files import write_depth, write_trajectories
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -82,21 +83,22 @@ def test_a_run_of_a_batch_leaves_its_recording_where_one_is_asked_for(run: Recor
 
 
 def test_the_recording_holds_every_entity(recording: Path) -> None:
-    """Each listed entity is in the file, on the timeline it belongs to; oracle: rerun's own reader."""
-    from vggtgeo.viewing.entities import ENTITIES
-
+    """Each entity of the page on views is in the file, on its timeline; oracle: the page, rerun's own reader."""
     found = entities_of(recording)
-    assert set(ENTITIES) - set(found) == set()
+    rows = [line for line in (ROOT / "docs/guides/views.md").read_text().splitlines() if line.startswith("| `")]
+    listed = re.findall(r"`((?:world|window|keyframe|plots)/\w+|notes)`", "\n".join(rows))
+    assert len(listed) > 15
+    assert [path for path in listed if not any(entity.startswith(f"/{path}") for entity in found)] == []
     for path in ("/world/camera", "/world/trajectory", "/keyframe/image/matches", "/plots/residuals/points"):
         assert {"frame", "time"} <= found[path], path
     for path in ("/plots/solver/energy", "/plots/convergence/step", "/world/iteration", "/world/covariance"):
         assert "iteration" in found[path], path
 
 
-def logged(states: Sequence[Slam], path: Path, cloud: PointCloud | None = None) -> Path:
+def logged(states: Sequence[Slam], path: Path) -> Path:
     """A recording of what `RerunCallback` shows of the map in these states, state n at frame n."""
     from vggtgeo.viewing import entities
-    from vggtgeo.viewing.live_map import LiveMap
+    from vggtgeo.viewing.callback import LiveMap
     from vggtgeo.viewing.target import open_target
 
     stream = open_target(str(path), "test", path).stream
@@ -106,9 +108,6 @@ def logged(states: Sequence[Slam], path: Path, cloud: PointCloud | None = None) 
         live.update(slam)
         entities.log_loops(stream, slam, apart=2)
         entities.log_lost(stream, slam)
-    if cloud is not None:
-        live.clear()
-        entities.log_map(stream, cloud)
     stream.disconnect()
     return path
 
@@ -128,7 +127,7 @@ def test_a_keyframe_that_moves_takes_its_cloud_along(run: RecordedRun, tmp_path:
     """Points are logged once, as the final map has them; a keyframe that is half a metre wrong and then put right has
     its transform logged again, and no other keyframe has. Oracle: the poses, and the true depth's bounds.
     """
-    from vggtgeo.viewing.live_map import MAX_CLOUDS, MAX_POINTS
+    from vggtgeo.viewing.callback import MAX_CLOUDS, MAX_POINTS
 
     slam = run.slam
     assert 3 <= len(slam.keyframes) <= MAX_CLOUDS
@@ -208,14 +207,19 @@ def test_loops_and_lost_frames_are_shown(run: RecordedRun, tmp_path: Path) -> No
 
 
 def test_the_blueprint_shows_what_is_logged(recording: Path) -> None:
-    """Every view's origin holds something, and the file carries the arrangement; oracle: the entities, the reader."""
+    """Every view's origin holds something, and the file carries the arrangement; oracle: rerun's own reader."""
     import rerun as rr
+    import rerun.blueprint as rrb
 
-    from vggtgeo.viewing.entities import ENTITIES
-    from vggtgeo.viewing.target import ORIGINS, blueprint
+    from vggtgeo.viewing.target import blueprint
 
-    assert [origin for origin in ORIGINS if not any(path.startswith(origin) for path in ENTITIES)] == []
-    assert blueprint().root_container is not None
+    containers, views = [blueprint().root_container], []
+    while containers:
+        for part in containers.pop().contents:
+            (containers if isinstance(part, rrb.Container) else views).append(part)
+    assert len(views) > 8
+    found = entities_of(recording)
+    assert [view.origin for view in views if not any(path.startswith(view.origin) for path in found)] == []
     assert len(rr.chunk.RrdReader(recording).blueprints()) >= 1
 
 

@@ -2,42 +2,46 @@
 
 Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage`; colour before grey and infrared),
 depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
-any other; depth with a camera of its own is registered by what the bag states of it, `bag_cameras.py`), the camera's
+any other; depth with a camera of its own is registered by what the bag states of it, `bag_messages.py`), the camera's
 `CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
 name contains `truth`, `gt`, `vicon` or `mocap`. A choice among several is reported.
 """
 
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from vggtgeo.datasets.bag_cameras import CAMERA_INFO, TRANSFORMS, DepthCamera, camera_of, depth_camera_of, frame_name
-from vggtgeo.datasets.bag_images import (
+from vggtgeo.datasets.bag_messages import (
+    CAMERA_INFO,
     IMAGES,
+    TRANSFORMS,
     Chosen,
+    DepthCamera,
     Unread,
+    camera_of,
     chosen_topics,
+    depth_camera_of,
     described_choice,
+    frame_name,
     image_of,
     metres_of,
     truth_topic,
 )
-from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import orientation_message
+from vggtgeo.datasets.folder import ImageChecks
+from vggtgeo.datasets.frame import MAX_DELAY, Frame, NearestInTime, check_selection
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning, install_hint
+from vggtgeo.io.errors import InputError, NoteWarning, install_hint, warn
 
-_DELAY = 0.02
-"""Seconds between an image and its depth."""
+_Read = TypeVar("_Read")
 METADATA = "metadata.yaml"
 ROS_2 = (".db3", ".mcap")
 """Suffixes of the files that lie beside a `metadata.yaml`."""
@@ -101,8 +105,11 @@ class RosBag:
             chosen = chosen_topics(path, first)
             poses = truth_topic(topics)
             if text := described_choice(chosen, poses):
-                _warn(f"`{path}`: {text}", NoteWarning)
-            times, (width, height) = _times_and_size(reader, path, chosen.colour)
+                warn(f"`{path}`: {text}", NoteWarning)
+            times, image, wrong = _times_and_first(reader, path, chosen.colour, image_of)
+            if image is None:
+                raise InputError(f"none of the {len(times)} images of `{path}` can be read; the first: {wrong}")
+            height, width = image.image.shape[:2]
             infos = _infos(reader, topics)
             frame = frame_name(first[chosen.colour].header.frame_id)
             known = camera_of(path, infos, chosen.colour, (width, height), frame)
@@ -111,8 +118,9 @@ class RosBag:
             size = (other.camera.width, other.camera.height) if other else (width, height)
             has_depth = depth and bool(chosen.depth) and _depth_is_usable(reader, path, chosen.depth, times, size)
             if has_depth and other:
-                _warn(f"`{path}`: {_registration_note(chosen, other)}", NoteWarning)
-        return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, times, has_depth, other)
+                text = f"is of a camera of its own, {1e3 * float(np.linalg.norm(other.motion[:3, 3])):.0f} mm beside"
+                warn(f"`{path}`: the depth of `{chosen.depth}` {text}: registered to `{chosen.colour}`", NoteWarning)
+        return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, tuple(times), has_depth, other)
 
     def __len__(self) -> int:
         return len(self.times)
@@ -131,9 +139,7 @@ class RosBag:
         whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, Unread)]
         if len(whole) < len(messages):
             lost = len(messages) - len(whole)
-            _warn(
-                f"`{self.path}`: {lost} of {len(messages)} poses of `{self.poses}` are damaged; left out of the truth"
-            )
+            warn(f"`{self.path}`: {lost} of {len(messages)} poses of `{self.poses}` are damaged; left out of the truth")
         if not whole:
             raise InputError(f"`{self.path}` has no pose in its topic `{self.poses}`")
         rows = np.array(whole).reshape(-1, 8)
@@ -141,51 +147,32 @@ class RosBag:
 
     def _read(self, chosen: range) -> Iterator[Frame]:
         with _reader(self.path) as reader:
-            depths = _messages(reader, self.depth) if self.has_depth else iter(())
+            depths = NearestInTime(_messages(reader, self.depth)) if self.has_depth else None
             other = self.depth_camera
             register = DepthRegistration.of(other.camera, self.camera, other.motion) if other else None
-            waiting: list[tuple[float, Any]] = []
-            bits, turned = 8, False
+            images = ImageChecks(self.camera)
             for index, (time, message) in enumerate(_messages(reader, self.colour)):
+                if index >= chosen.stop:
+                    return
                 if index not in chosen:
-                    if index >= chosen.stop:
-                        return
                     continue
                 place = _place(self.path, self.colour, index)
-                try:
-                    read = image_of(message, place, bits)
-                except InputError as error:
-                    _warn(f"{error}; the frame is skipped", LeftOutWarning)
-                    continue
-                height, width = read.image.shape[:2]
-                if (width, height) != (self.camera.width, self.camera.height):
-                    size = f"{self.camera.width} x {self.camera.height}"
-                    text = f"`{place}` is {width} x {height} pixels; the bag's images are {size}: the frame is skipped"
-                    _warn(text, LeftOutWarning)
-                    continue
-                if read.orientation != 1 and not turned:
-                    _warn(orientation_message(place, read.orientation))
-                bits, turned = max(bits, read.bits), turned or read.orientation != 1
-                depth = None
-                if self.has_depth:
-                    waiting = _around(time, waiting, depths)
-                    depth = self._depth(time, waiting, place, register)
-                yield Frame(index, time, read.image, depth, f"{self.name}, {index}")
+                image = images.checked(place, partial(image_of, message))
+                if image is not None:
+                    depth = None if depths is None else self._depth(depths.at(time), place, register)
+                    yield Frame(index, time, image, depth, f"{self.name}, {index}")
 
-    def _depth(
-        self, time: float, waiting: list[tuple[float, Any]], place: Path, register: DepthRegistration | None
-    ) -> np.ndarray:
+    def _depth(self, message: Any, place: Path, register: DepthRegistration | None) -> np.ndarray:
         nothing = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
-        near = [entry for entry in waiting if abs(entry[0] - time) <= _DELAY]
-        if not near:
+        if message is None:
             return nothing
         try:
-            depth = metres_of(min(near, key=lambda entry: abs(entry[0] - time))[1], Path(f"{place}, its depth"))
+            depth = metres_of(message, Path(f"{place}, its depth"))
         except InputError as error:
-            _warn(f"{error}; used without depth")
+            warn(f"{error}; used without depth")
             return nothing
         if depth.shape != (register.rays.shape[:2] if register else nothing.shape):
-            _warn(f"`{place}`: its depth is {depth.shape[1]} x {depth.shape[0]} pixels; used without depth")
+            warn(f"`{place}`: its depth is {depth.shape[1]} x {depth.shape[0]} pixels; used without depth")
             return nothing
         return register(depth) if register else depth
 
@@ -195,51 +182,45 @@ def _place(path: Path, topic: str, number: int) -> Path:
     return Path(f"{path}, {topic}, {number}")
 
 
-def _times_and_size(reader: Any, path: Path, topic: str) -> tuple[tuple[float, ...], tuple[int, int]]:
-    """Return all times of the images, and width and height of the first that can be read."""
-    times, size, wrong = [], None, ""
+def _times_and_first(
+    reader: Any, path: Path, topic: str, read: Callable[[Any, Path], _Read | None]
+) -> tuple[list[float], _Read | None, str]:
+    """Return all times of a topic, what `read` returns for the first message that it can read, and its first error."""
+    times, found, wrong = [], None, ""
     for number, (time, message) in enumerate(_messages(reader, topic)):
         times.append(time)
-        if size is None:
+        if found is None:
             try:
-                height, width = image_of(message, _place(path, topic, number)).image.shape[:2]
-                size = width, height
+                found = read(message, _place(path, topic, number))
             except InputError as error:
                 wrong = wrong or str(error)
-    if size is None:
-        raise InputError(f"none of the {len(times)} images of `{path}` can be read; the first: {wrong}")
-    return tuple(times), size
+    return times, found, wrong
 
 
-def _depth_is_usable(reader: Any, path: Path, topic: str, images: tuple[float, ...], size: tuple[int, int]) -> bool:
+def _depth_is_usable(reader: Any, path: Path, topic: str, images: list[float], size: tuple[int, int]) -> bool:
     """Return whether depth has the images' size and times and a valid pixel; warn otherwise."""
-    times, valid, wrong = [], False, ""
-    for number, (time, message) in enumerate(_messages(reader, topic)):
-        times.append(time)
-        if valid:
-            continue
-        try:
-            depth = metres_of(message, _place(path, topic, number))
-        except InputError as error:
-            wrong = wrong or f" ({error})"
-            continue
+
+    def valid(message: Any, place: Path) -> np.ndarray | None:
+        depth = metres_of(message, place)
         if depth.shape != size[::-1]:
-            wrong = wrong or (
-                f" (that of `{topic}` is {depth.shape[1]} x {depth.shape[0]} pixels, the images are {size[0]} x "
-                f"{size[1]}: record depth that is registered to them)"
+            raise InputError(
+                f"that of `{topic}` is {depth.shape[1]} x {depth.shape[0]} pixels, the images are {size[0]} x "
+                f"{size[1]}: record depth that is registered to them"
             )
-            continue
-        valid = bool(np.isfinite(depth).any())
-    if not valid:
-        _warn(f"`{path}`: no depth image of {len(times)} has a valid pixel{wrong}; reading the images only")
+        return depth if np.isfinite(depth).any() else None
+
+    times, depth, wrong = _times_and_first(reader, path, topic, valid)
+    if depth is None:
+        reason = f" ({wrong})" if wrong else ""
+        warn(f"`{path}`: no depth image of {len(times)} has a valid pixel{reason}; reading the images only")
         return False
     ordered = np.sort(times)
     after = np.searchsorted(ordered, images).clip(1, max(len(ordered) - 1, 1))
     nearest = [ordered[np.minimum(row, len(ordered) - 1)] for row in (after - 1, after)]
-    alone = int((np.minimum(*(np.abs(np.array(images) - time) for time in nearest)) > _DELAY).sum())
+    alone = int((np.minimum(*(np.abs(np.array(images) - time) for time in nearest)) > MAX_DELAY).sum())
     if alone:
         only = "; reading the images only" if alone == len(images) else ""
-        _warn(f"`{path}`: {alone} of {len(images)} images have no depth within {_DELAY} s{only}")
+        warn(f"`{path}`: {alone} of {len(images)} images have no depth within {MAX_DELAY} s{only}")
     return alone < len(images)
 
 
@@ -285,14 +266,6 @@ def _whole(reader: Any, connections: list[Any]) -> Iterator[Any]:
     for connection, _, raw in reader.messages(connections=connections) if connections else ():
         with suppress(Exception):  # a damaged message may raise anything
             yield reader.deserialize(raw, connection.msgtype)
-
-
-def _registration_note(chosen: Chosen, other: DepthCamera) -> str:
-    distance = 1e3 * float(np.linalg.norm(other.motion[:3, 3]))
-    return (
-        f"the depth of `{chosen.depth}` is of a camera of its own (f = {other.camera.intrinsics[0]:.1f}, "
-        f"{distance:.0f} mm from that of the images): it is registered to the images of `{chosen.colour}`"
-    )
 
 
 @contextmanager
@@ -346,21 +319,3 @@ def _pose(message: Any) -> tuple[float, ...]:
     place = getattr(value, "position", None) or value.translation
     turn = getattr(value, "orientation", None) or value.rotation
     return place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
-
-
-def _around(
-    time: float, waiting: list[tuple[float, Any]], later: Iterator[tuple[float, Any]]
-) -> list[tuple[float, Any]]:
-    """Return the depth messages near `time`, reading further as needed."""
-    kept = [entry for entry in waiting if entry[0] >= time - _DELAY]
-    while not kept or kept[-1][0] <= time + _DELAY:
-        entry = next(later, None)
-        if entry is None:
-            break
-        if entry[0] >= time - _DELAY:
-            kept.append(entry)
-    return kept
-
-
-def _warn(message: str, category: type[InputWarning] = InputWarning) -> None:
-    warnings.warn(message, category, stacklevel=3)

@@ -5,7 +5,6 @@ aerial vehicle datasets", IJRR 2016.
 """
 
 import re
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
@@ -25,7 +24,7 @@ from vggtgeo.datasets.pose_files import (
 )
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, NoteWarning
+from vggtgeo.io.errors import InputError, NoteWarning, warn
 from vggtgeo.io.text_files import whole_text
 
 _TRUTH = ("state_groundtruth_estimate0", "leica0", "vicon0")
@@ -50,9 +49,7 @@ class Euroc(FolderSequence):
         if base is None:
             raise InputError(f"`{folder}` must have `mav0/cam0/data.csv`, as a sequence of EuRoC")
         if (base / "imu0" / "data.csv").is_file():
-            warnings.warn(
-                f"`{folder}`: the IMU is not used; images alone leave the scale free", NoteWarning, stacklevel=3
-            )
+            warn(f"`{folder}`: the IMU is not used; images alone leave the scale free", NoteWarning)
         camera_folder = base / "cam0"
         frames = [(time, camera_folder / "data" / name, None) for time, name in _images(camera_folder / "data.csv")]
         if not frames:

@@ -1,6 +1,5 @@
 """Base of all sequences of image files: a list of files, read one by one, with warnings about invalid ones."""
 
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,13 +8,21 @@ from typing import Any, ClassVar, Self
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
-from vggtgeo.datasets.depth_files import MILLIMETRES, DepthFormat, floats_out_of_range, read_depth
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import ImageFile, is_there, orientation_message, read_image_file
+from vggtgeo.datasets.image_files import (
+    MILLIMETRES,
+    DepthFormat,
+    ImageFile,
+    floats_out_of_range,
+    is_there,
+    read_depth,
+    read_image_file,
+)
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, UnusableDepthWarning
+from vggtgeo.io.errors import InputError, LeftOutWarning, UnusableDepthWarning, warn
 
 LATEST = 1e11
 """Seconds of a time stamp at most, 3,000 years: Unix times in nanoseconds are 1e18."""
@@ -82,7 +89,7 @@ class FolderSequence:
                 raise InputError(f"`{folder}`: {text}")
         without = sum(file.depth is None for file in files)
         if 0 < without < len(files):
-            _warn(f"`{folder}`: {without} of {len(files)} images have no depth")
+            warn(f"`{folder}`: {without} of {len(files)} images have no depth")
         whole = cls(folder, folder.resolve().name, Camera.guess(1, 1), files, coding, without < len(files), **fields)
         whole = replace(whole, camera=camera(*whole.common_size()))
         return replace(whole, has_depth=whole.depth_is_usable())
@@ -135,20 +142,19 @@ class FolderSequence:
 
     def common_size(self) -> tuple[int, int]:
         """Return width and height of most of a few readable images; raise InputError if none can be read."""
-        sizes: list[tuple[int, int]] = []
+        shapes: Counter[tuple[int, ...]] = Counter()
         reason = ""
         for file in _spread(self.files):
             try:
-                height, width = self.stored_image(file.image).image.shape[:2]
+                shapes[self.stored_image(file.image).image.shape] += 1
             except InputError as error:
                 reason = reason or str(error)
-                continue
-            sizes.append((width, height))
-            if len(sizes) == _SAMPLES:
+            if shapes.total() == _SAMPLES:
                 break
-        if not sizes:
+        if not shapes:
             raise InputError(f"none of the {len(self)} images of `{self.folder}` can be read; the first: {reason}")
-        return Counter(sizes).most_common(1)[0][0]
+        height, width, _ = shapes.most_common(1)[0][0]
+        return width, height
 
     def depth_is_usable(self) -> bool:
         """Return whether a depth file has a valid pixel, with an UnusableDepthWarning if none has.
@@ -171,7 +177,7 @@ class FolderSequence:
                 )
             if np.isfinite(depth).any():
                 if (middle := float(np.nanmedian(depth))) < MIN_MEDIAN_DEPTH:
-                    _warn(
+                    warn(
                         f"`{path}`: half of its depths are below {middle:.2g} m: is its unit another? "
                         "`--depth-scale` says how many there are in a metre: 1000 are millimetres"
                     )
@@ -179,45 +185,25 @@ class FolderSequence:
         if depths:
             reason = reason or floats_out_of_range(depths[0])
             text = f"none of the {len(depths)} depth images has a valid pixel{reason}; reading the images only"
-            _warn(f"`{self.folder}`: {text}", UnusableDepthWarning)
+            warn(f"`{self.folder}`: {text}", UnusableDepthWarning)
         return False
 
     def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
-        empty, bits, turned = 0, 8, False
+        images, empty = ImageChecks(self.camera), 0
         for file in files:
-            read = self._read_image(file, bits)
-            if read is None:
+            image = images.checked(file.image, self.load_image)
+            if image is None:
                 continue
-            bits = max(bits, read.bits)
-            if read.orientation != 1 and not turned:
-                turned = True
-                _warn(orientation_message(file.image, read.orientation))
             depth = self._read_depth(file) if self.has_depth else None
             if file.depth is not None and depth is not None and not np.isfinite(depth).any():
                 empty += 1
                 if empty <= _NAMED_EMPTY_DEPTHS:
-                    _warn(f"`{file.depth}` gives no valid depth; the frame is used without")
+                    warn(f"`{file.depth}` gives no valid depth; the frame is used without")
             if self.has_depth and depth is None:
                 depth = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
-            yield Frame(file.index, file.timestamp, read.image, depth, file.image.name)
+            yield Frame(file.index, file.timestamp, image, depth, file.image.name)
         if empty > _NAMED_EMPTY_DEPTHS:
-            _warn(f"`{self.name}`: {empty} of {len(files)} depth images gave no valid depth")
-
-    def _read_image(self, file: FrameFile, bits: int) -> ImageFile | None:
-        try:
-            read = self.load_image(file.image, bits)
-        except InputError as error:
-            _warn(f"{error}; the frame is skipped", LeftOutWarning)
-            return None
-        height, width = read.image.shape[:2]
-        if (width, height) != (self.camera.width, self.camera.height):
-            _warn(
-                f"`{file.image}` is {width} x {height} pixels; the sequence's images are "
-                f"{self.camera.width} x {self.camera.height}: the frame is skipped",
-                LeftOutWarning,
-            )
-            return None
-        return read
+            warn(f"`{self.name}`: {empty} of {len(files)} depth images gave no valid depth")
 
     def _read_depth(self, file: FrameFile) -> np.ndarray | None:
         """Read the depth of a frame; None if there is none, or, with a warning, if it cannot be used."""
@@ -226,10 +212,10 @@ class FolderSequence:
         try:
             depth = self.load_depth(file.depth)
         except InputError as error:
-            _warn(f"{error}; the frame is used without depth")
+            warn(f"{error}; the frame is used without depth")
             return None
         if depth.shape != (self.camera.height, self.camera.width):
-            _warn(f"{self._depth_size_message(file.depth, depth)}; used without depth")
+            warn(f"{self._depth_size_message(file.depth, depth)}; used without depth")
             return None
         return depth
 
@@ -237,6 +223,38 @@ class FolderSequence:
         """Say that a depth image has another size than the images."""
         size = f"{self.camera.width} x {self.camera.height}"
         return f"`{path}` is {depth.shape[1]} x {depth.shape[0]} pixels; the colour images are {size}"
+
+
+class ImageChecks:
+    """Reads the images of a sequence in their order; warns of those that cannot be used, and of an orientation."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._size = camera.width, camera.height
+        self._bits, self._turned = 8, False
+
+    def checked(self, place: Path, load: Callable[[Path, int], ImageFile]) -> UInt8[np.ndarray, "h w 3"] | None:
+        """Return an image; None, after a warning, if it cannot be read or has another size than the camera's images.
+
+        load: returns the image at `place`, with at least so many bits.
+        """
+        try:
+            read = load(place, self._bits)
+        except InputError as error:
+            warn(f"{error}; the frame is skipped", LeftOutWarning)
+            return None
+        height, width = read.image.shape[:2]
+        if (width, height) != self._size:
+            sizes = f"{width} x {height} pixels; the sequence's images are {self._size[0]} x {self._size[1]}"
+            warn(f"`{place}` is {sizes}: the frame is skipped", LeftOutWarning)
+            return None
+        self._bits = max(self._bits, read.bits)
+        if read.orientation != 1 and not self._turned:
+            self._turned = True
+            warn(
+                f"`{place}` has the EXIF orientation {read.orientation}, which is not applied: intrinsics and depth "
+                "must be those of the stored images"
+            )
+        return read.image
 
 
 def existing(path: Path) -> Path | None:
@@ -248,7 +266,3 @@ def _spread(files: Sequence[FrameFile]) -> list[FrameFile]:
     first = dict.fromkeys((0, len(files) // 2, len(files) - 1))
     order = [*first, *(row for row in range(len(files)) if row not in first)]
     return [files[row] for row in order] if files else []
-
-
-def _warn(message: str, category: type[InputWarning] = InputWarning) -> None:
-    warnings.warn(message, category, stacklevel=4)

@@ -13,6 +13,9 @@ from vggtgeo.geometry.trajectory import MAX_TIME, Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 
+MAX_DELAY = 0.02
+"""Maximum seconds between an image and its depth."""
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -129,3 +132,23 @@ def check_depth(name: str, depth: Any, image: np.ndarray) -> None:
 def described(given: Any) -> str:
     """Return type and shape of an array, the type of another value."""
     return f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else f"of the type `{type(given).__name__}`"
+
+
+class NearestInTime:
+    """Values of a stream of (time, value), asked for by rising times: depth that comes beside images."""
+
+    def __init__(self, entries: Iterator[tuple[float, Any]]) -> None:
+        self._entries = entries
+        self._near: list[tuple[float, Any]] = []
+
+    def at(self, time: float) -> Any | None:
+        """Return the value nearest to a time, seconds; None if none is within `MAX_DELAY`."""
+        self._near = [entry for entry in self._near if entry[0] >= time - MAX_DELAY]
+        while not self._near or self._near[-1][0] <= time + MAX_DELAY:
+            entry = next(self._entries, None)
+            if entry is None:
+                break
+            if entry[0] >= time - MAX_DELAY:
+                self._near.append(entry)
+        near = [entry for entry in self._near if abs(entry[0] - time) <= MAX_DELAY]
+        return min(near, key=lambda entry: abs(entry[0] - time))[1] if near else None

@@ -21,8 +21,8 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float
 
-from vggtgeo.datasets.depth_files import FIVE_THOUSANDTHS, metres_of_floats
 from vggtgeo.datasets.folder import FolderSequence, existing
+from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, metres_of_floats
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of, read_matrices, trajectory_of

@@ -1,4 +1,5 @@
-"""Image files: checked by Pillow before a decoder takes memory for their pixels, decoded by simplejpeg and OpenCV.
+"""Image files: checked by Pillow before a decoder takes memory for their pixels, decoded by simplejpeg and OpenCV; and
+depth files: images of 16 bits, or floats in metres as TIFF, PFM, arrays of NumPy (`.npy`) or EXR.
 
 Pillow reads the header, the EXIF orientation, and the check sums of a PNG. simplejpeg reports damaged data of a JPEG,
 for which OpenCV returns grey or shifted pixels. Images are used as they are stored, whatever their EXIF orientation:
@@ -15,15 +16,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import simplejpeg
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8, UInt16
 from PIL import Image, UnidentifiedImageError
 
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.archives import UNREADABLE
+from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.text_files import content_of
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 OTHER_PICTURES = frozenset({".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".dng", ".raw", ".cr2", ".nef", ".arw"})
 """Image formats of phones and cameras that are not read."""
+DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
+_EXR_DEPTH = re.compile(r"(.*[.])?(z|depth|depth[.]v|y|v|r)", re.IGNORECASE)
+"""Channels of Blender, Nuke, grey images and Record3D."""
 MAX_PIXELS = 100_000_000
 """Pixels of an image that is decoded: 0.3 GB."""
 MAX_BYTES = 700_000_000
@@ -32,7 +37,10 @@ BITS = (8, 10, 12, 14, 16)
 """Bits of the values in a 16-bit file: cameras of 10 and 12 bits write such files without filling them."""
 _FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "PPM", "TIFF")
 _ORIENTATION = 274
-_BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, struct.error, OverflowError)
+_BROKEN = (
+    *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, struct.error, OverflowError),
+    Image.DecompressionBombError,
+)
 """What Pillow raises for damaged files."""
 # Of damaged EXIF data and directories: what is wrong with a file is the error below.
 warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
@@ -78,7 +86,8 @@ def read_image_file(path: Path, min_bits: int = 8) -> ImageFile:
 def image_in(content: bytes, path: Path, min_bits: int = 8) -> ImageFile:
     """Return the image in the content of a file; path: for messages. Otherwise as `read_image_file`."""
     header = image_header(content, path)
-    image = _pixels(content, header, path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = decoded(content, path, flags, header)
     if image.dtype not in (np.uint8, np.uint16) or image.ndim != 3:
         raise InputError(f"`{path}` is {image.dtype} of shape {image.shape}; images must have 8 or 16 bits")
     image, bits = eight_bits(image, min_bits)
@@ -94,14 +103,6 @@ def eight_bits(image: np.ndarray, min_bits: int = 8) -> tuple[np.ndarray, int]:
     return (image >> (bits - 8)).astype(np.uint8), bits
 
 
-def orientation_message(path: Path, orientation: int) -> str:
-    """Return the text of the warning about an EXIF orientation."""
-    return (
-        f"`{path}` has the EXIF orientation {orientation}, which is not applied: intrinsics and depth must be those of "
-        "the stored images"
-    )
-
-
 def image_header(content: bytes, path: Path) -> ImageHeader:
     """Return the header of an image file; path: for messages.
 
@@ -109,8 +110,6 @@ def image_header(content: bytes, path: Path) -> ImageHeader:
         InputError: the file is empty, truncated, too large, or of a format that is not read.
 
     """
-    if not content:
-        raise InputError(f"`{path}` is empty")
     try:
         with Image.open(io.BytesIO(content), formats=_FORMATS) as image:  # its own `getexif` of a PNG decodes the image
             orientation = (
@@ -123,8 +122,6 @@ def image_header(content: bytes, path: Path) -> ImageHeader:
             image.verify()  # the check sums of a PNG, up to its end
     except InputError:
         raise
-    except Image.DecompressionBombError as error:
-        raise InputError(f"`{path}` has too many pixels: {error}") from None
     except UnidentifiedImageError:
         raise InputError(
             f"`{path}` begins with {content[:16]!r}; it must be a PNG, JPEG, TIFF, WebP, BMP or PNM: convert it, or "
@@ -143,23 +140,20 @@ def is_there(path: Path) -> bool:
         return False
 
 
-def decoded(content: bytes, path: Path, flags: int) -> np.ndarray:
+def decoded(content: bytes, path: Path, flags: int, header: ImageHeader | None = None) -> np.ndarray:
     """Return the pixels in the content of an image file, as OpenCV has them (BGR).
 
     Args:
         content: the file.
         path: its name, for messages.
         flags: of `cv2.imdecode`; without effect on a JPEG.
+        header: that of the file, if it has been read.
 
     Raises:
         InputError: the file is damaged, too large, or not an image.
 
     """
-    return _pixels(content, image_header(content, path), path, flags)
-
-
-def _pixels(content: bytes, header: ImageHeader, path: Path, flags: int) -> np.ndarray:
-    if header.format in ("JPEG", "MPO"):
+    if (header or image_header(content, path)).format in ("JPEG", "MPO"):
         try:
             return simplejpeg.decode_jpeg(content, "BGR")
         except ValueError as error:
@@ -173,3 +167,114 @@ def _pixels(content: bytes, header: ImageHeader, path: Path, flags: int) -> np.n
     if image is None:
         raise InputError(f"`{path}` cannot be decoded: it is damaged, or of a kind that OpenCV does not decode")
     return image
+
+
+@dataclass(frozen=True)
+class DepthFormat:
+    """Unit of depth files.
+
+    Fields: units_per_metre, of 16-bit values. invalid, 16-bit values that mean "no depth". floats_per_metre, units of
+    floating-point values, which are metres by convention.
+    """
+
+    units_per_metre: float
+    invalid: tuple[int, ...] = (0,)
+    floats_per_metre: float = 1.0
+
+
+MIN_DEPTH, MAX_DEPTH = 1e-3, 1000.0
+"""Metres, of floating-point depth: renderers write 1e10 for the background, and swapped bytes read as 1e-40."""
+MILLIMETRES = DepthFormat(1000.0, (0, 65535))
+"""7-Scenes: 0 and 65535 mean no depth."""
+FIVE_THOUSANDTHS = DepthFormat(5000.0)
+"""TUM RGB-D: 5000 is one metre."""
+
+
+def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
+    """Return depth, float32 metres, NaN for none, of an image, a PFM, an EXR or an array of NumPy (`.npy`).
+
+    Raises:
+        InputError: the file cannot be read, or is not one channel of uint16 or floats.
+
+    """
+    codes = read_codes(path)
+    codes = codes[..., 0] if codes.ndim == 3 and codes.shape[2] == 1 else codes
+    if codes.ndim == 2 and np.issubdtype(codes.dtype, np.floating):
+        return metres_of_floats(codes, coding.floats_per_metre)
+    if codes.dtype != np.uint16 or codes.ndim != 2:
+        raise InputError(
+            f"`{path}` is {codes.dtype} of shape {codes.shape}; depth must have one channel, of uint16 or of floats in "
+            "metres"
+        )
+    return metres_of_codes(codes, coding)
+
+
+def metres_of_codes(codes: UInt16[np.ndarray, "h w"], coding: DepthFormat) -> Float[np.ndarray, "h w"]:
+    """Return depth of 16-bit values, float32 metres, NaN for none."""
+    depth = np.divide(codes, np.float32(coding.units_per_metre), dtype=np.float32)
+    for code in coding.invalid:
+        depth[codes == code] = np.nan
+    return depth
+
+
+def metres_of_floats(codes: np.ndarray, per_metre: float = 1.0) -> Float[np.ndarray, "h w"]:
+    """Return depth of floating-point values, float32 metres, NaN outside `MIN_DEPTH` to `MAX_DEPTH`."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = np.divide(codes, per_metre).astype(np.float32)
+        return np.where((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH), depth, np.float32(np.nan))
+
+
+def floats_out_of_range(path: Path) -> str:
+    """Return a hint about the unit if a file of floats has depth and no value of it is in range; "" otherwise."""
+    codes = read_codes(path)
+    known = codes[np.isfinite(codes) & (codes > 0)] if np.issubdtype(codes.dtype, np.floating) else codes[:0]
+    if not known.size:
+        return ""
+    return (
+        f" (`{path}`: its depth is {known.min():g} to {known.max():g}; it must be {MIN_DEPTH:g} to {MAX_DEPTH:g} m: "
+        "give the values in a metre by `--depth-scale`, 1000 for millimetres)"
+    )
+
+
+def read_codes(path: Path) -> np.ndarray:
+    """Return the values of an image or an array of NumPy as they are stored; raise InputError if it cannot be read."""
+    if path.suffix.lower() == ".exr":
+        return exr_depth(path)
+    content = content_of(path, MAX_BYTES)
+    if path.suffix.lower() != ".npy":
+        return decoded(content, path, cv2.IMREAD_UNCHANGED)
+    try:
+        return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))  # a pickle could run code
+    except UNREADABLE as error:
+        raise InputError(f"`{path}` is not an array of NumPy that can be read: {error}") from None
+
+
+def exr_depth(path: Path) -> np.ndarray:
+    """Return the one channel that may be depth, float [H, W], as stored; read by OpenEXR (extra `phones`).
+
+    Raises:
+        InputError: OpenEXR is not installed, or the file is damaged, too large, or has no such channel, or several.
+
+    """
+    try:
+        import OpenEXR
+    except ImportError:
+        raise InputError(f"`{path}` needs the package OpenEXR; {install_hint('phones')}") from None
+    content_of(path, MAX_BYTES)  # OpenEXR names no reason
+    try:
+        header = OpenEXR.File(str(path), header_only=True).header()
+        (left, top), (right, bottom) = header["dataWindow"]
+        names = [channel.name for channel in header["channels"]]
+        values = (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1) * len(names)
+        if not 0 < values <= MAX_PIXELS:  # all channels are decoded
+            raise InputError(f"`{path}` declares {values} values; at most {MAX_PIXELS // 10**6} million are decoded")
+        found = [name for name in names if _EXR_DEPTH.fullmatch(name)]
+        if len(found) > 1:  # Blender writes colours, too: R, G, B beside Z
+            found = [name for name in found if name.lower().endswith(("z", "depth", "depth.v"))] or found
+        if len(found) != 1:
+            raise InputError(f"`{path}` has the channels {', '.join(names)}; it must have one of Z, V, Y, R, depth")
+        return np.asarray(OpenEXR.File(str(path), separate_channels=True).channels()[found[0]].pixels)
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
+        raise InputError(f"`{path}` cannot be decoded: {error}") from None

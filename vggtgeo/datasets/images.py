@@ -1,15 +1,26 @@
-"""A plain folder of images, in natural order (2 before 10)."""
+"""Plain folders: images alone, in natural order (2 before 10); or colour and depth of recorders and scripts, in folders
+`rgb/0.png` and `depth/0.png`, or both in one folder, distinguished by a word of their names (`color_0.jpg`,
+`depth_0.png`).
+
+Open3D's recorders write `color/`, `depth/` and `intrinsic.json`; scripts of users often write `rgb/` and `depth/`
+without a camera. Depth is in millimetres (Open3D, RealSense, Kinect), or in metres if it is of floats (TIFF, PFM,
+`.npy`), unless `with_depth_scale` sets another unit.
+"""
 
 import re
-import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES
-from vggtgeo.datasets.intrinsics import camera_or_guess
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.datasets.frame import MAX_DELAY
+from vggtgeo.datasets.image_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, OTHER_PICTURES
+from vggtgeo.datasets.intrinsics import camera_from_folder, camera_or_guess, guess_with_warning
+from vggtgeo.io.errors import InputError, LeftOutWarning, warn
 
 FRAMES_PER_SECOND = 30.0
 _UNITS = (
@@ -19,6 +30,16 @@ _UNITS = (
     (re.compile(r"1\d{12}"), 1e-3),
 )
 """Names that are times, and their unit: seconds, nanoseconds, and micro- and milliseconds since 1970."""
+COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
+DEPTH = ("depth", "depths")
+_NEITHER = {"conf", "confidence", "mask", "inverse", "disparity"}
+"""Words of names of files that are neither images nor depth."""
+_FORMAT = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
+"""Endings of folder names without meaning: `rgb_png`, `depth_images`."""
+_LOOSE_SHARE = 0.5
+"""Maximum share of images beside the folder of colour that are not of the recording."""
+_WITH_DEPTH = 0.5
+"""Minimum depths per image of a folder of both: a single image called `depth` is not enough."""
 _NUMBERS = re.compile(r"([0-9]+)")
 _NUMBERED = re.compile(r"[^0-9]*([0-9]{1,15})")
 
@@ -57,7 +78,7 @@ def warn_of_unread(folder: Path, images: list[Path]) -> None:
     ]
     if other:
         text = f"`{folder}`: {len(other)} images (`{other[0].name}`) are of a format that is not read"
-        warnings.warn(LeftOutWarning(f"{text}; left out: convert to PNG or JPEG", len(other)), stacklevel=4)
+        warn(LeftOutWarning(f"{text}; left out: convert to PNG or JPEG", len(other)))
 
 
 def _warn_of_more(folder: Path, count: int) -> None:
@@ -65,7 +86,7 @@ def _warn_of_more(folder: Path, count: int) -> None:
     for place in sorted(path for path in folder.iterdir() if path.is_dir()):
         if (more := len(image_files(place))) > count:
             text = f"reading its {count} images; `{place.name}` in it has {more}: give that folder to read those"
-            warnings.warn(f"`{folder}`: {text}", InputWarning, stacklevel=4)
+            warn(f"`{folder}`: {text}")
             return
 
 
@@ -109,3 +130,156 @@ def rows_of(images: list[Path], lines: int | None) -> tuple[int, ...]:
     if apart and (lines != len(images) or max(numbers, default=0) < lines):
         return tuple(numbers)
     return tuple(range(len(images)))
+
+
+def partners_in_time(images: Sequence[tuple[float, Path]], depths: Sequence[tuple[float, Path]]) -> list[int | None]:
+    """Return for each image (time, file) the row of its depth in a list in the order of time.
+
+    Pairs are made in the order of their time difference, each row once.
+    """
+    times = np.array([time for time, _ in depths])
+    candidates = []
+    for row, (time, _) in enumerate(images):
+        low, high = np.searchsorted(times, [time - MAX_DELAY, time + MAX_DELAY], side="left")
+        candidates += [(abs(times[k] - time), row, k) for k in range(low, min(high + 1, len(times)))]
+    partners: list[int | None] = [None] * len(images)
+    taken: set[int] = set()
+    for difference, row, k in sorted(candidates):
+        if difference <= MAX_DELAY and partners[row] is None and k not in taken:
+            partners[row] = k
+            taken.add(k)
+    return partners
+
+
+@dataclass(frozen=True)
+class RgbdFolders(FolderSequence):
+    """Images in one folder, and their depth in a second one or the same. Ground truth: `groundtruth.txt` (TUM format).
+
+    Depth is paired with the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), of the
+    nearest time within 0.02 s if names are times, or of the same position. Times are as in a folder of images. Depth of
+    fewer pixels (a phone's LiDAR) is enlarged to images of the same aspect.
+    """
+
+    depth_of_fewer_pixels = True
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Return whether `folder` has images in a folder of `COLOUR`, and few of its own; or names of its own images
+        distinguish depth.
+        """
+        colour = _folder(folder, COLOUR, IMAGE_SUFFIXES)
+        if colour is None:
+            return _of_one_folder(folder) is not None
+        return len(image_files(folder)) <= _LOOSE_SHARE * len(image_files(colour))
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """List the images and find their depths; raise InputError if they cannot be paired."""
+        colour, (images, depths) = _listed(folder)
+        warn_of_unread(colour, images)
+        times = times_by_name(images)
+        partners = _partners(folder, images, depths) if depths else [None] * len(images)
+        rows = sorted(zip(times, images, partners, strict=True), key=lambda row: row[0])
+        _warn_of_depth_alone(folder, depths, partners)
+        camera = lambda *size: (
+            camera_from_folder(folder, *size)
+            or camera_from_folder(colour, *size)
+            or guess_with_warning(str(folder), *size)
+        )
+        return cls.listed(folder, rows, camera)
+
+
+def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
+    """Return the folder of the images, and the files of images and depths."""
+    colour, depth = _folder(folder, COLOUR, IMAGE_SUFFIXES), _folder(folder, DEPTH, DEPTH_SUFFIXES)
+    if colour is not None:
+        return colour, (image_files(colour), [] if depth is None else image_files(depth, DEPTH_SUFFIXES))
+    both = _of_one_folder(folder)
+    if both is None:
+        raise InputError(f"`{folder}` has no folder of images named {', '.join(f'`{name}`' for name in COLOUR)}")
+    return folder, both
+
+
+def _of_one_folder(folder: Path) -> tuple[list[Path], list[Path]] | None:
+    """Return images and depths of one folder, by the words of their names; None if few names say depth."""
+    depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_depth(path)]
+    others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *_NEITHER}]
+    images = [path for path in others if _words(path) & set(COLOUR)] or others
+    return (images, depths) if images and len(depths) >= _WITH_DEPTH * len(images) else None
+
+
+def _words(path: Path) -> set[str]:
+    return set(re.findall(r"[a-z]+", path.stem.lower()))
+
+
+def _is_depth(path: Path) -> bool:
+    return bool(_words(path) & set(DEPTH)) and not _words(path) & _NEITHER
+
+
+def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str]) -> Path | None:
+    """Return the first of the folders `names` that has images, in any case; `rgb_png` counts as `rgb`, and any name
+    with the word depth as depth (`aligned_depth_to_color`).
+    """
+    there = {}
+    for path in sorted(path for path in folder.iterdir() if path.is_dir() and image_files(path, suffixes)):
+        there[path.name.lower()] = path
+        there.setdefault(_FORMAT.sub("", path.name.lower()), path)
+        if _is_depth(path):
+            there.setdefault(DEPTH[0], path)
+    return next((there[name] for name in names if name in there), None)
+
+
+def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path | None]:
+    """Return the depth of each image, None without one."""
+    for key in (lambda path: path.stem, _number):
+        found = _by(key, images, depths)
+        if found is not None:
+            return found
+    image_times, depth_times = _seconds(images), _seconds(depths)
+    if image_times is not None and depth_times is not None:
+        listed = sorted(zip(depth_times, depths, strict=True))
+        rows = partners_in_time(list(zip(image_times, images, strict=True)), listed)
+        if any(row is not None for row in rows):
+            return [None if row is None else listed[row][1] for row in rows]
+    if len(images) == len(depths):
+        warn(f"`{folder}`: the names of images and depths have nothing in common; they are paired in their order")
+        return list(depths)
+    raise InputError(
+        f"`{folder}`: the {len(images)} images ({images[0].name}, ...) and the {len(depths)} depths ({depths[0].name}, "
+        f"...) cannot be paired: give both the same names or numbers, or times no more than {MAX_DELAY} s apart"
+    )
+
+
+def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path]) -> list[Path | None] | None:
+    """Return pairs by a key of the names; None if keys are not distinct, or pair less than half of the files."""
+    keys = [[key(path) for path in paths] for paths in (images, depths)]
+    if any(None in own or len(set(own)) < len(own) for own in keys):
+        return None
+    known = dict(zip(keys[1], depths, strict=True))
+    found = [known.get(one) for one in keys[0]]
+    paired = len(found) - found.count(None)
+    return found if paired >= 0.5 * min(len(images), len(depths)) else None
+
+
+def _warn_of_depth_alone(folder: Path, depths: list[Path], partners: Sequence[Path | None]) -> None:
+    """Warn of depths without an image, unless every second or third has one (a slower colour camera)."""
+    paired = {partner for partner in partners if partner is not None}
+    alone = len(depths) - len(paired)
+    if not (alone and paired):
+        return
+    longest = max(len(list(run)) for known, run in groupby(depth in paired for depth in depths) if not known)
+    if alone < 0.5 * len(depths) or longest > len(depths) / len(paired) + 1:
+        warn(f"`{folder}`: {alone} of {len(depths)} depths have no image: are images missing?")
+
+
+def _number(path: Path) -> str | None:
+    """Return the last number in a name that is not a time."""
+    numbers = re.findall(r"\d+", path.stem)
+    return str(int(numbers[-1])) if numbers and _seconds([path]) is None else None
+
+
+def _seconds(paths: list[Path]) -> list[float] | None:
+    """Return times of files named `1305031102.175304.png`."""
+    if not all(re.fullmatch(r"\d+\.\d+", path.stem) for path in paths):
+        return None
+    return [float(path.stem) for path in paths]

@@ -2,7 +2,6 @@
 
 import math
 import re
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from vggtgeo.datasets.pose_files import check_size, parsing, read_json, same_size
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
-from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, warn
 from vggtgeo.io.text_files import whole_text
 
 NARROWEST, WIDEST = 1.0, 170.0
@@ -25,8 +24,6 @@ MAX_ASPECT = 4.0
 _OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
 _FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
 """Names of the two lens models in ROS, Kalibr, EuRoC and RealSense."""
-MAX_BYTES = 100_000
-"""Maximum size of a file with a few numbers and comments."""
 CALIBRATION, DISTORTION = "calibration.txt", "distortion.txt"
 FISHEYE = "fisheye"
 """Last word of such a file, after four coefficients of Kannala and Brandt."""
@@ -172,12 +169,11 @@ def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float =
     """Return a guessed camera, `known` False, with a GuessedCameraWarning."""
     camera = Camera.guess(width, height, pixel_aspect)
     focal = " and ".join(dict.fromkeys(f"{value:.0f}" for value in camera.intrinsics[:2]))
-    warnings.warn(
+    warn(
         f"`{name}`: no camera file found, so the camera is estimated (normal for a phone video), beginning with a "
         f"focal length of {focal} pixels. To give it: --intrinsics fx,fy,cx,cy (in Python: `camera`), or a file "
         f"`{CALIBRATION}` with `fx fy cx cy` beside the images",
         GuessedCameraWarning,
-        stacklevel=3,
     )
     return camera
 
@@ -222,7 +218,7 @@ def _of_realsense(file: Path, content: Mapping[str, Any]) -> tuple[float, ...]:
     if model in ("", "brown_conrady", "modified_brown_conrady"):
         return check_distortion(tuple(map(float, coefficients)))
     text = f"`model` is {model[:40]}, which is not read: its `coeffs` are left out; undistort the images"
-    warnings.warn(f"`{file}`: {text}", InputWarning, stacklevel=5)
+    warn(f"`{file}`: {text}")
     return ()
 
 
@@ -242,10 +238,7 @@ def _numbers(text: str) -> tuple[float, ...]:
 
 
 def _without_comments(file: Path) -> str:
-    if file.stat().st_size > MAX_BYTES:
-        raise InputError(f"`{file}` has {file.stat().st_size} bytes; expected a few numbers")
-    lines = whole_text(file).splitlines()
-    return " ".join(line.split("#", 1)[0] for line in lines)
+    return " ".join(line.split("#", 1)[0] for line in whole_text(file).splitlines())
 
 
 def warn_of_other_size(where: str, camera: Camera) -> None:
@@ -254,9 +247,7 @@ def warn_of_other_size(where: str, camera: Camera) -> None:
     centred = 0 <= cx < camera.width and 0 <= cy < camera.height
     field_of_view = math.degrees(2 * math.atan(0.5 * max(camera.width / fx, camera.height / fy)))
     if not centred or field_of_view < 10:
-        warnings.warn(
+        warn(
             f"{where}: principal point ({cx:g}, {cy:g}) and field of view {field_of_view:.0f} deg are odd "
-            f"for images of {camera.width} x {camera.height}; was it calibrated at another image size?",
-            InputWarning,
-            stacklevel=3,
+            f"for images of {camera.width} x {camera.height}; was it calibrated at another image size?"
         )

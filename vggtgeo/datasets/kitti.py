@@ -3,7 +3,6 @@
 Source: A. Geiger et al., "Are we ready for autonomous driving?", CVPR 2012.
 """
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -18,7 +17,7 @@ from vggtgeo.datasets.intrinsics import camera_or_guess, intrinsics_of
 from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of_rows, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, NoteWarning
+from vggtgeo.io.errors import InputError, NoteWarning, warn
 from vggtgeo.io.text_files import whole_text
 
 RATE = 10.0
@@ -58,9 +57,7 @@ class Kitti(FolderSequence):
         every = [times[row] if times else (row - rows[0]) / RATE for row in rows]
         frames = [(time, image, None) for time, image in zip(every, images[place], strict=True)]
         if (folder / "oxts").is_dir():
-            warnings.warn(
-                f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", NoteWarning, stacklevel=3
-            )
+            warn(f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", NoteWarning)
         name = place.relative_to(folder).parts[0]
         baseline = 0.0
 

@@ -13,7 +13,6 @@ The poses are those of another program (COLMAP, ARKit), often of free scale, not
 
 import math
 import statistics
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,15 +20,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from vggtgeo.datasets.depth_files import MILLIMETRES
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, is_there
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, is_there
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
 from vggtgeo.datasets.pose_files import parsing, read_json, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 
 FILE = "transforms.json"
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -138,7 +136,7 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
         fisheye = _is_fisheye(content)
         if unread := [key for key in ("k4", "k5", "k6") if number(key) and not (fisheye and key == "k4")]:
             text = f"`{file}` has {', '.join(unread)} of its lens, which is not read, left out: undistort the images"
-            warnings.warn(text, InputWarning, stacklevel=4)
+            warn(text)
         lens = tuple(map(number, _OF_FISHEYE if fisheye else _DISTORTION))
         distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
         intrinsics = intrinsics_of(file, (fx, number("fl_y", fx), *centre))

@@ -1,7 +1,6 @@
 """Choice of the reader of a path."""
 
 import os
-import warnings
 from pathlib import Path
 from typing import Protocol
 
@@ -10,23 +9,20 @@ from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim, IclNuimRaw
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES, is_there
-from vggtgeo.datasets.images import ImageFolder
+from vggtgeo.datasets.images import ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
-from vggtgeo.datasets.live import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
-from vggtgeo.datasets.phone_exports import Polycam, Scanner3d
-from vggtgeo.datasets.phones import ArkitScenes, StrayScanner
+from vggtgeo.datasets.phones import ArkitScenes, Polycam, Scanner3d, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
 from vggtgeo.datasets.replica import Replica
-from vggtgeo.datasets.rgbd_folders import RgbdFolders
 from vggtgeo.datasets.scannet import ScanNet
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
-from vggtgeo.datasets.video import VideoFile
+from vggtgeo.datasets.video import LiveCamera, VideoFile, is_live
 from vggtgeo.datasets.views import with_rate
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.given import path_of
 
 
@@ -113,11 +109,8 @@ def is_readable(place: Path) -> bool:
 def check_there(path: str | os.PathLike[str]) -> None:
     """Raise InputError if the path does not exist or may not be read, before anything is opened."""
     place = path_of("path", path)
-    if not is_live(os.fspath(path)):
-        _check_place(place)
-
-
-def _check_place(place: Path) -> None:
+    if is_live(os.fspath(path)):
+        return
     if not is_there(place):
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
     if not os.access(place, os.R_OK | os.X_OK if place.is_dir() else os.R_OK):
@@ -128,7 +121,7 @@ def _check_place(place: Path) -> None:
 
 
 def _open_place(place: Path, kind: str | None, depth: bool) -> Sequence:
-    _check_place(place)
+    check_there(place)
     if kind == "bag" or (kind is None and is_bag(place)):
         return RosBag.open(place, depth)
     if place.is_file() and (kind == "record3d" or (kind is None and Record3d.matches(place))):
@@ -151,7 +144,7 @@ def _open_folder(place: Path, kind: str | None) -> Sequence:
     for reader in FOLDER_KINDS.values():
         if reader.matches(place):
             if dead:
-                warnings.warn(f"`{place}`: {dead}", InputWarning, stacklevel=4)
+                warn(f"`{place}`: {dead}")
             return reader.open(place)
     names = sorted(path.name for path in place.iterdir())
     other = next((name for name in names if Path(name).suffix.lower() in OTHER_PICTURES | ARCHIVES), None)

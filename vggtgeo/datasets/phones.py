@@ -1,36 +1,42 @@
-"""Recordings of phones with LiDAR: Stray Scanner (and alike) and ARKitScenes.
+"""Recordings of phones with LiDAR: Stray Scanner (and alike), ARKitScenes, and the raw exports of two apps: 3D Scanner
+App ("All data") and Polycam ("Raw data", below `keyframes/`).
 
-| | Stray Scanner | ARKitScenes |
-|---|---|---|
-| images | `rgb.mp4` | `lowres_wide/*_TIME.png` |
-| depth, mm | `depth/NNNNNN.png`, `confidence/NNNNNN.png` 0 to 2 | `lowres_depth/*_TIME.png` |
-| camera | `camera_matrix.csv` | `lowres_wide_intrinsics/*.pincam` |
-| poses | `odometry.csv` | `lowres_wide.traj` |
+| | Stray Scanner | ARKitScenes | 3D Scanner App | Polycam |
+|---|---|---|---|---|
+| images | `rgb.mp4` | `lowres_wide/*_TIME.png` | `frame_00012.jpg`, one of a few | `images/TIME.jpg` |
+| depth, mm | `depth/NNNNNN.png` | `lowres_depth/*_TIME.png` | `depth_00012.png` | `depth/TIME.png` |
+| trust in it: 0 is low | `confidence/NNNNNN.png` | | `conf_00012.png` | `confidence/TIME.png` |
+| camera | `camera_matrix.csv` | `lowres_wide_intrinsics/*.pincam` | `frame_00012.json` | `cameras/TIME.json` |
+| poses | `odometry.csv` | `lowres_wide.traj` | the same | the same |
 
-The depth has 256 x 192 pixels of the same view; it is enlarged to the images without interpolation. Poses are those of
-ARKit, not an independent ground truth: differences from them are not errors.
+The depth has fewer pixels of the same view (256 x 192); it is enlarged to the images without interpolation. Polycam's
+corrected data (`corrected_images/`, ...: refined poses, undistorted images) are preferred. Thumbnails and meshes are
+not read. Poses are those of ARKit, not an independent ground truth: differences from them are not errors.
 """
 
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.datasets.depth_files import MILLIMETRES, read_codes, read_depth
-from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.images import files_like
+from vggtgeo.datasets.folder import FolderSequence, existing
+from vggtgeo.datasets.frame import MAX_DELAY, Frame, check_selection
+from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
 from vggtgeo.datasets.intrinsics import intrinsics_of
-from vggtgeo.datasets.pose_files import poses_of, read_matrices, read_matrix, trajectory_of
+from vggtgeo.datasets.nerfstudio import FROM_OPENGL
+from vggtgeo.datasets.pose_files import parsing, poses_of, read_json, read_matrices, read_matrix, trajectory_of
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, warn
 from vggtgeo.io.text_files import whole_text
 
 LARGEST = 960
@@ -40,7 +46,8 @@ _MIN_CONFIDENCE = 1
 _CONFIDENCE = "confidence"
 _LISTS = "odometry.csv", "camera_matrix.csv"
 """Files of Stray Scanner beside the video."""
-_MAX_DELAY = 0.02
+_FRAME = re.compile(r"frame_(\d{1,9})\.(jpe?g|png)", re.IGNORECASE)
+_MICROSECOND = 1e-6
 
 
 @dataclass(frozen=True)
@@ -78,11 +85,9 @@ class StrayScanner:
         camera = Camera(intrinsics, width // reduction, height // reduction)
         times = tuple(_odometry(folder)[:, 0].tolist())
         if len(video) and len(times) != len(video):
-            warnings.warn(
+            warn(
                 f"`{folder}`: `rgb.mp4` has {len(video)} frames, `odometry.csv` {len(times)} times; frames behind "
-                f"{min(len(video), len(times))} are left out",
-                InputWarning,
-                stacklevel=3,
+                f"{min(len(video), len(times))} are left out"
             )
         has_depth = bool(files_like(folder / "depth", "*.png"))
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
@@ -102,13 +107,11 @@ class StrayScanner:
         return trajectory_of(rows[:, 0], poses_of(rows[:, 2:5], rows[:, 5:9]), self.folder / "odometry.csv")
 
     def _frame(self, frame: Frame) -> Frame:
-        size = (self.camera.width, self.camera.height)
-        image = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+        image = cv2.resize(frame.image, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA)
         depth = self._depth(frame.index) if self.has_depth else None
         return Frame(frame.index, self.times[frame.index], np.asarray(image, np.uint8), depth, frame.name)
 
     def _depth(self, index: int) -> np.ndarray:
-        shape = (self.camera.height, self.camera.width)
         file = self.folder / "depth" / f"{index:06d}.png"
         try:
             depth = read_depth(file, MILLIMETRES)
@@ -117,8 +120,8 @@ class StrayScanner:
             depth = cv2.resize(depth, (self.camera.width, self.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
             return np.asarray(depth, np.float32)
         except InputError as error:
-            warnings.warn(f"{error}; the frame is used without depth", InputWarning, stacklevel=3)
-            return np.full(shape, np.nan, np.float32)
+            warn(f"{error}; the frame is used without depth")
+            return np.full((self.camera.height, self.camera.width), np.nan, np.float32)
 
 
 def remove_doubtful(depth: np.ndarray, file: Path) -> None:
@@ -128,7 +131,7 @@ def remove_doubtful(depth: np.ndarray, file: Path) -> None:
         if trust.shape != depth.shape:
             raise InputError(f"`{file}` has shape {trust.shape}, its depth {depth.shape}")
     except InputError as error:
-        warnings.warn(f"{error}; all depth of the frame is used", InputWarning, stacklevel=4)
+        warn(f"{error}; all depth of the frame is used")
     else:
         depth[trust < _MIN_CONFIDENCE] = np.nan
 
@@ -188,10 +191,8 @@ def _timed(folder: Path) -> list[tuple[float, Path]]:
 
 
 def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
-    if not depths:
-        return None
-    other, path = min(depths, key=lambda entry: abs(entry[0] - time))
-    return path if abs(other - time) <= _MAX_DELAY else None
+    other, path = min(depths, key=lambda entry: abs(entry[0] - time), default=(np.inf, None))
+    return path if abs(other - time) <= MAX_DELAY else None
 
 
 def _pincam(folder: Path, width: int, height: int) -> Camera:
@@ -206,3 +207,141 @@ def _pincam(folder: Path, width: int, height: int) -> Camera:
         )
     fx, fy, cx, cy = np.median(rows[:, 2:], axis=0)
     return Camera(intrinsics_of(files[0].parent, (fx, fy, cx, cy)), width, height)
+
+
+class _View(NamedTuple):
+    """What is known of one image. Fields: its files; time, seconds; camera, fx, fy, cx, cy; size, width and height of
+    the camera's images, if stated; pose float64 [4, 4], camera -> world, OpenGL's axes.
+    """
+
+    image: Path
+    depth: Path
+    confidence: Path
+    time: float
+    camera: tuple[float, float, float, float]
+    size: tuple[float, float] | None
+    pose: np.ndarray
+
+
+@dataclass(frozen=True)
+class PhoneExport(FolderSequence):
+    """Images of a phone, each with a file of camera, pose and time. Ground truth: ARKit's poses.
+
+    poses: float64 [4, 4], camera -> world, by image. confidence: files by that of the depth.
+    """
+
+    poses: Mapping[Path, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
+    confidence: Mapping[Path, Path] = field(default_factory=dict, compare=False, repr=False)
+
+    def load_depth(self, path: Path) -> np.ndarray:
+        """Return the depth, enlarged to the images, without that of low confidence."""
+        depth = read_depth(path, self.depth_format)
+        if path in self.confidence:
+            remove_doubtful(depth, self.confidence[path])
+        return self.enlarge_depth(depth)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return ARKit's poses, camera -> world; the files have OpenGL's axes."""
+        poses = np.array([self.poses[file.image] for file in self.files])
+        with np.errstate(invalid="ignore"):  # of invalid poses, which are left out
+            return trajectory_of([file.timestamp for file in self.files], poses @ FROM_OPENGL, self.folder)
+
+    @classmethod
+    def views(cls, folder: Path) -> Iterable[tuple[Path, Path, Path, Path]]:
+        """Return image, file of its camera, depth and confidence of each frame, in their order."""
+        raise NotImplementedError
+
+    @classmethod
+    def stated(cls, file: Path) -> tuple[float, tuple[float, float, float, float], tuple | None, np.ndarray]:
+        """Return time, camera, size and pose of the file of a camera; see `_View`."""
+        raise NotImplementedError
+
+    @classmethod
+    def matches(cls, folder: Path) -> bool:
+        """Return whether `folder` has an image with the file of its camera."""
+        return any(file.is_file() for _, file, *_ in cls.views(folder))
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """List the images; raise InputError if none has a valid camera."""
+        views = []
+        for image, file, depth, confidence in cls.views(folder):
+            try:
+                views.append(_View(image, depth, confidence, *cls.stated(file)))
+            except InputError as error:
+                warn(LeftOutWarning(f"{error}; `{image.name}` is left out"))
+        if not views:
+            raise InputError(f"`{folder}` has no image with a valid file of its camera")
+        times = _times(folder, [view.time for view in views])
+        frames = [(time, view.image, existing(view.depth)) for time, view in zip(times, views, strict=True)]
+        trusted = {view.depth: view.confidence for view in views if view.confidence.is_file()}
+        poses = {view.image: view.pose for view in views}
+        return cls.listed(folder, frames, lambda *size: _camera(folder, views, *size), poses=poses, confidence=trusted)
+
+
+@dataclass(frozen=True)
+class Scanner3d(PhoneExport):
+    """An export of 3D Scanner App."""
+
+    @classmethod
+    def views(cls, folder: Path) -> Iterable[tuple[Path, Path, Path, Path]]:
+        for image in files_like(folder, "frame_*"):
+            if match := _FRAME.fullmatch(image.name):
+                number = match[1]
+                depth, confidence = folder / f"depth_{number}.png", folder / f"conf_{number}.png"
+                yield image, folder / f"frame_{number}.json", depth, confidence
+
+    @classmethod
+    def stated(cls, file: Path) -> tuple[float, tuple[float, float, float, float], tuple | None, np.ndarray]:
+        with parsing(file, "`intrinsics` of 9 numbers, `cameraPoseARFrame` of 16, and `time`"):
+            content = read_json(file)
+            matrix = np.reshape(content["intrinsics"], (3, 3)).astype(np.float64)
+            matrix = matrix if matrix[0, 2] or matrix[1, 2] else matrix.T  # by columns, as ARKit has it
+            pose = np.reshape(content["cameraPoseARFrame"], (4, 4)).astype(np.float64)
+            pose = pose.T if pose[3, :3].any() and not pose[:3, 3].any() else pose
+            camera = intrinsics_of(file, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+            return float(content["time"]), camera, None, pose
+
+
+@dataclass(frozen=True)
+class Polycam(PhoneExport):
+    """A raw export of Polycam, or `keyframes` in it."""
+
+    @classmethod
+    def views(cls, folder: Path) -> Iterable[tuple[Path, Path, Path, Path]]:
+        for place in (folder / "keyframes", folder):
+            for kind in ("corrected_", ""):
+                cameras = place / f"{kind}cameras"
+                if any(cameras.glob("*.json")):
+                    depth = place / f"{kind}depth"
+                    depth = depth if depth.is_dir() else place / "depth"
+                    for image in files_like(place / f"{kind}images", "*.jpg"):
+                        name = f"{image.stem}.png"
+                        yield image, cameras / f"{image.stem}.json", depth / name, place / "confidence" / name
+                    return
+
+    @classmethod
+    def stated(cls, file: Path) -> tuple[float, tuple[float, float, float, float], tuple | None, np.ndarray]:
+        with parsing(file, "`fx`, `fy`, `cx`, `cy`, `width`, `height` and `t_00` to `t_23`"):
+            content = read_json(file)
+            camera = intrinsics_of(file, [content[key] for key in ("fx", "fy", "cx", "cy")])
+            pose = np.eye(4)
+            pose[:3] = [[content[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
+            size = float(content["width"]), float(content["height"])
+            return float(content.get("timestamp", file.stem)) * _MICROSECOND, camera, size, pose
+
+
+def _times(folder: Path, stated: list[float]) -> list[float]:
+    """Return those of the files where they rise, else 30 frames a second."""
+    if np.isfinite(stated).all() and all(before < after for before, after in pairwise(stated)):
+        return stated
+    text = f"the times of its images do not increase; {FRAMES_PER_SECOND:g} frames a second are assumed"
+    warn(f"`{folder}`: {text}")
+    return [index / FRAMES_PER_SECOND for index in range(len(stated))]
+
+
+def _camera(folder: Path, views: list[_View], width: int, height: int) -> Camera:
+    """Return the median of the intrinsics of all frames; autofocus changes them by a few tenths of a per cent."""
+    size = views[0].size or (width, height)
+    middle = intrinsics_of(folder, np.median([view.camera for view in views], axis=0))
+    return Camera(middle, round(size[0]), round(size[1])).resized(width, height)

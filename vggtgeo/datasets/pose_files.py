@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry.trajectory import MAX_COORDINATE, MAX_QUATERNION, MAX_TIME, MIN_QUATERNION, Trajectory, rising
-from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning, warn
 from vggtgeo.io.text_files import whole_text
 
 _KITTI, _EUROC = 12, 17
@@ -87,9 +86,9 @@ def trajectory_of(
     ):
         if lost.any():
             text = f"`{where}`: {int(lost.sum())} of {len(poses)} poses have {why}; left out of the {of}"
-            warnings.warn(text, kind, stacklevel=3)
+            warn(text, kind)
     if not len(poses) and where.is_file():
-        warnings.warn(f"`{where}` has no pose: there is no {of}", InputWarning, stacklevel=3)
+        warn(f"`{where}` has no pose: there is no {of}")
     if not turned.any():
         return None
     rows = np.flatnonzero(turned)
@@ -104,11 +103,9 @@ def trajectory_of_rows(
     there = [place for place, row in enumerate(rows) if row < len(poses)]
     beyond = len(rows) - len(there)
     if beyond and len(poses):
-        warnings.warn(
+        warn(
             f"`{where}`: {beyond} of {len(rows)} images, by their numbers up to {max(rows)} counted from 0, are beyond "
-            f"its end (poses: {len(poses)}) and have no truth",
-            InputWarning,
-            stacklevel=3,
+            f"its end (poses: {len(poses)}) and have no truth"
         )
         if not there:
             return None
@@ -230,7 +227,7 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
     found = Trajectory.load_tum(file)
     if found.timestamps[0] < _NANOSECONDS:
         return found
-    warnings.warn(f"`{file}`: its times are nanoseconds, and are converted", NoteWarning, stacklevel=2)
+    warn(f"`{file}`: its times are nanoseconds, and are converted", NoteWarning)
     return Trajectory(1e-9 * found.timestamps, found.poses)
 
 

@@ -14,7 +14,6 @@ independent ground truth.
 
 import math
 import re
-import warnings
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,9 +24,8 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from vggtgeo.datasets.depth_files import metres_of_floats, read_depth
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, image_in
+from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, image_in, metres_of_floats, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_of_record3d, guess_with_warning
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
@@ -35,7 +33,7 @@ from vggtgeo.datasets.pose_files import json_in, parsing, poses_of, same_size, t
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
-from vggtgeo.io.errors import InputError, InputWarning, install_hint
+from vggtgeo.io.errors import InputError, install_hint, warn
 from vggtgeo.io.text_files import MAX_BYTES as MAX_TEXT
 from vggtgeo.io.text_files import content_of
 
@@ -57,21 +55,17 @@ class Record3d(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether a folder or a zip archive has `metadata` and `rgbd`, or `metadata.json` and EXR; or the file's
-        suffix is `.r3d`.
+        """Return whether a folder or a zip archive has `metadata` and `rgbd`, or `metadata.json` and EXR; or the suffix
+        of a file is `.r3d`.
         """
-        if folder.is_dir():
-            exported = (folder / EXPORTED).is_file() and next((folder / "depth").glob("*.exr"), None) is not None
-            return exported or ((folder / METADATA).is_file() and (folder / "rgbd").is_dir())
-        if folder.suffix.lower() == SUFFIX:  # a truncated one is not a zip archive
-            return folder.is_file()
+        if folder.suffix.lower() == SUFFIX and folder.is_file():  # a truncated one is not a zip archive
+            return True
         try:
-            if not (folder.is_file() and zipfile.is_zipfile(folder)):
-                return False
             names = _names(folder)
         except UNREADABLE:
             return False
-        return METADATA in names and any(name.startswith("rgbd/") for name in names)
+        exported = EXPORTED in names and any(name.endswith(".exr") for name in names)
+        return exported or (METADATA in names and any(name.startswith("rgbd/") for name in names))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
@@ -113,9 +107,7 @@ class Record3d(FolderSequence):
 
     def holds(self, path: Path) -> bool:
         """Return whether the archive or folder has this file."""
-        if self.folder.is_dir():
-            return path.is_file()
-        return path.relative_to(self.folder).as_posix() in self._archive.NameToInfo
+        return (self._root / path.relative_to(self.folder).as_posix()).is_file()
 
     def stored_image(self, path: Path, min_bits: int = 8) -> ImageFile:
         """Return the image in a file of the archive."""
@@ -147,21 +139,18 @@ class Record3d(FolderSequence):
         return trajectory_of([self.files[row].timestamp for row in there], found, where)
 
     def _content(self, path: Path, most: int = MAX_BYTES) -> bytes:
-        """Return the content of a file in the folder or archive; at most `most` bytes."""
+        """Return the content of a file in the folder or archive; at most `most` bytes of a folder's."""
         if self.folder.is_dir():
             return content_of(path, most)
         try:
-            part = self._archive.getinfo(path.relative_to(self.folder).as_posix())
-            return self._archive.read(part)
-        except InputError:
-            raise
+            return (self._root / path.relative_to(self.folder).as_posix()).read_bytes()
         except UNREADABLE as error:
             raise InputError(f"`{path}` cannot be read: {error}") from None
 
     @cached_property
-    def _archive(self) -> zipfile.ZipFile:
+    def _root(self) -> Path | zipfile.Path:
         """Keep the archive open: its directory takes longer to read than an image."""
-        return zipfile.ZipFile(self.folder)
+        return _root(self.folder)
 
     def _unpacked(self, path: Path, item_bytes: int) -> bytes:
         """Return decompressed bytes (LZFSE): at most one item per pixel of the image."""
@@ -174,14 +163,16 @@ class Record3d(FolderSequence):
         return bytes(content)
 
 
-def _names(place: Path) -> frozenset[str]:
+def _root(place: Path) -> Path | zipfile.Path:
+    return place if place.is_dir() else zipfile.Path(place)
+
+
+def _names(place: Path) -> set[str]:
     """Return the names of the files."""
-    if place.is_dir():
-        parts = [place / METADATA, place / EXPORTED]
-        parts += [path for name in ("rgbd", "rgb", "depth") for path in (place / name).glob("*")]
-        return frozenset(path.relative_to(place).as_posix() for path in parts if path.is_file())
-    with zipfile.ZipFile(place) as archive:
-        return frozenset(archive.namelist())
+    root = _root(place)
+    names = {name for name in (METADATA, EXPORTED) if (root / name).is_file()}
+    folders = (root / name for name in ("rgbd", "rgb", "depth"))
+    return names | {f"{folder.name}/{file.name}" for folder in folders if folder.is_dir() for file in folder.iterdir()}
 
 
 def _depth_of(image: Path) -> Path:
@@ -229,11 +220,7 @@ def _camera(where: Path, metadata: Mapping[str, Any], width: int, height: int) -
     """Return the camera of the metadata; None without one, or, with a warning, for another image size."""
     size = metadata.get("w"), metadata.get("h")
     if None not in size and not same_size(size, (width, height)):
-        warnings.warn(
-            f"`{where}` has a camera for {size[0]} x {size[1]} pixels; the images are {width} x {height}: not used",
-            InputWarning,
-            stacklevel=4,
-        )
+        warn(f"`{where}` has a camera for {size[0]} x {size[1]} pixels; the images are {width} x {height}: not used")
         return None
     if not {"K", "perFrameIntrinsicCoeffs"} & metadata.keys():
         return None

@@ -5,12 +5,14 @@ The camera is in `cam_params.json` beside the rooms; the depth is in 1 / 6553.5 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Self
 
-from vggtgeo.datasets.depth_files import DepthFormat
 from vggtgeo.datasets.folder import FolderSequence, existing
+from vggtgeo.datasets.image_files import DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
 from vggtgeo.datasets.pose_files import check_size, parsing, read_json, read_matrices, trajectory_of_rows
@@ -50,9 +52,8 @@ class Replica(FolderSequence):
         ]
         places = (folder / _CAMERA, folder.resolve().parent / _CAMERA)
         file = next((file for file in places if file.is_file()), None)
-        stated = None if file is None else _Stated.of(file)
-        coding = DepthFormat(_UNITS if stated is None else stated.scale)
-        return cls.listed(folder, frames, lambda *size: _camera(folder, stated, *size), coding, rows=rows)
+        scale, camera = (_UNITS, partial(_unstated_camera, folder)) if file is None else _stated(file)
+        return cls.listed(folder, frames, camera, DepthFormat(scale), rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
         """Return the true poses."""
@@ -69,30 +70,24 @@ def _poses_in(file: Path) -> int | None:
         return None
 
 
-class _Stated(NamedTuple):
-    """Content of `cam_params.json`: size, as it is written; scale, units a metre."""
+def _stated(file: Path) -> tuple[float, Callable[[int, int], Camera]]:
+    """Return the units a metre, and the camera for images of a size, of `cam_params.json`."""
+    with parsing(file, "`camera` with fx, fy, cx, cy and a positive `scale`, units a metre"):
+        stated = read_json(file)["camera"]
+        scale, size = float(stated["scale"]), (stated.get("w"), stated.get("h"))
+        if not 0 < scale < math.inf:
+            raise ValueError(f"`scale` is {scale}")
+        intrinsics = intrinsics_of(file, [stated[name] for name in ("fx", "fy", "cx", "cy")])
 
-    file: Path
-    intrinsics: tuple[float, float, float, float]
-    size: tuple[Any, Any]
-    scale: float
+    def camera(width: int, height: int) -> Camera:
+        if None not in size:
+            check_size(file, size, (width, height))
+        return Camera(intrinsics, width, height)
 
-    @classmethod
-    def of(cls, file: Path) -> Self:
-        with parsing(file, "`camera` with fx, fy, cx, cy and a positive `scale`, units a metre"):
-            camera = read_json(file)["camera"]
-            scale = float(camera["scale"])
-            if not 0 < scale < math.inf:
-                raise ValueError(f"`scale` is {scale}")
-            values = intrinsics_of(file, [camera[name] for name in ("fx", "fy", "cx", "cy")])
-            return cls(file, values, (camera.get("w"), camera.get("h")), scale)
+    return scale, camera
 
 
-def _camera(folder: Path, stated: _Stated | None, width: int, height: int) -> Camera:
-    if stated is not None:
-        if None not in stated.size:
-            check_size(stated.file, stated.size, (width, height))
-        return Camera(stated.intrinsics, width, height)
+def _unstated_camera(folder: Path, width: int, height: int) -> Camera:
     if (width, height) == _PUBLISHED_SIZE:
         return Camera(_PUBLISHED, width, height)
     own = camera_from_folder(folder, width, height)

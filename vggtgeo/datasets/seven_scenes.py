@@ -10,7 +10,6 @@ Kinect: near objects have errors of some pixels.
 """
 
 import re
-import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +23,7 @@ from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.errors import InputError, NoteWarning, warn
 
 FRAMES_PER_SECOND = 30.0
 COLOUR_TRUTH = "groundtruth-colour.txt"
@@ -107,11 +106,9 @@ def _first_sequence(folder: Path) -> Path:
     if not sequences:
         raise InputError(f"`{folder}` has no `frame-XXXXXX.color.png|jpg`; expected a sequence of 7-Scenes")
     if len(sequences) > 1:
-        warnings.warn(
+        warn(
             f"`{folder}` holds {len(sequences)} sequences; reading `{sequences[0].name}`: give the folder of "
-            "another to read that",
-            InputWarning,
-            stacklevel=3,
+            "another to read that"
         )
     return sequences[0]
 
@@ -126,11 +123,10 @@ def _camera(folder: Path, width: int, height: int) -> Camera:
         return own
     if (width, height) != (640, 480):
         return guess_with_warning(str(folder), width, height)
-    warnings.warn(
+    warn(
         f"`{folder}` has no intrinsics of its colour camera: taken as published, with that of a Kinect, {_KINECT}; "
         "depth and poses belong to its depth camera (f = 585) and are moved to the colour camera by a generic "
         "calibration",
         NoteWarning,
-        stacklevel=3,
     )
     return _AS_PUBLISHED

@@ -7,23 +7,19 @@ ETH3D SLAM comes with and ORB-SLAM2 takes (`associations.txt`), is read where `r
 """
 
 import itertools
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-import numpy as np
-
-from vggtgeo.datasets.depth_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
 from vggtgeo.datasets.folder import LATEST, FolderSequence
-from vggtgeo.datasets.images import FRAMES_PER_SECOND
+from vggtgeo.datasets.frame import MAX_DELAY
+from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, partners_in_time
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
+from vggtgeo.io.errors import InputError, LeftOutWarning, warn
 from vggtgeo.io.text_files import whole_text
 
-MAX_DEPTH_DELAY = 0.02
-"""Maximum seconds between an image and its depth."""
 MAX_LETTERS = 200
 _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")
 MAX_FRAMES = 1e6
@@ -81,7 +77,7 @@ def _of_lists(folder: Path) -> list[_Frame]:
     depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
     partners = partners_in_time(images, depths)
     if depths and (alone := partners.count(None)):
-        _warn(f"`{folder}`: {alone} of {len(images)} images have no depth within {MAX_DEPTH_DELAY} s")
+        warn(f"`{folder}`: {alone} of {len(images)} images have no depth within {MAX_DELAY} s")
     return [
         (time, image, None if partner is None else depths[partner][1])
         for (time, image), partner in zip(images, partners, strict=True)
@@ -94,9 +90,9 @@ def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
     counted = all(time.is_integer() and abs(time) < MAX_FRAMES for time, *_ in pairs)
     if counted:
         rate = f"{FRAMES_PER_SECOND:g} a second"
-        _warn(f"`{file}`: its first column counts frames; {rate} are assumed, and depth in millimetres")
+        warn(f"`{file}`: its first column counts frames; {rate} are assumed, and depth in millimetres")
     elif file.name != _PAIRS[0]:
-        _warn(f"`{file}`: depth is taken in 1/5000 m, as TUM RGB-D has it; millimetres need --depth-scale 1000")
+        warn(f"`{file}`: depth is taken in 1/5000 m, as TUM RGB-D has it; millimetres need --depth-scale 1000")
     depths = {
         (time / FRAMES_PER_SECOND if counted else time, file.parent / image): file.parent / depth
         for time, image, depth in pairs
@@ -147,32 +143,9 @@ def _rows(file: Path, columns: int, expected: str) -> list[list[str]]:
 def _in_order(file: Path, entries: list[_Entry], frames: bool) -> list[_Entry]:
     ordered = sorted(entries, key=lambda entry: entry[0])
     if ordered != entries:
-        _warn(f"`{file}`: timestamps are out of order; the list was sorted by time")
+        warn(f"`{file}`: timestamps are out of order; the list was sorted by time")
     unique = [entry for row, entry in enumerate(ordered) if row == 0 or entry[0] > ordered[row - 1][0]]
     if len(unique) < len(ordered):
         text = f"`{file}`: {len(ordered) - len(unique)} lines repeat the time of another; the first was kept"
-        _warn(LeftOutWarning(text, len(ordered) - len(unique)) if frames else text)
+        warn(LeftOutWarning(text, len(ordered) - len(unique)) if frames else text)
     return unique
-
-
-def partners_in_time(images: list[_Entry], depths: list[_Entry]) -> list[int | None]:
-    """Return for each image (time, file) the row of its depth in a list in the order of time.
-
-    Pairs are made in the order of their time difference, each row once.
-    """
-    times = np.array([time for time, _ in depths])
-    candidates = []
-    for row, (time, _) in enumerate(images):
-        low, high = np.searchsorted(times, [time - MAX_DEPTH_DELAY, time + MAX_DEPTH_DELAY], side="left")
-        candidates += [(abs(times[k] - time), row, k) for k in range(low, min(high + 1, len(times)))]
-    partners: list[int | None] = [None] * len(images)
-    taken: set[int] = set()
-    for difference, row, k in sorted(candidates):
-        if difference <= MAX_DEPTH_DELAY and partners[row] is None and k not in taken:
-            partners[row] = k
-            taken.add(k)
-    return partners
-
-
-def _warn(message: str | InputWarning) -> None:
-    warnings.warn(message, InputWarning, stacklevel=4)

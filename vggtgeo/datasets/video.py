@@ -1,34 +1,34 @@
-"""A video file, decoded frame by frame by PyAV (`video_stream.py`)."""
+"""A video file, decoded frame by frame by PyAV, and its tracks: which are the images, which their depth; and live
+cameras: a webcam (`webcam:0`) or a stream by its address (`rtsp://...`, `http://...`), read by OpenCV.
+
+Action cameras write a small preview beside the recording; k4arecorder writes COLOR, DEPTH and IR into one Matroska
+file.
+"""
+
+from __future__ import annotations
 
 import math
+import os
 import re
-import warnings
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import monotonic
 from typing import Any, Self
 
+import av
+import cv2
 import numpy as np
+from jaxtyping import UInt8
 
-from vggtgeo.datasets.depth_files import MILLIMETRES, metres_of_codes
-from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.datasets.frame import Frame, NearestInTime, check_range, check_selection
+from vggtgeo.datasets.image_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.intrinsics import MAX_ASPECT, camera_from_folder, guess_with_warning
-from vggtgeo.datasets.video_stream import (
-    ChosenTracks,
-    DepthStream,
-    Track,
-    VideoStream,
-    choose_tracks,
-    open_container,
-    open_stream,
-    shown_size,
-    stands_alone,
-    tracks_of,
-)
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, NoteWarning
+from vggtgeo.io.errors import InputError, LeftOutWarning, NoteWarning, warn
 
 FASTEST = 1000
 """Frames a second that a header may state."""
@@ -36,15 +36,95 @@ _FALLBACK_RATE = 30.0
 _HEAD = 4096
 _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 """Control characters other than those of text and terminals: every video has some."""
-Size = tuple[int, int]
+_NO_TIMESTAMPS = 0x80
+"""Flag of FFmpeg's formats that are streams without a container (AVFMT_NOTIMESTAMPS)."""
+_IMAGES = ("_pipe", "gif", "image2", "ico")
+"""Formats of FFmpeg that hold images: it takes one for a video of one frame."""
+_PREDICTED = (2, 3)
+"""Types of frames that are made of others: P and B."""
+_DEPTH = re.compile(r"(^|[^a-z])depth([^a-z]|$)", re.IGNORECASE)
+_INFRARED = re.compile(r"(^|[^a-z])(ir|infrared)([^a-z]|$)", re.IGNORECASE)
+_ATTACHED_PICTURE = 0x400
+_UNNAMED = "VideoHandler"
+"""Title that FFmpeg gives a track without one."""
+
+
+_WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
+"""Digits of a webcam's number."""
+_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://.+", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Track:
+    """A stream of video.
+
+    Fields: index, among all streams of the file. number, among those of video. title, "" for none. codec and pixels,
+    FFmpeg's names. width, height, pixels. cover, whether it is a single picture for lists of files.
+    """
+
+    index: int
+    number: int
+    title: str
+    codec: str
+    pixels: str
+    width: int
+    height: int
+    cover: bool = False
+
+    def __str__(self) -> str:
+        title = f", `{self.title}`" if self.title else ""
+        return f"track {self.number} ({self.codec}, {self.width} x {self.height}{title})"
+
+    @property
+    def has_16_bits_of_grey(self) -> bool:
+        """Return whether its pixels may be depth in millimetres."""
+        return self.pixels.startswith("gray16")
+
+    @property
+    def is_depth(self) -> bool:
+        """Return whether its title says so."""
+        return bool(_DEPTH.search(self.title))
+
+
+@dataclass(frozen=True)
+class ChosenTracks:
+    """Fields: images and depth, the tracks that are read. others, those that are not."""
+
+    images: Track
+    depth: Track | None
+    others: tuple[Track, ...]
+
+    @property
+    def maybe_depth(self) -> tuple[Track, ...]:
+        """Tracks that are not read and may be depth, without a title that says so."""
+        untitled = (one for one in self.others if one.has_16_bits_of_grey and not _INFRARED.search(one.title))
+        return tuple(untitled) if self.depth is None else ()
+
+
+def choose_tracks(tracks: Sequence[Track]) -> ChosenTracks:
+    """Choose the largest track in colour, before grey and infrared, and the 16-bit grey one whose title says depth.
+
+    tracks: at least one.
+    """
+    videos = [track for track in tracks if not track.cover] or list(tracks)
+    depth = next((track for track in videos if track.is_depth and track.has_16_bits_of_grey), None)
+    rank = lambda track: (
+        track.is_depth,
+        bool(_INFRARED.search(track.title)),
+        track.pixels.startswith("gray"),
+        -track.width * track.height,
+    )
+    images = min(videos, key=rank)
+    depth = None if depth is images else depth
+    return ChosenTracks(images, depth, tuple(track for track in tracks if track not in (images, depth)))
 
 
 @dataclass(frozen=True)
 class VideoFile:
     """A video without ground truth; with depth if a track of it says so. Intrinsics come from a file in its folder.
 
-    Fields: path; name; camera; rate, frames/s; count, the container's number of frames (an estimate);
-    given_rate, frames/s in place of the container's times; tracks, those that are read, of a file with several.
+    Fields: path; name; camera; rate, frames/s; count, the container's number of frames (an estimate); tracks, those
+    that are read; given_rate, frames/s in place of the container's times.
     """
 
     path: Path
@@ -52,9 +132,9 @@ class VideoFile:
     camera: Camera
     rate: float
     count: int
+    tracks: ChosenTracks
     has_depth: bool = False
     given_rate: float | None = None
-    tracks: ChosenTracks | None = None
 
     @classmethod
     def open(cls, path: Path, depth: bool = True) -> Self:
@@ -66,25 +146,30 @@ class VideoFile:
         """
         _check_content(path)
         tracks = _tracks(path, depth)
-        with open_stream(path, None if tracks is None else tracks.images.index) as stream:
+        with _open_stream(path, tracks.images) as stream:
             first = next((frame for _, frame in stream.frames()), None)
             if first is None:
                 raise InputError(
-                    f"`{path}` has no frame that can be decoded (its codec: {stream.codec}): it is damaged, or of a "
-                    "kind that FFmpeg does not decode; `ffmpeg -i FILE -c:v libx264 NEW.mp4` converts others"
+                    f"`{path}` has no frame that can be decoded (its codec: {tracks.images.codec}): it is damaged, or "
+                    "of a kind that FFmpeg does not decode; `ffmpeg -i FILE -c:v libx264 NEW.mp4` converts others"
                 )
-            width, height = shown_size(first)
-            aspect = _pixel_aspect(stream, first)
-            rate, count, has_times = stream.rate, stream.count, stream.has_times
-        if tracks is not None and tracks.depth is not None:
-            _check_depth(path, tracks, tracks.depth, (width, height))
+            width, height = _shown_size(first)
+            aspect = stream.pixel_aspect if 1 / MAX_ASPECT <= stream.pixel_aspect <= MAX_ASPECT else 1.0
+            aspect = aspect if (width, height) == (first.width, first.height) else 1 / aspect
+        if tracks.depth is not None and (tracks.depth.width, tracks.depth.height) != (width, height):
+            raise InputError(
+                f"`{path}`: the depth of {tracks.depth} has another size than the images of {tracks.images}: register "
+                "it first (Azure Kinect: `k4a_transformation_depth_image_to_color_camera`), or leave it out with "
+                "--rgb-only"
+            )
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
-        if not has_times:
-            text = "is a stream without times: is its header damaged?"
-            _warn(InputWarning(f"`{path}` {text} {rate:g} frames a second are assumed: give `--fps` if it has others"))
-        has_depth = tracks is not None and tracks.depth is not None
-        rate = rate if 0 < rate < FASTEST else _FALLBACK_RATE
-        return cls(path, path.name, camera, rate, max(count, 1), has_depth, None, tracks)
+        if not stream.has_times:
+            warn(
+                f"`{path}` is a stream without times: is its header damaged? {stream.rate:g} frames a second are "
+                "assumed: give `--fps` if it has others"
+            )
+        rate = stream.rate if 0 < stream.rate < FASTEST else _FALLBACK_RATE
+        return cls(path, path.name, camera, rate, max(stream.count, 1), tracks, tracks.depth is not None)
 
     def __len__(self) -> int:
         return self.count
@@ -96,13 +181,13 @@ class VideoFile:
         ends before its container says so ends with an InputWarning.
         """
         check_selection(self.name, self.count, start, end, stride)
-        return self._decode(_Selection(start, end, stride))
+        return self._decode(range(start, sys.maxsize if end is None else end, stride))
 
     def ground_truth(self) -> Trajectory | None:
         """Return None."""
         return None
 
-    def _decode(self, selection: "_Selection") -> Iterator[Frame]:
+    def _decode(self, chosen: range) -> Iterator[Frame]:
         index, time = 0, -math.inf
         damaged: int | None = None  # the first of the frames that cannot be decoded, while they last
         size, others = (self.camera.width, self.camera.height), []
@@ -112,45 +197,46 @@ class VideoFile:
                 if failed or frame.is_corrupt:
                     damaged = index if damaged is None else damaged
                     index += self._missed(failed, stated - time, index)
-                if selection.is_behind(index):
+                if index >= chosen.stop:
                     break
                 time = self._time(index, time, stated)
-                if damaged is not None and stands_alone(frame) and not frame.is_corrupt:
-                    self._warn_of_damage(selection, damaged, index)
+                if damaged is not None and int(frame.pict_type) not in _PREDICTED and not frame.is_corrupt:
+                    self._warn_of_damage(chosen, damaged, index)
                     damaged = None
-                if damaged is None and selection.has(index):
-                    if shown_size(frame) != size:
-                        others.append(f"frame {index} is {shown_size(frame)[0]} x {shown_size(frame)[1]}")
+                if damaged is None and index in chosen:
+                    if _shown_size(frame) != size:
+                        others.append(f"frame {index} is {_shown_size(frame)[0]} x {_shown_size(frame)[1]}")
                     else:
                         depth = None if depths is None else self._depth(depths, stated)
                         yield Frame(index, time, stream.rgb(frame), depth, f"{self.name}, frame {index}")
                 index += 1
         if damaged is not None:
-            self._warn_of_damage(selection, damaged, index)
+            self._warn_of_damage(chosen, damaged, index)
         if others:
             text = f"{len(others)} frames are not {size[0]} x {size[1]} pixels as the first ({others[0]})"
-            _warn(LeftOutWarning(f"`{self.name}`: {text}; they are skipped", len(others)))
-        wanted = self.count if selection.end is None else min(selection.end, self.count)
-        if index < wanted:
+            warn(LeftOutWarning(f"`{self.name}`: {text}; they are skipped", len(others)))
+        if index < min(chosen.stop, self.count):
             counts = f"ends after {index} frames; its header says {self.count}"
             text = f"`{self.name}` {counts}: is the file cut off, or damaged, or was it trimmed?"
-            _warn(InputWarning(text))  # not as left out: the count of an MKV is an estimate where the rate varies
+            warn(text)  # not as left out: the count of an MKV is an estimate where the rate varies
 
     @contextmanager
-    def _streams(self) -> Iterator[tuple[VideoStream, DepthStream | None]]:
+    def _streams(self) -> Iterator[tuple[_Stream, NearestInTime | None]]:
         """Return the images, and the depth where it is read."""
-        with open_stream(self.path, None if self.tracks is None else self.tracks.images.index) as images:
-            if self.tracks is None or self.tracks.depth is None or not self.has_depth:
+        with _open_stream(self.path, self.tracks.images) as images:
+            if self.tracks.depth is None or not self.has_depth:
                 yield images, None
                 return
-            with open_stream(self.path, self.tracks.depth.index) as depth:
-                yield images, DepthStream(depth, images.start)
+            with _open_stream(self.path, self.tracks.depth) as depth:
+                later = depth.start - images.start
+                yield images, NearestInTime((depth.time(frame) + later, frame) for _, frame in depth.frames())
 
-    def _depth(self, depths: DepthStream, time: float) -> np.ndarray:
+    def _depth(self, depths: NearestInTime, time: float) -> np.ndarray:
         """Return depth at a time of the stream, metres, NaN for none."""
-        codes = depths.at(time)
-        shape = self.camera.height, self.camera.width
-        return np.full(shape, np.nan, np.float32) if codes is None else metres_of_codes(codes, MILLIMETRES)
+        frame = depths.at(time)
+        if frame is None:
+            return np.full((self.camera.height, self.camera.width), np.nan, np.float32)
+        return metres_of_codes(frame.to_ndarray(format="gray16le"), MILLIMETRES)
 
     def _missed(self, failed: int, seconds: float, index: int) -> int:
         """Return frames that are missing before one: those that failed, or those that the time since the last one
@@ -167,79 +253,229 @@ class VideoFile:
             return index / self.given_rate
         return stated if stated > previous else previous + 1.0 / self.rate
 
-    def _warn_of_damage(self, selection: "_Selection", first: int, behind: int) -> None:
-        if count := selection.count(first, behind):
+    def _warn_of_damage(self, chosen: range, first: int, behind: int) -> None:
+        if count := sum(index in chosen for index in range(first, behind)):
             text = f"frames {first} to {behind - 1} cannot be decoded, or are predicted from such"
-            _warn(LeftOutWarning(f"`{self.name}` is damaged: {text}; they are skipped", count))
+            warn(LeftOutWarning(f"`{self.name}` is damaged: {text}; they are skipped", count))
 
 
-@dataclass(frozen=True)
-class _Selection:
-    """The frames start, start + stride, ... below end."""
+class _Stream:
+    """One stream of an open file.
 
-    start: int
-    end: int | None
-    stride: int
+    rate: frames a second as stated, 0 for none. count: frames as stated, or by the stated duration, 0 for none. start:
+    time of the first frame, seconds of the file. pixel_aspect: width of a stored pixel over its height (1440 x 1080 are
+    shown as 16:9), 0 for none. has_times: whether the file has a container, which states the time of each frame.
+    """
 
-    def is_behind(self, index: int) -> bool:
-        return self.end is not None and index >= self.end
+    def __init__(self, container: Any, index: int) -> None:
+        """container: of `av`. index: of the stream among all of the file."""
+        self._container = container
+        self._stream = stream = container.streams[index]
+        stream.thread_type = "AUTO"
+        self._conversion = av.video.reformatter.VideoReformatter()
+        self.start = float((stream.start_time or 0) * (stream.time_base or 0))
+        self.rate = float(stream.guessed_rate or stream.average_rate or 0)
+        self.count = int(stream.frames or round(self._seconds() * self.rate))
+        self.pixel_aspect = float(stream.sample_aspect_ratio or 0)
+        self.has_times = not int(container.format.flags) & _NO_TIMESTAMPS
 
-    def has(self, index: int) -> bool:
-        return index >= self.start and not self.is_behind(index) and (index - self.start) % self.stride == 0
+    def frames(self) -> Iterator[tuple[int, Any]]:
+        """Yield each decoded frame, and how many packets before it could not be decoded."""
+        failed = 0
+        packets = self._container.demux(self._stream)
+        while True:
+            try:
+                packet = next(packets, None)
+            except av.error.FFmpegError:  # of the container: there is nothing to be read behind it
+                return
+            if packet is None:
+                return
+            try:
+                decoded = packet.decode()
+            except av.error.FFmpegError:
+                failed += 1
+                continue
+            for frame in decoded:
+                yield failed, frame
+                failed = 0
 
-    def count(self, first: int, behind: int) -> int:
-        """Return how many lie from `first` to before `behind`."""
-        return sum(self.has(index) for index in range(first, behind))
+    def time(self, frame: Any) -> float:
+        """Return seconds of a frame since the stream's start; NaN if it has no time."""
+        return float(frame.time) - self.start if frame.time is not None and self.has_times else math.nan
+
+    def rgb(self, frame: Any) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the pixels of a frame, rotated as its file states."""
+        turns = round(frame.rotation / 90)
+        # Of 10 bits FFmpeg's RGB differs from its BGR by up to 5: BGR is that of OpenCV. A frame's own `to_ndarray`
+        # sets the conversion up anew each time, which takes as long as the conversion.
+        image: Any = self._conversion.reformat(frame, format="bgr24", interpolation="BICUBIC").to_ndarray()
+        image = np.ascontiguousarray(np.rot90(image, turns))
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+
+    def _seconds(self) -> float:
+        """Return the duration of the stream as Matroska states it, else of the whole file."""
+        stated = re.fullmatch(r"(\d+):(\d+):([\d.]+)", self._stream.metadata.get("DURATION", ""))
+        if stated is None:
+            return (self._container.duration or 0) * 1e-6
+        return 3600.0 * int(stated[1]) + 60.0 * int(stated[2]) + float(stated[3]) - self.start
 
 
-def _pixel_aspect(stream: VideoStream, frame: Any) -> float:
-    """Return width of a shown pixel over its height (1440 x 1080 are shown as 16:9); 1 if not stated, or impossible."""
-    aspect = stream.pixel_aspect
-    if not 1 / MAX_ASPECT <= aspect <= MAX_ASPECT:
-        return 1.0
-    return 1 / aspect if shown_size(frame) != (frame.width, frame.height) else aspect
+def _shown_size(frame: Any) -> tuple[int, int]:
+    """Return width and height of a frame after it is rotated as its file states."""
+    return (frame.height, frame.width) if round(frame.rotation / 90) % 2 else (frame.width, frame.height)
 
 
-def _tracks(path: Path, depth: bool) -> ChosenTracks | None:
-    """Return the tracks that are read, with a note; None if the first is all that there is to be read."""
-    with open_container(path) as container:
-        tracks = tracks_of(container)
-    if len(tracks) < 2:
-        return None
+@contextmanager
+def _open_container(path: Path) -> Iterator[Any]:
+    """Open a video file; raise InputError if FFmpeg cannot."""
+    try:
+        container = av.open(os.path.abspath(path))  # what is before a `:` would be a protocol otherwise
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"`{path}` cannot be opened as a video ({reason}): it is damaged, or not a video; give an MP4, MOV, MKV, "
+            "AVI or WebM"
+        ) from None
+    with container:
+        yield container
+
+
+@contextmanager
+def _open_stream(path: Path, track: Track) -> Iterator[_Stream]:
+    with _open_container(path) as container:
+        yield _Stream(container, track.index)
+
+
+def _tracks(path: Path, depth: bool) -> ChosenTracks:
+    """Return the tracks that are read, with a note if there are others; raise InputError if no track is a video."""
+    with _open_container(path) as container:
+        if container.format.name.endswith(_IMAGES):
+            raise InputError(
+                f"`{path}` is an image ({container.format.name}); give the folder of the sequence, or a video file"
+            )
+        streams = enumerate(container.streams.video)
+        tracks = [_track(number, stream) for number, stream in streams if stream.codec_context is not None]
+    if not tracks:
+        raise InputError(f"`{path}` has no stream of video that can be decoded")
     chosen = choose_tracks(tracks)
     chosen = chosen if depth else replace(chosen, depth=None)
+    if len(tracks) < 2:
+        return chosen
     beside = f", depth in millimetres of {chosen.depth}" if chosen.depth else ""
     left = ", ".join(map(str, chosen.others))
-    _warn(NoteWarning(f"`{path}`: images of {chosen.images}{beside}" + (f"; not read: {left}" if left else "")))
+    warn(f"`{path}`: images of {chosen.images}{beside}" + (f"; not read: {left}" if left else ""), NoteWarning)
     if depth and (maybe := chosen.maybe_depth):
-        _warn(
-            InputWarning(
-                f"`{path}`: {', '.join(map(str, maybe))} may be depth (16 bits of grey), and has no title that says so:"
-                f" not used; `ffmpeg -i FILE -map 0 -c copy -metadata:s:v:{maybe[0].number} title=DEPTH NEW.mkv` gives "
-                "the title, for depth in millimetres"
-            )
+        warn(
+            f"`{path}`: {', '.join(map(str, maybe))} may be depth (16 bits of grey), and has no title that says so:"
+            f" not used; `ffmpeg -i FILE -map 0 -c copy -metadata:s:v:{maybe[0].number} title=DEPTH NEW.mkv` gives "
+            "the title, for depth in millimetres"
         )
     return chosen
 
 
-def _check_depth(path: Path, chosen: ChosenTracks, depth: Track, size: Size) -> None:
-    if (depth.width, depth.height) != size:
-        raise InputError(
-            f"`{path}`: the depth of {depth} has another size than the images of {chosen.images}: register it first "
-            "(Azure Kinect: `k4a_transformation_depth_image_to_color_camera`), or leave it out with --rgb-only"
-        )
+def _track(number: int, stream: Any) -> Track:
+    codec = stream.codec_context
+    title = stream.metadata.get("title") or stream.metadata.get("handler_name") or ""
+    title = "" if title == _UNNAMED else str(title)
+    cover = bool(int(stream.disposition) & _ATTACHED_PICTURE)
+    return Track(stream.index, number, title, codec.name, str(codec.pix_fmt), codec.width, codec.height, cover)
 
 
 def _check_content(path: Path) -> None:
     """Raise InputError for an empty file or text: FFmpeg draws letters, and opens lists of addresses (`m3u8`)."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-    except OSError as error:  # a disk that fails
-        raise InputError(f"`{path}` cannot be read: {error.strerror}; give a copy on a disk that works") from None
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
     if not _NO_TEXT.search(head):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
 
 
-def _warn(warning: InputWarning) -> None:
-    warnings.warn(warning, stacklevel=3)
+def is_live(text: str) -> bool:
+    """Return whether `text` names a webcam or a stream, not a file."""
+    return _WEBCAM.fullmatch(text) is not None or _ADDRESS.fullmatch(text) is not None
+
+
+@dataclass(frozen=True)
+class LiveCamera:
+    """Frames of a live camera, without depth and ground truth, until the stream ends or the run is interrupted.
+
+    The length is unknown (0). Times are those of arrival.
+    """
+
+    source: str
+    camera: Camera
+    has_depth: bool = False
+
+    @classmethod
+    def open(cls, source: str) -> Self:
+        """Open a camera and read one frame for the size; raise InputError if no camera answers."""
+        capture = _capture(source)
+        try:
+            there, image = capture.read()
+            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        finally:
+            capture.release()
+        if not there:
+            raise InputError(f"`{_public(source)}` gives no frame: is the camera connected, and not in use?")
+        height, width = image.shape[:2]
+        if _ADDRESS.fullmatch(source) and math.isfinite(count) and count > 0:  # a live camera has no length
+            warn(
+                f"`{_public(source)}` is a recording of {count:.0f} frames, whose times would be those of arrival: "
+                "download it first (`curl -O ADDRESS`), and give the file"
+            )
+        return cls(source, guess_with_warning(_public(source), width, height))
+
+    @property
+    def name(self) -> str:
+        """Return the source without its password."""
+        return _public(self.source)
+
+    def __len__(self) -> int:
+        return 0
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """Return the frames start, start + stride, ... below end as they arrive; frames that are not requested in time
+        are lost.
+        """
+        check_range(start, end, stride)
+        return self._read(start, end, stride)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return None: there is no ground truth."""
+        return None
+
+    def _read(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
+        capture = _capture(self.source)
+        began = last = monotonic()
+        index = 0
+        try:
+            while (end is None or index < end) and capture.grab():
+                now = max(monotonic(), last + 1e-6)
+                if index >= start and (index - start) % stride == 0:
+                    there, image = capture.retrieve()
+                    if there:
+                        yield Frame(
+                            index, now - began, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), None, f"{self.name}, {index}"
+                        )
+                last = now
+                index += 1
+        finally:
+            capture.release()
+
+
+def _public(source: str) -> str:
+    """Return an address without the user's name and password."""
+    return re.sub(r"//[^/?#]*@", "//", source)
+
+
+def _capture(source: str) -> cv2.VideoCapture:
+    webcam = _WEBCAM.fullmatch(source)
+    logging: Any = cv2.utils.logging
+    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the error below replaces its warnings
+    try:
+        capture = cv2.VideoCapture(int(webcam.group(1) or 0) if webcam else source)
+    finally:
+        logging.setLogLevel(level)
+    if not capture.isOpened():
+        capture.release()
+        raise InputError(f"`{_public(source)}` cannot be opened: is the camera connected, and the address right?")
+    return capture

@@ -1,4 +1,5 @@
-"""Views of a sequence: with other intrinsics, without depth or ground truth, or with smaller images.
+"""Views of a sequence: with other intrinsics, without depth or ground truth, or with smaller images; and frames of any
+iterable: a list, a generator, a live camera.
 
 The pipeline detects and judges corners in pixels. Pixel noise and search radii are constants, measured on images of 540
 x 360 to 752 x 480. Phones record 1920 x 1080 and 3840 x 2160, where corners are blurred over several pixels and the
@@ -8,26 +9,28 @@ same error is many pixels: a sequence without intrinsics that initializes at 540
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
-from typing import overload
+from typing import Any, overload
 
 import cv2
 import numpy as np
 
 from vggtgeo.datasets.bags import RosBag
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.frame import Frame, Sequence, check_frame
-from vggtgeo.datasets.images import ImageFolder
-from vggtgeo.datasets.in_memory import FrameStream, copied
+from vggtgeo.datasets.frame import Frame, Sequence, check_depth, check_frame, check_selection, described
+from vggtgeo.datasets.image_files import MAX_DEPTH, MIN_DEPTH
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.nerfstudio import Nerfstudio
-from vggtgeo.datasets.rgbd_folders import RgbdFolders
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.given import check_positive
 
 MIN_UNITS, MAX_UNITS = 1e-3, 1e6
@@ -161,3 +164,95 @@ def _reduced_frames(frames: Iterator[Frame], camera: Camera, smaller: Camera) ->
         if depth is not None:  # a mean over an edge would be on no surface
             depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
         yield replace(frame, image=image, depth=depth)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameStream:
+    """Frames of one camera, read once."""
+
+    camera: Camera
+    has_depth: bool
+    source: Iterator[Frame]
+
+    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
+        """Return every `stride`-th frame from `start` to before `end`."""
+        check_selection("frames", sys.maxsize, start, end, stride)
+        return itertools.islice(self.source, start, end, stride)
+
+
+def frame_stream(frames: Iterable[Any], camera: Camera | None = None) -> FrameStream:
+    """Return frames of any iterable, which is read one frame ahead.
+
+    Args:
+        frames: of `Frame`; or images, uint8 [H, W, 3] RGB, 30 a second; or pairs of an image and depth, float [H, W]
+            metres with NaN for none. They are copied: a camera may reuse one array.
+        camera: of all frames; None: a guess from the size of the first image, and intrinsics are estimated.
+
+    Raises:
+        InputError: there is no frame, or one has another type.
+
+    """
+    if not isinstance(frames, Iterable):
+        raise InputError(f"`frames` is {described(frames)}; give a folder, a video file, or images one after another")
+    counted = (_frame(item, index) for index, item in enumerate(frames))
+    first = next(counted, None)
+    if first is None:
+        raise InputError("`frames` is empty; give at least one frame")
+    height, width = first.image.shape[:2]
+    source = _of_one_kind(first, counted)
+    return FrameStream(camera or Camera.guess(width, height), first.depth is not None, source)
+
+
+def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
+    """Yield all frames; warn of depth that later frames alone have, and of depth in another unit."""
+    last, warned = first, first.depth is not None
+    _warn_of_unit(first)
+    yield first
+    for frame in others:
+        if frame.index <= last.index:
+            raise InputError(
+                f"`{frame.name}` has the index {frame.index} after {last.index}; number the frames from 0 on, as "
+                "`enumerate` does"
+            )
+        if frame.depth is not None and not warned:
+            warn(
+                f"`{frame.name}` has depth, and `{first.name}` had none: depth is used where the first frame has it, "
+                "all NaN if need be; reading the images only"
+            )
+            warned = True
+        yield frame
+        last = frame
+
+
+def _warn_of_unit(frame: Frame) -> None:
+    """Warn of depth without a value in range; all NaN is valid."""
+    depth = frame.depth
+    if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or np.isnan(depth).all():
+        return
+    if not ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
+        warn(
+            f"the depth of `{frame.name}` goes from {np.nanmin(depth):g} to {np.nanmax(depth):g}, and none of it is "
+            f"from {MIN_DEPTH:g} to {MAX_DEPTH:g} m: are these metres (millimetres: divide by 1000.0)? It is not used"
+        )
+
+
+def _frame(item: Any, index: int) -> Frame:
+    if isinstance(item, Frame):
+        given: Any = item.image
+        if not isinstance(given, np.ndarray) or given.ndim != 3:
+            raise InputError(f"`frames[{index}]` has an image {described(given)}; it must be uint8 [H, W, 3], RGB")
+        return copied(item)
+    image, depth = item if isinstance(item, tuple) and len(item) == 2 else (item, None)
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise InputError(
+            f"`frames[{index}]` is {described(image)}; it must be a `Frame`, uint8 [H, W, 3], or (image, depth)"
+        )
+    if depth is not None:
+        check_depth(f"the depth of `frames[{index}]`", depth, image)
+        depth = depth.astype(np.float32)
+    return Frame(index, index / FRAMES_PER_SECOND, image.copy(), depth, f"frame {index}")
+
+
+def copied(frame: Frame) -> Frame:
+    """Return the frame with copies of its arrays."""
+    return replace(frame, image=copy(frame.image), depth=copy(frame.depth))

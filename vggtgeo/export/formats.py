@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vggtgeo.datasets.depth_files import read_codes
+from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.export.colmap import write_colmap
-from vggtgeo.export.contents import EmptyRunError, cloud_of, copy_pictures, picture_mask, scene_of
-from vggtgeo.export.surfaces import write_glb, write_las, write_ply
+from vggtgeo.export.colmap import copy_pictures, scene_of, write_colmap
+from vggtgeo.export.surfaces import EmptyRunError, cloud_of, write_glb, write_las, write_ply
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import atomic_path, whole_path, write_json, write_picture, write_text
 from vggtgeo.io.given import path_of
-from vggtgeo.io.locks import LockedError, locked, not_written
+from vggtgeo.io.locks import not_written
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.summary import load_poses, read_summary
@@ -38,8 +35,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     """
     scene, cloud = scene_of(source), cloud_of(source)
     poses = rigid.invert(scene.poses) @ FROM_OPENGL
-    copy_pictures(scene, source, target)
-    mask = picture_mask(scene, source)
+    mask = copy_pictures(scene, source, target)
     if mask is not None:
         with atomic_path(target / "mask.png") as temporary:
             temporary.write_bytes(mask)
@@ -55,7 +51,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
         frames.append(frame)
     if not deep:
         text = f"`{source / 'depth'}` does not exist, the export has no depth; run again with `--save-depth`"
-        warnings.warn(text, InputWarning, stacklevel=3)
+        warn(text)
     cloud.save_ply(target / "points.ply")
     fx, fy, cx, cy = (float(value) for value in scene.intrinsics)
     camera = {"camera_model": "PINHOLE", "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
@@ -107,9 +103,6 @@ FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
 """Each function writes the files of a format from a run's folder to another, and returns counts."""
 _RECORD = ".vggtgeo-export"
 """Lists the files that exports wrote into a folder: the only ones that an export may replace."""
-_LOCK = ".vggtgeo-export.lock"
-_TIMEOUT = 10.0
-"""Seconds that an export waits for another."""
 
 
 def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[str] | None = None) -> dict[str, float]:
@@ -133,22 +126,22 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
         raise InputError(f"`to` must be one of {', '.join(FORMATS)}, got {to!r}")
     check_is_run(place)
     output = path_of("target", target) if target is not None else place / EXPORTS / to
-    _check_target(output, place)
+    if whole_path(output) == whole_path(place):
+        raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
     verdict = read_summary(place)[1]
     failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""
     try:
         with _staged(output) as stage:  # existing files stay until all new ones are complete
             written = FORMATS[to](place, stage)
             names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
-            with _locked(output):
-                _record(output, names, ours=whole_path(output) == whole_path(place / EXPORTS / to))
-                for name in names:
-                    (output / name).parent.mkdir(parents=True, exist_ok=True)
-                    (stage / name).replace(output / name)
+            _record(output, names, ours=whole_path(output) == whole_path(place / EXPORTS / to))
+            for name in names:
+                (output / name).parent.mkdir(parents=True, exist_ok=True)
+                (stage / name).replace(output / name)
     except EmptyRunError as error:
         raise InputError(f"{error} ({failed})" if failed else str(error)) from None
     if failed:
-        warnings.warn(f"`{place}`: {failed}", InputWarning, stacklevel=2)
+        warn(f"`{place}`: {failed}")
     return written
 
 
@@ -157,53 +150,18 @@ def _staged(output: Path) -> Iterator[Path]:
     """Make a temporary folder in `output` for the files of an export; remove new folders that stay empty."""
     made = [folder for folder in (output, *output.parents) if not folder.exists()]
     try:
-        stage = _new_stage(output)
-        try:
-            yield stage
-        except OSError as error:
-            # Name the output in the error: the stage does not exist afterwards.
-            if error.filename is not None and Path(error.filename).is_relative_to(stage):
-                raise not_written(output, error) from None
-            raise
-        finally:
-            shutil.rmtree(stage, ignore_errors=True)
+        output.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=output, ignore_cleanup_errors=True) as stage:
+            yield Path(stage)
+    except OSError as error:
+        # Name the output in the error: the stage does not exist afterwards.
+        if error.filename is not None and Path(error.filename).is_relative_to(output):
+            raise not_written(output, error) from None
+        raise
     finally:
         for folder in made:  # innermost first
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
-
-
-def _new_stage(output: Path) -> Path:
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=".unfinished-", dir=output))
-    except OSError as error:
-        raise not_written(output, error) from None
-
-
-@contextmanager
-def _locked(output: Path) -> Iterator[None]:
-    """Lock the folder against other exports, which hold it for a moment only; raise InputError after a timeout."""
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(locked(output / _LOCK, _TIMEOUT))
-        except LockedError:
-            raise InputError(f"`{output}` is in use by another export; give another folder with `-o`") from None
-        except OSError as error:
-            raise not_written(output, error) from None
-        yield
-
-
-def _check_target(output: Path, run: Path) -> None:
-    """Raise InputError if the export would mix with the run's own files or a recording, or `output` is a file."""
-    if whole_path(output) == whole_path(run):
-        raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
-    for name in ("images", "depth"):
-        if whole_path(output).is_relative_to(whole_path(run / name)):
-            raise InputError(f"`{output}` is in `{run / name}`, which is the run's own; give another for the export")
-    for folder in (output, *output.parents):
-        if os.path.lexists(folder) and not folder.is_dir():
-            raise InputError(f"`{folder}` is not a folder; give a new one for the export with `-o`")
 
 
 def _record(output: Path, names: list[str], ours: bool) -> None:

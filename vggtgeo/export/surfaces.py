@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from vggtgeo.export.contents import cloud_of, mesh_of
+from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path
 
@@ -35,6 +36,32 @@ _LAS_COUNTS = 2**31 - 1
 FULL_SCALE = 65535
 _LINEAR_BELOW, _SLOPE, _OFFSET, _GAMMA = 0.04045, 12.92, 0.055, 2.4
 """Of the transfer function of sRGB."""
+
+
+class EmptyRunError(InputError):
+    """The run lacks the data that a format needs, for example points."""
+
+
+def cloud_of(source: Path) -> PointCloud:
+    """Load the cloud of the run in `source`; raise EmptyRunError if it has no points."""
+    file = source / "map.ply"
+    if not file.is_file():
+        raise InputError(f"`{file}` does not exist; give a folder that `vggtgeo run` wrote")
+    cloud = PointCloud.load_ply(file)
+    if not len(cloud):
+        raise EmptyRunError(f"`{file}` has no points")
+    return cloud
+
+
+def mesh_of(source: Path) -> Mesh:
+    """Load the mesh of the run in `source`; raise EmptyRunError if it has none."""
+    file = source / "mesh.ply"
+    if not file.is_file():
+        raise EmptyRunError(
+            f"`{file}` does not exist, the run has no mesh; run again with `--dense auto` or `--dense mvs`, or export "
+            "the points with `--to ply`"
+        )
+    return Mesh.load_ply(file)
 
 
 def write_ply(source: Path, target: Path) -> dict[str, float]:
@@ -86,7 +113,7 @@ def write_las(source: Path, target: Path) -> dict[str, float]:
     header.offsets = np.floor(points.min(axis=0))
     record = laspy.LasData(header)
     record.x, record.y, record.z = points.T
-    record.red, record.green, record.blue = srgb_16_bits(cloud.colours).T
+    record.red, record.green, record.blue = (cloud.colours.astype(np.uint16) * (FULL_SCALE // 255)).T
     with atomic_path(target / "map.las") as temporary:
         record.write(str(temporary))
     return {"points": len(cloud)}
@@ -98,11 +125,6 @@ def _package(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise InputError(f"this export needs the package `{name}`; {install_hint('maps')}") from None
-
-
-def srgb_16_bits(colours: UInt8[np.ndarray, "n 3"]) -> UInt16[np.ndarray, "n 3"]:
-    """Return sRGB colours in 16 bits, for LAS."""
-    return colours.astype(np.uint16) * (FULL_SCALE // 255)
 
 
 def linear_16_bits(colours: UInt8[np.ndarray, "n 3"]) -> UInt16[np.ndarray, "n 3"]:

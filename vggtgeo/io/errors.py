@@ -53,6 +53,11 @@ class LeftOutWarning(InputWarning):
         self.frames = frames
 
 
+def warn(message: str | InputWarning, category: type[InputWarning] = InputWarning) -> None:
+    """Warn about the input, at the place that called the function in which this is called."""
+    warnings.warn(message, category, stacklevel=3)
+
+
 MAX_LENGTH = 1200
 """Characters of a line; a message may quote a whole damaged file."""
 _LONG_WORD = re.compile(r"[^\s]{500,}")
@@ -64,14 +69,14 @@ def shortened(message: str) -> str:
     return _LONG_WORD.sub(lambda word: f"{word[0][:60]}...{word[0][-60:]}", message)
 
 
-def one_line(message: str, most: int = MAX_LENGTH) -> str:
+def one_line(message: str) -> str:
     """Return `message` without line breaks and control characters (a file name may contain a code that clears the
-    screen), at most `most` characters, its middle left out.
+    screen), at most `MAX_LENGTH` characters, its middle left out.
     """
     words = shortened(" ".join(message.split()))
     text = "".join(sign if sign.isprintable() else f"\\x{ord(sign):02x}" for sign in words)
-    half = most // 2
-    return text if len(text) <= most else f"{text[:half]} ... {text[-half:]}"
+    half = MAX_LENGTH // 2
+    return text if len(text) <= MAX_LENGTH else f"{text[:half]} ... {text[-half:]}"
 
 
 _lock = Lock()

@@ -29,11 +29,6 @@ def whole_path(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def make_parent(path: Path) -> None:
-    """Create the parent folders of `path`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-
-
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path`, with its suffix, which replaces `path` at the end of the block.
@@ -49,7 +44,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
         yield temporary
-        _flush_to_disk(temporary)
+        with temporary.open("rb+") as written:
+            os.fsync(written.fileno())
         os.replace(temporary, target)
     except OSError as error:
         if error.filename is None or str(error.filename) == str(temporary):  # as on a full disk
@@ -77,14 +73,6 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def write_json(path: str | os.PathLike[str], values: Mapping[str, Any]) -> None:
     """Write `values` as indented JSON, atomically; NaN and infinity, which JSON lacks, are a ValueError."""
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
-
-
-def _flush_to_disk(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def write_picture(path: Path, image: np.ndarray, options: Sequence[int] = ()) -> None:

@@ -23,10 +23,9 @@ def jax_environment() -> dict[str, str]:
         "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
         "OPENBLAS_NUM_THREADS": "1",
     }
-    if fast_compilation() is not None:
-        found["XLA_FLAGS"] = str(fast_compilation())
-    folder = cache_folder()
-    if folder is not None:
+    if (flag := fast_compilation()) is not None:
+        found["XLA_FLAGS"] = flag
+    if (folder := cache_folder()) is not None:
         found["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         found["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(SHORTEST_CACHED_COMPILATION)
     return found
@@ -42,20 +41,13 @@ def fast_compilation() -> str | None:
     return "--xla_cpu_use_fusion_emitters=false" if version < (0, 11) else None
 
 
-def own_cache() -> Path | None:
-    """Return `$XDG_CACHE_HOME/vggtgeo/jax` (by default in `~/.cache`); None without a home folder."""
-    try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vggtgeo" / "jax"
-    except RuntimeError:
-        return None
-
-
 def cache_folder() -> Path | None:
-    """Return `own_cache`, created if missing; None if it is not writable."""
-    folder = own_cache()
+    """Return `$XDG_CACHE_HOME/vggtgeo/jax` (by default in `~/.cache`), created if missing; None without a home folder,
+    or if it is not writable.
+    """
     try:
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vggtgeo" / "jax"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (RuntimeError, OSError):
         return None
-    return folder if folder is not None and os.access(folder, os.W_OK) else None
+    return folder if os.access(folder, os.W_OK) else None

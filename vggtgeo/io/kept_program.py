@@ -164,13 +164,10 @@ def _read(path: Path) -> jax.export.Exported | None:
 
 
 def _digest(named: str) -> str:
-    parts = [*(f"{name} {metadata.version(name)}" for name in VERSIONS), _sources(), _switches(), named]
+    # The settings of JAX that change what is traced.
+    switches = str([_setting(name) for name in ("enable_x64", "default_matmul_precision", "numpy_dtype_promotion")])
+    parts = [*(f"{name} {metadata.version(name)}" for name in VERSIONS), _sources(), switches, named]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
-
-
-def _switches() -> str:
-    """Return the settings of JAX that change what is traced."""
-    return str([_setting(name) for name in ("enable_x64", "default_matmul_precision", "numpy_dtype_promotion")])
 
 
 def _setting(name: str) -> Any:

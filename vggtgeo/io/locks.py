@@ -11,27 +11,21 @@ from filelock import FileLock, Timeout
 
 from vggtgeo.io.errors import InputError
 
-
-class LockedError(OSError):
-    """Another process holds the lock."""
+LockedError = Timeout
+"""Another process holds the lock."""
 
 
 @contextmanager
-def locked(path: Path, timeout: float = 0.0) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Hold a lock on the file `path`, which is created, and removed at the end if it is empty.
-
-    timeout: seconds to wait for another process.
 
     Raises:
         LockedError: another process holds the lock.
         OSError: the file cannot be created, or is a link.
 
     """
-    lock = FileLock(path, timeout=timeout)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise LockedError(f"`{path}` is locked by another process") from None
+    lock = FileLock(path, blocking=False)
+    lock.acquire()
     own = path.stat()
     try:
         yield

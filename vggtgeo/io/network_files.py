@@ -52,12 +52,10 @@ def fetch_network(network: Network, folder: Path, endpoint: str | None = None) -
         return target
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f".{network.file}.{source.sha256[:16]}.part"
-    announced = _download(network, source, part, endpoint)
+    _download(network, source, part, endpoint)
     found = _sha256(part)
     if found != source.sha256:
         part.unlink()
-        if announced == source.sha256:
-            raise InputError(f"{_another(source, found)}: the download was damaged; nothing was kept, try again")
         raise InputError(
             f"{_another(source, found)}: its authors replaced it, or the download was damaged; nothing was kept, try "
             f"once again, and {_instead(network)}"
@@ -66,8 +64,8 @@ def fetch_network(network: Network, folder: Path, endpoint: str | None = None) -
     return target
 
 
-def _download(network: Network, source: HubFile, part: Path, endpoint: str | None) -> str | None:
-    """Append the missing part to `part`; return the SHA-256 that the server announced, if any.
+def _download(network: Network, source: HubFile, part: Path, endpoint: str | None) -> None:
+    """Append the missing part to `part`; raise InputError if the server announces another SHA-256.
 
     The client's `hf_hub_download` discards interrupted downloads.
     """
@@ -83,7 +81,6 @@ def _download(network: Network, source: HubFile, part: Path, endpoint: str | Non
             )
         with part.open("ab") as file:
             http_get(remote.location, file, resume_size=file.tell(), expected_size=remote.size)
-        return announced
     except (OSError, hub.errors.HfHubHTTPError, hub.errors.HFValidationError, broken) as error:
         reason = " ".join(str(error).split())
         raise InputError(

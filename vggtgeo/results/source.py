@@ -18,9 +18,8 @@ from jaxtyping import UInt8
 
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence
 from vggtgeo.datasets.frame import check_selection
-from vggtgeo.datasets.in_memory import FrameStream, frame_stream
 from vggtgeo.datasets.pose_files import load_trajectory
-from vggtgeo.datasets.views import reduced
+from vggtgeo.datasets.views import FrameStream, frame_stream, reduced
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, Sequence, check_frame
-from vggtgeo.datasets.in_memory import FrameStream, frame_stream
-from vggtgeo.datasets.views import reduced
+from vggtgeo.datasets.views import FrameStream, frame_stream, reduced
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory

@@ -1,8 +1,14 @@
-"""Log a run to Rerun: the camera of each frame, the window of each keyframe, the iterations of its solver."""
+"""Log a run to Rerun: the camera of each frame, the window of each keyframe, the iterations of its solver, and the map:
+the cloud of each keyframe, logged once in its own frame, and the keyframe's pose.
+
+When an adjustment moves a keyframe, logging its pose moves its points as well. So the cost per frame is bounded: at
+most `MAX_CLOUDS` clouds of `MAX_POINTS` points, and a transform per moved keyframe: those of the window, or all of them
+when submaps are merged.
+"""
 
 from __future__ import annotations
 
-import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +17,98 @@ import numpy as np
 from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.io.errors import InputWarning
+from vggtgeo.io.errors import warn
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.settings.groups import WindowSettings
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots, read_at
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
 from vggtgeo.viewing import entities
-from vggtgeo.viewing.live_map import LiveMap
 from vggtgeo.viewing.target import flush
+
+MAX_POINTS = 4000
+"""Of a keyframe's cloud: 60 kB, as much as three of the frames' images."""
+MAX_CLOUDS = 4
+"""Clouds logged per frame: a run in a known map, or a resumed one, starts with many keyframes."""
+MIN_CONFIDENCE = 128
+"""Of depth that is shown, of 255: as in the map."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Logged:
+    """Frame, pose and points of a keyframe as logged, to detect changes."""
+
+    frame: int
+    pose: np.ndarray
+    points: Slots
+
+
+class LiveMap:
+    """Logs the cloud of each keyframe and its pose, camera -> world, to `world/live/NUMBER`."""
+
+    def __init__(self, stream: Any):
+        self._stream = stream
+        self._logged: dict[int, _Logged] = {}
+
+    def update(self, slam: Slam) -> None:
+        """Log new clouds, and the poses of moved keyframes."""
+        room = MAX_CLOUDS
+        for keyframe in slam.adjusted_keyframes:
+            before = self._logged.get(keyframe.number)
+            if room and _is_stale(keyframe, before, slam):
+                points, colours = own_cloud(keyframe, slam.intrinsics, dense=slam.metric)
+                entities.log_cloud(self._stream, f"world/live/{keyframe.number}", points, colours)
+                room -= 1
+                entities.log_pose(self._stream, f"world/live/{keyframe.number}", keyframe.pose)
+                self._logged[keyframe.number] = _Logged(keyframe.frame, keyframe.pose, keyframe.points)
+            elif before is not None and keyframe.pose is not before.pose:
+                entities.log_pose(self._stream, f"world/live/{keyframe.number}", keyframe.pose)
+                self._logged[keyframe.number] = replace(before, pose=keyframe.pose)
+
+    def clear(self) -> None:
+        """Remove the clouds and the window's points, from the current time on."""
+        import rerun as rr
+
+        for path in ("world/live", "world/points"):
+            self._stream.log(path, rr.Clear(recursive=True))
+        self._logged.clear()
+
+
+def _is_stale(keyframe: Keyframe, before: _Logged | None, slam: Slam) -> bool:
+    """Return whether to log the cloud of a keyframe (again).
+
+    Without dense depth the cloud is that of the adjusted points, which may have changed. Those of the window change
+    with each keyframe and are shown by `world/points`.
+    """
+    if before is None or before.frame != keyframe.frame:  # a new map reuses keyframe numbers
+        return True
+    return not slam.metric and keyframe.points is not before.points and keyframe.number not in slam.window.members
+
+
+def own_cloud(keyframe: Keyframe, intrinsics: np.ndarray, *, dense: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return points float32 [n, 3] in the keyframe's camera frame, and colours uint8 [n, 3]; at most `MAX_POINTS`.
+
+    dense: use its depth on a regular grid, if it has any; else its adjusted points.
+    """
+    if dense:
+        height, width = keyframe.size
+        step = int(np.ceil(np.sqrt(height * width / MAX_POINTS)))
+        grid = np.s_[step // 2 :: step, step // 2 :: step]
+        z = keyframe.depth[grid].astype(np.float64)
+        rows, columns = np.nonzero(np.isfinite(z) & (keyframe.depth_confidence[grid] >= MIN_CONFIDENCE))
+        if len(rows):
+            pixels = np.column_stack([columns, rows]) * float(step) + step // 2
+            points = pinhole.rays(pixels, intrinsics) * z[rows, columns, None]
+            return points.astype(np.float32), keyframe.image[grid][rows, columns]
+    inverse = keyframe.points.inverse_depth
+    known = np.nonzero(np.isfinite(inverse) & (inverse > 0.1))[0][:MAX_POINTS]
+    pixels = keyframe.points.pixels[known]
+    points = pinhole.rays(pixels, intrinsics) / inverse[known, None]
+    return points.astype(np.float32), read_at(keyframe.image, pixels)
 
 
 class RerunCallback(Callback):
@@ -68,12 +155,12 @@ class RerunCallback(Callback):
         """Log the path after the last adjustment, and replace the live map by the dense map."""
         self._log_path(slam)
         self._live.clear()
-        entities.log_map(self.stream, cloud)
+        entities.log_cloud(self.stream, "world/map", cloud.points, cloud.colours)
         counts = f"{len(slam.frames)} frames, {len(slam.keyframes)} keyframes, {len(cloud)} points in the map"
         entities.log_note(self.stream, f"finished: {counts}", level="INFO")
         if problem := flush(self.stream, self._file):
             self.cut_short = self._file is not None
-            warnings.warn(problem, InputWarning, stacklevel=2)
+            warn(problem)
 
     @in_double_precision
     def _log_adjusted(self, slam: Slam) -> None:

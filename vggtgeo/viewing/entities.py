@@ -9,7 +9,6 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
-from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.sparse_map.connected import loop_edges, submap_of
@@ -20,40 +19,8 @@ from vggtgeo.slam.submaps import lost_stretches
 from vggtgeo.slam.window_recorder import WindowRecord
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
-ENTITIES = (
-    "/world",
-    "/world/camera",
-    "/world/camera/image",
-    "/world/trajectory",
-    "/world/keyframes",
-    "/world/covariance",
-    "/world/covisibility",
-    "/world/loops",
-    "/world/lost",
-    "/world/unjoined",
-    "/world/iteration",
-    "/world/points",
-    "/world/live/0",
-    "/world/map",
-    "/keyframe/image",
-    "/keyframe/image/matches",
-    "/keyframe/image/motion",
-    "/keyframe/image/lines",
-    "/keyframe/depth",
-    "/keyframe/confidence",
-    "/window/graph",
-    "/plots/residuals/points",
-    "/plots/residuals/lines",
-    "/plots/residuals/depth",
-    "/plots/solver/energy",
-    "/plots/convergence/damping",
-    "/plots/convergence/gradient",
-    "/plots/convergence/step",
-    "/plots/tracking/inliers",
-    "/plots/tracking/lost",
-    "/notes",
-)
-"""All entity paths in the recording of a run with depth and lines."""
+RADIUS = 0.011
+"""Of the points of clouds, metres."""
 SIGMAS = 20.0
 """Size of the ellipsoids, standard deviations: one is only millimetres in a good window."""
 _BLUE, _ORANGE, _GREEN, _GREY = (31, 95, 191), (224, 123, 26), (58, 143, 92), (150, 150, 150)
@@ -67,15 +34,22 @@ def log_camera(stream: Any, pose: np.ndarray, intrinsics: np.ndarray, image: np.
     import rerun as rr
 
     height, width = image.shape[:2]
-    to_world = rigid.invert(pose)
     fx, fy, cx, cy = (float(value) for value in intrinsics)
-    stream.log("world/camera", rr.Transform3D(translation=to_world[:3, 3], mat3x3=to_world[:3, :3]))
+    log_pose(stream, "world/camera", pose)
     half = (width // 2, height // 2)
     camera = np.array([[fx / 2, 0, (cx - 0.5) / 2], [0, fy / 2, (cy - 0.5) / 2], [0, 0, 1]])
     lens = rr.Pinhole(
         image_from_camera=camera, resolution=half, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.25
     )
     stream.log("world/camera/image", lens, _jpeg(cv2.resize(image, half, interpolation=cv2.INTER_AREA)))
+
+
+def log_pose(stream: Any, path: str, pose: np.ndarray) -> None:
+    """Log where a camera stands, `pose` world -> camera, float [4, 4]: entities below `path` are in its frame."""
+    import rerun as rr
+
+    to_world = rigid.invert(pose)
+    stream.log(path, rr.Transform3D(translation=to_world[:3, 3], mat3x3=to_world[:3, :3]))
 
 
 def log_path(stream: Any, trajectory: Trajectory, keyframes: Trajectory) -> None:
@@ -211,11 +185,11 @@ def log_mesh(stream: Any, mesh: Mesh) -> None:
     stream.log("world/mesh", shape, static=True)
 
 
-def log_map(stream: Any, cloud: PointCloud) -> None:
-    """Log the dense map from the current time on; before it, `LiveMap` shows the map."""
+def log_cloud(stream: Any, path: str, points: np.ndarray, colours: np.ndarray) -> None:
+    """Log points, float32 [n, 3], and colours, uint8 [n, 3], from the current time on."""
     import rerun as rr
 
-    stream.log("world/map", rr.Points3D(cloud.points, colors=cloud.colours, radii=0.011))
+    stream.log(path, rr.Points3D(points, colors=colours, radii=RADIUS))
 
 
 def log_residuals(stream: Any, record: WindowRecord) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
@@ -50,32 +51,24 @@ def log_folder(stream: Any, folder: Path) -> None:
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.set_time("frame", sequence=0)
     entities.log_path(stream, trajectory, load_poses(folder, "keyframes.txt"))
-    entities.log_map(stream, PointCloud.load_ply(folder / "map.ply"))
+    cloud = PointCloud.load_ply(folder / "map.ply")
+    entities.log_cloud(stream, "world/map", cloud.points, cloud.colours)
     if (folder / "mesh.ply").is_file():
         entities.log_mesh(stream, Mesh.load_ply(folder / "mesh.ply"))
     for file in sorted(folder.glob("depth/*.depth.png")):
-        _log_depth(stream, file)
+        if (number := file.name.split(".")[0]).isdecimal():
+            stream.set_time("frame", sequence=int(number))
+            depth = rr.DepthImage(_pixels(file, np.uint16), meter=DEPTH_UNIT, colormap="viridis")
+            stream.log("keyframe/depth", depth)
+            confidence = file.with_name(f"{number}.confidence.png")
+            if confidence.is_file():
+                coloured = cv2.applyColorMap(_pixels(confidence, np.uint8), cv2.COLORMAP_VIRIDIS)
+                stream.log("keyframe/confidence", rr.Image(coloured[..., ::-1]))
 
 
-def _log_depth(stream: Any, file: Path) -> None:
-    import rerun as rr
-
-    number = file.name.split(".")[0]
-    if not number.isdecimal():
-        raise InputError(f"`{file}` must be named by a frame number before `.depth.png`, as `vggtgeo run` writes it")
-    stream.set_time("frame", sequence=int(number))
-    stream.log("keyframe/depth", rr.DepthImage(_read(file, np.uint16), meter=DEPTH_UNIT, colormap="viridis"))
-    confidence = file.with_name(f"{number}.confidence.png")
-    if confidence.is_file():
-        stream.log(
-            "keyframe/confidence",
-            rr.Image(cv2.applyColorMap(_read(confidence, np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]),
-        )
-
-
-def _read(file: Path, kind: type) -> np.ndarray:
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2 or image.dtype != kind:
-        found = "cannot be read as an image" if image is None else f"is {image.dtype} {image.shape}"
-        raise InputError(f"`{file}` {found}; expected {np.dtype(kind)} [H, W]: run again with `--save-depth`")
-    return np.asarray(image)
+def _pixels(file: Path, kind: type) -> np.ndarray:
+    pixels = read_codes(file)
+    if pixels.ndim != 2 or pixels.dtype != kind:
+        found = f"{pixels.dtype} {pixels.shape}"
+        raise InputError(f"`{file}` is {found}; expected {np.dtype(kind)} [H, W]: run again with `--save-depth`")
+    return pixels

@@ -8,20 +8,13 @@ import sys
 import sysconfig
 import tempfile
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import make_parent
+from vggtgeo.io.errors import InputError, warn
 
-ORIGINS = (
-    *("/world", "/world/camera/image", "/keyframe/image", "/keyframe/depth", "/keyframe/confidence", "/window"),
-    *("/plots/residuals", "/plots/solver", "/plots/convergence", "/plots/tracking", "/notes"),
-)
-"""Entities that the views of the blueprint show."""
 APPLICATION = "vggtgeo"
 STAND_IN = "run.rrd"
 """In the run's folder: the recording in place of a viewer that could not be opened."""
@@ -95,10 +88,14 @@ def flush(stream: Any, file: Path | None = None) -> str:
         file: of the stream, if any.
 
     """
-    reason = _send_error(stream, _TIMEOUT)
-    if not reason or file is None:
-        return reason and f"the Rerun viewer did not receive all of the recording ({reason})"
-    return f"the recording `{file}` is incomplete: {reason}; free disk space, or give another file"
+    try:
+        stream.flush(timeout_sec=_TIMEOUT)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        if file is None:
+            return f"the Rerun viewer did not receive all of the recording ({reason})"
+        return f"the recording `{file}` is incomplete: {reason}; free disk space, or give another file"
+    return ""
 
 
 def has_screen() -> bool:
@@ -110,34 +107,15 @@ def has_screen() -> bool:
 
 def _save(stream: Any, path: Path) -> Path:
     """Record to a file, after a test that the disk is writable: else Rerun may never return, on a full disk."""
-    make_parent(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        reason = _disk_error(path.parent)
-        if not reason:
-            stream.save(path, default_blueprint=blueprint())
-    except RuntimeError as error:
-        reason = str(error).splitlines()[0]
-    if reason:
-        raise InputError(f"`--rerun` is `{path}`, which cannot be written: {reason}")
-    return path
-
-
-def _send_error(stream: Any, seconds: float) -> str:
-    try:
-        stream.flush(timeout_sec=seconds)
-    except RuntimeError as error:
-        return str(error).splitlines()[0]
-    return ""
-
-
-def _disk_error(folder: Path) -> str:
-    """Return the error of writing a file in `folder`; empty if it can be written."""
-    try:
-        with tempfile.TemporaryFile(dir=folder) as probe:
+        with tempfile.TemporaryFile(dir=path.parent) as probe:
             probe.write(bytes(_PROBE_SIZE))
-    except OSError as error:
-        return error.strerror or str(error)
-    return ""
+        stream.save(path, default_blueprint=blueprint())
+    except (OSError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise InputError(f"`--rerun` is `{path}`, which cannot be written: {reason}") from None
+    return path
 
 
 def _spawn(stream: Any, instead: Path) -> Path | None:
@@ -147,11 +125,9 @@ def _spawn(stream: Any, instead: Path) -> Path | None:
         stream.connect_grpc(default_blueprint=blueprint())
         return None
     _save(stream, instead)
-    warnings.warn(
+    warn(
         f"{reason}, so the recording goes to `{instead}`; view it with `rerun {instead}` on a machine with a screen, "
-        "or with `--rerun serve` in a browser",
-        InputWarning,
-        stacklevel=2,
+        "or with `--rerun serve` in a browser"
     )
     return instead
 
