@@ -47,9 +47,11 @@ MIN_WARP = 0.5
 FIRST_WARP, PROBE = 1.0, 0.02
 """Displacements of a corner, pixels, by either coefficient: of the adjustments for second derivatives, and of the finite
 differences for first ones."""
-MAX_STEP, SETTLED = 10.0, 0.05
-"""Displacement of a corner by a step, pixels: the largest, and the one that ends the search."""
-MAX_STEPS = 12
+MAX_STEP = 10.0
+"""Displacement of a corner by a step, pixels."""
+PROMISE = 0.05
+"""Decrease of the energy that a step must promise: a tenth of what a standard deviation of a coefficient costs."""
+MAX_STEPS = 8
 DIRECTIONS = np.array([[1.0, 0.0], [-1.2, 1.0]])
 """Two distortions, as displacements of a corner by either coefficient, of which none looks like the other, or like a
 focal length: Zernike's radial polynomials `3 r^3 - 2 r` and `10 r^5 - 12 r^3 + 3 r`."""
@@ -90,10 +92,12 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
     changes = [bent.gradient(warp, solve(bent.at(warp), state)) - gradient for warp in first]
     hessian = np.linalg.solve(first, np.array(changes))
     hessian, largest = (hessian + hessian.T) / 2, MAX_STEP
+    if not np.isfinite(hessian).all():
+        return None
     for _ in range(MAX_STEPS):
-        if not np.isfinite(hessian).all():
-            return None
         step = _step(hessian, gradient, largest)
+        if -gradient @ step / 2 < PROMISE:
+            break
         moved = solve(bent.at(warp + step), found)
         if not _is_camera(pinhole_of(problem, moved)):
             return None
@@ -104,8 +108,6 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
         else:
             warp, found, gradient = warp + step, moved, gradient + change
             bent = replace(bent, pinhole=pinhole_of(problem, found))
-        if np.abs(step).max() < SETTLED:
-            break
     camera = bent.camera(warp)
     # No matches are held out: two parameters do not overfit thousands of matches.
     present = np.asarray(problem.points.present())
