@@ -18,10 +18,10 @@ from vggtgeo.simulation.degradations import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.given_camera import keyframe_pairs
+from vggtgeo.slam.camera.pixel_shifts import carried
 from vggtgeo.slam.camera.rolling_shutter import (
     _descend,
     _Search,
-    carried,
     find_readout,
     image_shift,
     pair_to_global_shutter,

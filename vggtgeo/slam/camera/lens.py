@@ -2,10 +2,19 @@
 
 A guessed camera is a pinhole until a whole map is adjusted: that of the calibration frames (`self_calibration.py`), or
 of the run. So is a given one without distortion coefficients, in a map without measured depth. If the lens distorts,
-the focal length absorbs the distortion and is wrong. So the map is adjusted once more with two radial coefficients free
-(`benchmarks/no_calibration.py`). If that explains the matches significantly better and moves pixels by more than
+the focal length absorbs the distortion and is wrong. So two radial coefficients `k` are estimated
+(`benchmarks/no_calibration.py`). If they explain the matches significantly better and move pixels by more than
 `MIN_WARP`, then images, key points and segments of the keyframes are undistorted, and all later steps use the ideal
 pinhole.
+
+The estimate minimises the energy of the adjusted map, `E(k) = min_x e(x, k)`, where `e` is that of the pinhole for
+undistorted pixels. Its gradient needs no other adjustment: it is the partial derivative of `e` at the adjusted map
+(envelope theorem). Two adjustments with a small distortion give the second derivatives of `E` as differences of
+gradients, which include how the map follows. Newton's method with bounded steps and updated second derivatives then
+takes a few adjustments. All are of the same program as the map's other adjustments.
+
+Noise is in the pixels as the lens draws them. Undistorting scales it by the derivative of the undistortion, so the
+weights of the matches are divided by the square of that; otherwise a lens that shrinks the image would be favoured.
 
 Poses of tracked frames are relative to keyframes, so they follow.
 """
@@ -15,18 +24,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera, Undistorter
-from vggtgeo.geometry.camera_models import RadialTangential, with_shared_focal
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatches
-from vggtgeo.slam.camera.camera_gain import gain
+from vggtgeo.slam.camera.camera_gain import gain, match_energies
+from vggtgeo.slam.camera.pixel_shifts import Shifts, carried, pinhole_of, shifted_problem
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
@@ -36,6 +44,17 @@ RADIAL = 0.3
 """Prior standard deviation of k1 and k2; it covers lenses of phones and action cameras."""
 MIN_WARP = 0.5
 """Largest displacement by the lens, pixels, for which it is removed: the noise of a match."""
+FIRST_WARP, PROBE = 1.0, 0.02
+"""Displacements of a corner, pixels, by either coefficient: of the adjustments for second derivatives, and of the finite
+differences for first ones."""
+MAX_STEP = 10.0
+"""Displacement of a corner by a step, pixels."""
+PROMISE = 0.05
+"""Decrease of the energy that a step must promise: a tenth of what a standard deviation of a coefficient costs."""
+MAX_STEPS = 8
+DIRECTIONS = np.array([[1.0, 0.0], [-1.2, 1.0]])
+"""Two distortions, as displacements of a corner by either coefficient, of which none looks like the other, or like a
+focal length: Zernike's radial polynomials `3 r^3 - 2 r` and `10 r^5 - 12 r^3 + 3 r`."""
 
 Solve = Callable[[Problem, State], State]
 
@@ -65,38 +84,122 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
     """Estimate the lens of a map that was adjusted without distortion; return None if the result is invalid.
 
     problem, state: that adjustment, its camera a `Pinhole`. size: height and width of the images.
-    solve: adjusts any problem.
+    solve: adjusts any problem of the same shape.
     """
-    with_lens, shared = _with_lens(problem), problem.shared_focal
-    pinhole = len(problem.camera.names)
-    none = jnp.zeros(len(with_lens.camera.names) - pinhole)
-    start = eqx.tree_at(lambda s: s.intrinsics, state, jnp.concatenate([state.intrinsics, none]))
-    found = solve(with_lens, start)
-    parameters = [float(value) for value in found.intrinsics]
-    fx, fy, cx, cy, *distortion = [parameters[0], *parameters] if shared else parameters
-    if not (min(fx, fy) > 0 and np.isfinite(parameters).all()):
+    bent = _Undistorted.of(problem, state, size)
+    warp, found, gradient = np.zeros(2), state, bent.gradient(np.zeros(2), state)
+    first = DIRECTIONS * FIRST_WARP
+    changes = [bent.gradient(warp, solve(bent.at(warp), state)) - gradient for warp in first]
+    hessian = np.linalg.solve(first, np.array(changes))
+    hessian, largest = (hessian + hessian.T) / 2, MAX_STEP
+    if not np.isfinite(hessian).all():
         return None
-    height, width = size
-    camera = Camera((fx, fy, cx, cy), width, height, tuple(distortion), known=False)
+    for _ in range(MAX_STEPS):
+        step = _step(hessian, gradient, largest)
+        if -gradient @ step / 2 < PROMISE:
+            break
+        moved = solve(bent.at(warp + step), found)
+        if not _is_camera(pinhole_of(problem, moved)):
+            return None
+        change = bent.gradient(warp + step, moved) - gradient
+        hessian = _updated(hessian, step, change)
+        if bent.energy(warp + step, moved) > bent.energy(warp, found):
+            largest = np.abs(step).max() / 4
+        else:
+            warp, found, gradient = warp + step, moved, gradient + change
+            bent = replace(bent, pinhole=pinhole_of(problem, found))
+    camera = bent.camera(warp)
     # No matches are held out: two parameters do not overfit thousands of matches.
     present = np.asarray(problem.points.present())
-    better, needed = gain((problem, state), (with_lens, found), present, fitted=pinhole + 2)
-    ideal = eqx.tree_at(lambda s: s.intrinsics, found, found.intrinsics[:pinhole])
-    return FoundLens(camera, ideal, better, needed, largest_shift(camera))
+    better, needed = gain((problem, state), (bent.at(warp), found), present, fitted=len(problem.camera.names) + 2)
+    return FoundLens(camera, found, better, needed, largest_shift(camera))
 
 
-def _with_lens(problem: Problem) -> Problem:
-    """Return the problem with a camera whose radial distortion is free."""
-    prior = problem.intrinsics_prior
-    kind = with_shared_focal(RadialTangential) if problem.shared_focal else RadialTangential
-    names, more = kind.names, len(kind.names) - len(problem.camera.names)
-    wider = IntrinsicsPrior(
-        index=jnp.arange(len(names)),
-        mean=jnp.concatenate([prior.mean, jnp.zeros(more)]),
-        weight=jnp.concatenate([prior.weight, jnp.full(more, 1 / RADIAL**2)]),
-    )
-    held = jnp.asarray([name in ("p1", "p2") for name in names])
-    return replace(problem.with_term(wider), camera=kind, fixed_intrinsics=held)
+def _is_camera(pinhole: np.ndarray) -> bool:
+    return bool(np.isfinite(pinhole).all() and pinhole[:2].min() > 0)
+
+
+def _step(hessian: np.ndarray, gradient: np.ndarray, largest: float) -> np.ndarray:
+    """Return the step of Newton's method, downhill also where the energy curves down, not longer than `largest`."""
+    curvature, directions = np.linalg.eigh(hessian)
+    bounded = np.maximum(np.abs(curvature), 1e-9)
+    step: np.ndarray = -directions @ ((directions.T @ gradient) / bounded)
+    return step * min(1.0, largest / np.abs(step).max(initial=1e-12))
+
+
+def _updated(hessian: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return the Hessian after the symmetric rank-one update by a change of the gradient."""
+    left = change - hessian @ step
+    along = float(left @ step)
+    if abs(along) < 1e-3 * np.linalg.norm(left) * np.linalg.norm(step):
+        return hessian
+    return np.asarray(hessian + np.outer(left, left) / along)
+
+
+@dataclass(frozen=True, eq=False)
+class _Undistorted:
+    """A problem whose pixels are undistorted; `warp` has the displacements of a corner by k1 and k2, pixels.
+
+    pinhole: fx, fy, cx, cy, float64 [4]. size: height and width. lines: where the map projects its line samples,
+    pixels of the ideal camera [e, l, 2].
+    """
+
+    problem: Problem
+    pinhole: np.ndarray
+    size: tuple[int, int]
+    lines: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Problem, state: State, size: tuple[int, int]) -> _Undistorted:
+        camera, count = pinhole_of(problem, state), problem.points.weight.shape[1]
+        poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
+        host, target = np.asarray(problem.edges.source), np.asarray(problem.edges.target)
+        pixels, inverse = (np.asarray(values, np.float64)[:, count:] for values in (problem.pixels, state.inverse_depth))
+        lines, _ = carried(pixels[host], inverse[host], poses[target] @ rigid.invert(poses[host]), camera)
+        inside = np.all((lines > 0) & (lines < size[::-1]), -1, keepdims=True)
+        return cls(problem, camera, size, np.where(inside, lines, camera[2:]))
+
+    def coefficients(self, warp: np.ndarray) -> np.ndarray:
+        """Return k1 and k2, float64 [2], of displacements of a corner; these stay if the focal length changes."""
+        focal = float(np.sqrt(np.prod(self.pinhole[:2])))
+        corner = np.hypot(*self.size) / 2 / focal
+        return np.asarray(warp / (focal * corner ** np.array([3.0, 5.0])))
+
+    def camera(self, warp: np.ndarray) -> Camera:
+        """Return the camera with these displacements of a corner."""
+        height, width = self.size
+        distortion = (*self.coefficients(warp).tolist(), 0.0, 0.0)
+        return Camera(tuple(self.pinhole.tolist()), width, height, distortion, known=False)
+
+    def at(self, warp: np.ndarray) -> Problem:
+        """Return the problem for undistorted pixels, each match with the weight of its noise in the distorted image."""
+        camera, present = self.camera(warp), np.asarray(self.problem.points.present())
+        slots = np.asarray(self.problem.pixels, np.float64)
+        matched = np.asarray(self.problem.points.target, np.float64)[present]
+        ideal, points = camera.undistorted(matched), np.zeros((*present.shape, 2))
+        points[present] = matched - ideal
+        lines = (self._scales(warp, self.lines)[0] - 1)[..., None] * (self.lines - self.pinhole[2:])
+        shifts = Shifts(slots - camera.undistorted(slots), points, lines)
+        weight = np.array(self.problem.points.weight)
+        weight[present] *= np.maximum(np.prod(self._scales(warp, ideal), axis=0), 0.0)
+        weighted = self.problem.with_term(self.problem.points.reweighted(jnp.asarray(weight)))
+        return shifted_problem(weighted, shifts, 1.0, max(self.size) / 2)
+
+    def _scales(self, warp: np.ndarray, ideal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the tangential and the radial scale of the distortion at pixels [..., 2] of the ideal camera."""
+        k1, k2 = self.coefficients(warp)
+        square = np.sum(((ideal - self.pinhole[2:]) / self.pinhole[:2]) ** 2, -1)
+        return 1 + k1 * square + k2 * square**2, 1 + 3 * k1 * square + 5 * k2 * square**2
+
+    def energy(self, warp: np.ndarray, state: State) -> float:
+        """Return the energy of the matches and of the prior of the coefficients."""
+        matches = np.sum(match_energies(self.at(warp), state), where=np.asarray(self.problem.points.present()))
+        return float(matches + np.sum(self.coefficients(warp) ** 2) / (2 * RADIAL**2))
+
+    def gradient(self, warp: np.ndarray, state: State) -> np.ndarray:
+        """Return the derivative of the energy at an adjusted map, float64 [2]."""
+        steps = PROBE * np.eye(2)
+        return np.array([self.energy(warp + step, state) - self.energy(warp - step, state) for step in steps]) / (2 * PROBE)
 
 
 def largest_shift(camera: Camera) -> float:

@@ -17,10 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t as student_t
 
@@ -28,6 +25,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.camera_gain import MIN_HOSTS, gain, match_energies
+from vggtgeo.slam.camera.pixel_shifts import Shifts, carried, pinhole_of, rays, shifted_problem
 from vggtgeo.slam.threads import map_in_threads
 
 FIRST_SHIFT, SETTLED = 1.0, 0.05
@@ -49,16 +47,6 @@ USUAL_LARGEST = 90
 Solve = Callable[[Problem, State], State]
 
 
-class Shifts(NamedTuple):
-    """Displacement per second of readout time, pixels a second: of slots [n, s, 2], of points [e, p, 2] in the target,
-    and of lines [e, l, 2] at their projected samples.
-    """
-
-    slots: np.ndarray
-    points: np.ndarray
-    lines: np.ndarray
-
-
 @dataclass(frozen=True, eq=False)
 class FoundReadout:
     """The result of a search: the readout, the corrected problem and its adjusted map, the mean decrease of a match's
@@ -78,10 +66,11 @@ class FoundReadout:
 
 
 def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], columns: bool) -> Shifts:
-    """Return the displacements by a readout of one second. size: height and width of the images; columns: images are
-    read column by column.
+    """Return the displacements by a readout of one second, pixels a second.
+
+    size: height and width of the images. columns: images are read column by column.
     """
-    camera = _pinhole(problem, state)
+    camera = pinhole_of(problem, state)
     poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
     pixels, inverse = np.asarray(problem.pixels, np.float64), np.asarray(state.inverse_depth, np.float64)
     shift = lambda at, depth, motion: image_shift(at, depth, motion, camera, size, columns)
@@ -101,27 +90,6 @@ def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[
     return Shifts(shift(pixels, inverse, motions), points, lines)
 
 
-def carried(
-    pixels: np.ndarray, inverse: np.ndarray, relative: np.ndarray, camera: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels [a, b, 2] and inverse depths [a, b] of landmarks in other cameras; relative: [a, 4, 4]."""
-    rays = _rays(pixels, camera)
-    there = np.einsum("aij,abj->abi", relative[:, :3, :3], rays) + relative[:, None, :3, 3] * inverse[..., None]
-    with np.errstate(all="ignore"):
-        return there[..., :2] / there[..., 2:] * camera[:2] + camera[2:], inverse / there[..., 2]
-
-
-def _rays(pixels: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Return rays with depth one, [..., 3]."""
-    return np.concatenate([(pixels - camera[2:]) / camera[:2], np.ones((*pixels.shape[:-1], 1))], -1)
-
-
-def _pinhole(problem: Problem, state: State) -> np.ndarray:
-    """Return fx, fy, cx, cy."""
-    parameters = np.asarray(state.intrinsics, np.float64)
-    return np.array([parameters[0], *parameters])[:4] if problem.shared_focal else parameters[:4]
-
-
 def image_shift(
     pixels: np.ndarray,
     inverse: np.ndarray,
@@ -133,10 +101,10 @@ def image_shift(
     """Return the velocity in the image [a, b, 2] of pixels [a, b, 2] at inverse depths [a, b] under motions [a, 6],
     times the relative time of their row; zero for points that are not in front of the camera.
     """
-    rays = _rays(pixels, camera)
+    ray = rays(pixels, camera)
     with np.errstate(all="ignore"):
-        moved = motion[:, None, :3] * inverse[..., None] + np.cross(motion[:, None, 3:], rays)
-        velocity = (moved[..., :2] - rays[..., :2] * moved[..., 2:]) * camera[:2]
+        moved = motion[:, None, :3] * inverse[..., None] + np.cross(motion[:, None, 3:], ray)
+        velocity = (moved[..., :2] - ray[..., :2] * moved[..., 2:]) * camera[:2]
         axis = 0 if columns else 1
         moment = (pixels[..., axis] + 0.5) / size[1 - axis] - 0.5
         shift = moment[..., None] * velocity
@@ -179,31 +147,12 @@ def pair_to_global_shutter(
     )
 
 
-def global_shutter_problem(problem: Problem, shifts: Shifts, seconds: float, most: float) -> Problem:
-    """Return the problem with each match as at the middle of its image's readout. most: largest displacement, pixels:
-    larger ones come from landmarks at the camera's centre.
-    """
-    slots, points, lines = (np.clip(seconds * shift, -most, most) for shift in shifts)
-    coefficients = np.asarray(problem.lines.coefficients, np.float64)
-    offset = coefficients[..., 2] + np.sum(coefficients[..., :2] * lines, -1)
-    like = lambda values: jnp.asarray(values, problem.pixels.dtype)
-    return eqx.tree_at(
-        lambda p: (p.pixels, p.points.target, p.lines.coefficients),
-        problem,
-        (
-            like(np.asarray(problem.pixels) - slots),
-            like(np.asarray(problem.points.target) - points),
-            like(np.concatenate([coefficients[..., :2], offset[..., None]], -1)),
-        ),
-    )
-
-
 def without_readout(
     problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], readout: Readout
 ) -> Problem:
     """Return the problem corrected for a known readout; state: an estimate of the map."""
     shifts = row_shifts(problem, state, motions, size, readout.columns)
-    return global_shutter_problem(problem, shifts, readout.seconds, max(size) / 2)
+    return shifted_problem(problem, shifts, readout.seconds, max(size) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +178,7 @@ class _Search:
 
     def at(self, seconds: float) -> Problem:
         """Return the problem corrected for this readout time."""
-        return global_shutter_problem(self.problem, self.shifts, seconds, self.most)
+        return shifted_problem(self.problem, self.shifts, seconds, self.most)
 
     def slopes(self, seconds: float, state: State) -> np.ndarray:
         """Return the derivative of the energy of each keyframe's matches by the readout time, float64 [n]."""

@@ -33,6 +33,8 @@ from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit, warm
 
 CHECKED = (0.3, 0.6, 0.85)
 """Shares of the frames at which the number of keyframes is predicted: early for time, and again for accuracy."""
+GUIDED = 1.4
+"""Edges with guided matches (`guided_matches.py`), relative to those without: 1.2 to 1.4 on most clips."""
 MIN_KEYFRAMES = 8
 """For an unknown number of frames: smaller maps may stay small."""
 
@@ -56,23 +58,28 @@ class CompileAhead(Callback):
         count = expected_keyframes(len(slam.keyframes), len(slam.frames), self._total)
         if count is None or not slam.keyframes or not self._settings.refinement.global_adjustment:
             return
-        shape = self._shape(slam, count)
-        if shape.size.keyframes <= MAX_DENSE and shape not in self._asked:
-            task = partial(compile_global, shape, self._settings, shares_focal(slam), metric=slam.metric)
-            self._asked[shape] = self._pool.submit(task)
+        for shape in self._shapes(slam, count):
+            if shape.size.keyframes <= MAX_DENSE and shape not in self._asked:
+                task = partial(compile_global, shape, self._settings, shares_focal(slam), metric=slam.metric)
+                self._asked[shape] = self._pool.submit(task)
 
     def on_adjust(self, slam: Slam) -> None:
         """Wait for the program that is needed now."""
-        future = self._asked.get(self._shape(slam, len(slam.keyframes))) if slam.keyframes else None
+        future = self._asked.get(self._shapes(slam, len(slam.keyframes))[0]) if slam.keyframes else None
         if future is not None:
             wait([future])
 
-    def _shape(self, slam: Slam, keyframes: int) -> GlobalShape:
-        """Return the shape of a map with so many keyframes and as many edges for each as now."""
+    def _shapes(self, slam: Slam, keyframes: int) -> list[GlobalShape]:
+        """Return the shapes of a map with so many keyframes: with as many edges for each as now, and without depth also
+        with the further edges of guided matches.
+        """
         ends = np.array([pair.key for pair in slam.map.pairs], int).reshape(-1, 2)
         edges = np.minimum(np.bincount(ends.ravel(), minlength=1), MAX_NEIGHBOURS).sum()
-        shape = shape_for(keyframes, round(edges * keyframes / len(slam.keyframes)), self._settings)
-        return shape if slam.metric else _without_depth(shape)
+        expected = round(edges * keyframes / len(slam.keyframes))
+        if slam.metric:
+            return [shape_for(keyframes, expected, self._settings)]
+        more = min(round(GUIDED * expected), MAX_NEIGHBOURS * keyframes)
+        return [_without_depth(shape_for(keyframes, edges, self._settings)) for edges in (expected, more)]
 
 
 def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | None:

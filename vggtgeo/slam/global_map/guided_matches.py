@@ -79,27 +79,34 @@ def _predicted_pairs(known: Map, intrinsics: np.ndarray, but: set[tuple[int, int
 def _further_matches(pair: Pair, keyframes: Sequence[Keyframe], trees: list[cKDTree], intrinsics: np.ndarray) -> Pair:
     """Return the pair with the matches of points of either keyframe that the other shows near their projection."""
     first, second = (keyframes[number] for number in pair.key)
-    there = _near_projection(first, second, trees[pair.second], intrinsics)
-    back = _near_projection(second, first, trees[pair.first], intrinsics)
-    index_i = np.concatenate([pair.points.index_i, there.index_i, back.index_j])
-    index_j = np.concatenate([pair.points.index_j, there.index_j, back.index_i])
+    own = pair.points
+    there = _near_projection(first, second, own.index_i, trees[pair.second], intrinsics)
+    matched = np.concatenate([own.index_j, there.index_j])
+    back = _near_projection(second, first, matched, trees[pair.first], intrinsics)
+    index_i = np.concatenate([own.index_i, there.index_i, back.index_j])
+    index_j = np.concatenate([own.index_j, there.index_j, back.index_i])
     # A key point is matched once, to the one that was found first; -1 is no key point.
     lone = np.where(index_j < 0, -1 - np.arange(len(index_j)), index_j)
     once = _first(index_i) & _first(lone)
     added = PointMatches(
         index_i,
         index_j,
-        np.concatenate([pair.points.pixels_i, there.pixels_i, back.pixels_j]),
-        np.concatenate([pair.points.pixels_j, there.pixels_j, back.pixels_i]),
-        np.concatenate([pair.points.confidence, there.confidence, back.confidence]),
+        np.concatenate([own.pixels_i, there.pixels_i, back.pixels_j]),
+        np.concatenate([own.pixels_j, there.pixels_j, back.pixels_i]),
+        np.concatenate([own.confidence, there.confidence, back.confidence]),
     )
     return replace(pair, points=added.select(once))
 
 
-def _near_projection(of: Keyframe, other: Keyframe, tree: cKDTree, intrinsics: np.ndarray) -> PointMatches:
-    """Return the matches of points of `of` that `other` shows near their projection, aligned by the images."""
+def _near_projection(
+    of: Keyframe, other: Keyframe, matched: np.ndarray, tree: cKDTree, intrinsics: np.ndarray
+) -> PointMatches:
+    """Return the matches of points of `of` that `other` shows near their projection, aligned by the images.
+
+    matched: points that have a match already.
+    """
     index, _, pixels = expected_pixels(of, other.pose, intrinsics)
-    known = of.points.determined[index]
+    known = of.points.determined[index] & ~np.isin(index, matched)
     radius = RADIUS * float(intrinsics[0])
     found = search_near(of.features, index[known], pixels[known], other.features, tree, radius=radius)
     images = of.features.descriptors.gray, other.features.descriptors.gray
