@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sequence_problems import REACH, TIGHT, packed, sequence
 from vggtgeo.solvers.band_cholesky import BandCholesky
-from vggtgeo.solvers.conjugate_gradients import BlockJacobi, ConjugateGradients, HostProduct
+from vggtgeo.solvers.conjugate_gradients import BlockJacobi, ConjugateGradients
 from vggtgeo.solvers.kernels import Square
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import AbstractReducedSolver
@@ -16,7 +16,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 
 TINY = 1e-40
-SOLVERS = {"band": BandCholesky(REACH), "blocks": ConjugateGradients(BlockJacobi(), HostProduct(), **TIGHT)}
+SOLVERS = {"band": BandCholesky(REACH), "blocks": ConjugateGradients(BlockJacobi(), **TIGHT)}
 
 
 def times(problem: Problem, factor: float | jax.Array) -> Problem:

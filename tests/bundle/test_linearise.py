@@ -1,16 +1,20 @@
-"""The solver's normal equations against automatic differentiation of residuals written by hand."""
+"""The solver's normal equations and exact Hessian against automatic differentiation of residuals written by hand."""
 
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
+from arrow_systems import dense_matrix, zero_step
 from jax.flatten_util import ravel_pytree
+from priors import prior_on
 from scenes import make_scene, matrix
 from scipy.linalg import expm
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_schur_complement, multiply
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
+from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.reduced import DenseCholesky
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
@@ -39,11 +43,11 @@ def one_behind_its_target(state: State) -> State:
 @jax.jit
 def linearise_both(problem: Problem, state: State):
     ba = BundleAdjustment(problem)
-    system, zero = ba.linearise(state), ba.zero_step(state)
+    system, zero = ba.linearise(state), zero_step(ba, state)
     flat, unflat = ravel_pytree(zero)
     weights = oracle.reweighted(problem, state)
     vector = lambda step: oracle.weighted_residuals(problem, ba.retract(state, unflat(step)), weights)
-    matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
+    matrix = dense_matrix(system, zero)
     gradient = jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
     return system, matrix, gradient, jax.jacfwd(vector)(flat), vector(flat)
 
@@ -94,7 +98,7 @@ def test_retract_moves_poses_by_left_tangents() -> None:
     # Proves `T <- exp(x) T`, and that inverse depths stop at their bound. Oracle: the exponential of 4 x 4 matrices.
     problem, state, _ = SCENE.pack()
     ba, rng = BundleAdjustment(problem), np.random.default_rng(0)
-    zero = ba.zero_step(state)
+    zero = zero_step(ba, state)
     dense = rng.normal(0, 0.3, zero.dense.shape)
     landmarks = jnp.full_like(zero.landmarks, -100.0).at[0, 0].set(0.25)
     moved = ba.retract(state, ArrowVector(jnp.asarray(dense), landmarks))
@@ -114,3 +118,40 @@ def as_matrices(poses: jax.Array) -> np.ndarray:
     whole = np.tile(np.eye(4), (len(poses), 1, 1))
     whole[:, :3, :3], whole[:, :3, 3] = rotations, translations
     return whole
+
+
+BENT = make_scene(2, 4, 1, 2, noise=0.7, outliers=0.3, depth_error=0.2, seed=3)
+
+
+@jax.jit
+def energy_and_system(problem: Problem, state: State) -> tuple[jax.Array, ...]:
+    """Gradient and Hessian, dense, of the solver's arrow and of the energy in the same coordinates."""
+    ba = BundleAdjustment(problem)
+    zero = zero_step(ba, state)
+    flat, unflat = ravel_pytree(zero)
+    total = lambda step: oracle.energy(problem, ba.retract(state, unflat(step)))
+    system = ba.hessian(state)
+    matrix = dense_matrix(system, zero)
+    gradient = jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
+    return gradient, matrix, jax.grad(total)(flat), jax.hessian(total)(flat)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("strength", [0.0, 3.0], ids=["no prior", "marginal prior"])
+@pytest.mark.parametrize("depth", [None, 60.0], ids=["in front", "behind"])
+def test_hessian_is_that_of_automatic_differentiation(strength: float, depth: float | None) -> None:
+    # Proves the exact Hessian: points, lines, outliers on Huber's linear branch, curvature of the poses, intrinsics,
+    # the marginalisation prior, and a point behind its target. Oracle: `jax.hessian` of the energy after a retraction.
+    problem, state, _ = BENT.pack()
+    offset = (state.inverse_depth - problem.depth.mean) / problem.depth.sigma
+    squared = problem.depth.alpha * problem.depth.weight * offset**2
+    assert 0 < int(jnp.sum(squared > 1.5**2)) < squared.size  # on both branches of Huber's kernel
+    problem = problem.with_term(prior_on(state, strength))
+    if depth is not None:
+        state = eqx.tree_at(lambda s: s.inverse_depth, state, state.inverse_depth.at[0, 0].set(depth))
+    gradient, matrix, expected_gradient, expected = energy_and_system(problem, state)
+    unit = 1 / np.sqrt(np.abs(np.diag(expected)) + 1.0)
+    error = np.abs((matrix - expected) * np.outer(unit, unit)).max()
+    assert error < 1e-9
+    error = np.abs((gradient - expected_gradient) * unit).max() / np.abs(expected_gradient * unit).max()
+    assert error < 1e-11

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import make_scene
-from vggtgeo.solvers.symmetric_eigen import symmetric_eigen
 
 import vggtgeo as vg
+from vggtgeo.bundle.analysis.observability import symmetric_eigen
 from vggtgeo.bundle.marginalisation import square_root
 from vggtgeo.bundle.problem import Problem, State
 
@@ -157,39 +156,3 @@ def test_spectra_have_their_gradient_where_directions_are_undetermined(window: t
         return jnp.sum(jnp.where(known, shares + jnp.where(known, found.whole.values[0], 0.0), 0.0))
 
     check_by_weight(total, problem.points.weight)
-
-
-def test_energy_and_residuals_have_their_gradient(window: tuple[Problem, State]) -> None:
-    # Proves reverse mode of the energy and of single residuals by the weights. Oracle: central differences.
-    problem, state = window
-
-    def total(weight: jax.Array) -> jax.Array:
-        seen = problem.with_term(problem.points.reweighted(weight))
-        residuals = jnp.where(weight[..., None] > 0, vg.residuals_at(seen, state)["points"], 0.0)
-        return (
-            vg.energy(seen, state)
-            + vg.analysis.energy_terms(seen, state)["points"]
-            + jnp.sum(weight[..., None] * residuals)
-        )
-
-    check_by_weight(total, problem.points.weight)
-
-
-def test_reorder_and_gather_work_under_jit() -> None:
-    # Proves that a traced prior and order, and traced arrays of slots, give what concrete ones give.
-    scene = make_scene(3, 4, 1)
-    problem, initial, index = scene.pack(terms=[vg.empty_prior(3)])
-    root = np.random.default_rng(0).normal(size=(22, 22))
-    poses = jax.tree.map(lambda leaf: leaf[::-1], initial.poses)
-    prior = eqx.tree_at(lambda p: (p.root, p.poses), vg.empty_prior(3), (jnp.asarray(root), poses))
-    order = np.array([2, -1, 0])
-    expected = vg.permute_prior(prior, order)
-    np.testing.assert_array_equal(expected.root[:, :6], root[:, 12:18])
-    np.testing.assert_array_equal(expected.root[:, 6:12], 0.0)
-    for found in (jax.jit(vg.permute_prior)(prior, order), jax.jit(lambda p: vg.permute_prior(p, order))(prior)):
-        jax.tree.map(np.testing.assert_array_equal, found, expected)
-    np.testing.assert_array_equal(jax.jit(index.gather)(initial.inverse_depth), index.gather(initial.inverse_depth))
-    gathered = jax.jit(lambda w: index.gather_points(w, scene.observations))(problem.points.weight)
-    np.testing.assert_array_equal(gathered, scene.observations.point_weight)
-    slopes = jax.grad(lambda depth: jnp.sum(index.gather(depth) ** 2))(initial.inverse_depth)
-    np.testing.assert_allclose(index.gather(slopes), 2 * index.gather(initial.inverse_depth))

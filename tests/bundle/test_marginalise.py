@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import make_scene
-from vggtgeo.solvers.arrow import ArrowVector, dense_schur_complement
-from vggtgeo.solvers.exact_model import exact_model
+from vggtgeo.solvers.adjoint import exact_model
+from vggtgeo.solvers.arrow import ArrowVector
+from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.kernels import Square
 
 from vggtgeo.bundle.linearise import linearise

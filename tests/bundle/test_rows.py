@@ -217,10 +217,7 @@ def test_pack_chooses_rows_by_itself() -> None:
 def test_segments_stay_whole() -> None:
     # Proves that the samples of a two-ends line share a row, and the solution of a scene with them. Oracle: one row.
     made = make_scene(3, points=6, lines=3, samples=4, noise=0.5, depth_error=0.05, seed=5)
-    number = np.full(len(made.observations.host), -1)
-    lines = np.unique(made.observations.line_landmark)
-    number[lines] = np.arange(len(lines)) // 4
-    scene = made.with_observations(segment=number)
+    scene = made.with_segments(4)
     whole = scene.pack(size=PaddedSize(3, 6, 12, 2, samples=4))
     rows = scene.pack(size=PaddedSize(3, 3, 4, 2, samples=4, rows=9))
     found = [solved(*packed[:2]) for packed in (whole, rows)]

@@ -75,12 +75,3 @@ def test_the_gradient_by_flat_weights_is_that_by_the_padded_ones(packed: Packed)
     expected = index.gather_points(jax.jit(jax.grad(energy))(problem.points.weight), seen)
     assert float(np.abs(expected).max()) > 0
     np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-def test_precision_is_that_of_the_problem(packed: Packed) -> None:
-    """A network's float32 numbers become the problem's float64, with a derivative of float32. Oracle: the types."""
-    seen, problem, _, index, _ = packed
-    write = lambda values: index.scatter_points(values, seen, problem.points.weight)
-    given = jnp.ones(len(seen.point_edge), jnp.float32)
-    assert write(given).dtype == problem.points.weight.dtype
-    assert jax.grad(lambda values: write(values).sum())(given).dtype == jnp.float32

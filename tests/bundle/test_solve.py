@@ -13,7 +13,6 @@ from reported import raises
 from scenes import Scene, make_scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 
@@ -153,20 +152,6 @@ def test_depth_that_counts_nothing(solved: Solve) -> None:
     np.testing.assert_allclose(solution.state.inverse_depth, expected.state.inverse_depth, rtol=1e-9)
 
 
-def test_no_weight_at_all(solved: Solve) -> None:
-    # Proves that a problem that asks for nothing leaves the state as it is. Oracle: the start.
-    scene = NOISY.with_observations(
-        point_weight=0 * NOISY.observations.point_weight,
-        line_weight=0 * NOISY.observations.line_weight,
-        depth_weight=0 * NOISY.observations.depth_weight,
-    )
-    problem, start, _ = scene.pack(**{**OPTIONS, "prior_sigma": None})
-    solution = solved(problem, start)
-    assert bool(solution.converged), solution.message
-    assert float(solution.energy) == 0.0
-    assert distance(solution.state, start) < 1e-15
-
-
 def test_a_keyframe_that_nothing_was_matched_in(solved: Solve) -> None:
     # Proves that an unconnected keyframe does no harm: the others come out as they should, it stays finite and, having
     # depth priors only, where it was. Oracle: the truth of the others, its start.
@@ -251,17 +236,6 @@ def test_vmap_solves_each(solved: Solve) -> None:
         assert float(batch.energy[i]) == pytest.approx(float(solution.energy), rel=1e-10)
         assert distance(one, solution.state) < 1e-7
     assert [int(n) for n in batch.iterations] == [int(solution.iterations) for solution in alone]
-
-
-def test_padding_does_not_move_the_optimum(solved: Solve) -> None:
-    # Proves that the same problem in a larger shape has the same solution. Oracle: the tight packing.
-    problem, start, index = NOISY.pack(**OPTIONS)
-    padded, padded_start, padded_index = NOISY.pack(size=PaddedSize(4, 8, 5, 3), **OPTIONS)
-    tight, wide = solved(problem, start), solved(padded, padded_start)
-    assert float(wide.energy) == pytest.approx(float(tight.energy), rel=1e-12)
-    np.testing.assert_allclose(wide.state.poses.wxyz_xyz[:3], tight.state.poses.wxyz_xyz, atol=1e-6)
-    found, expected = padded_index.gather(wide.state.inverse_depth), index.gather(tight.state.inverse_depth)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_float32_is_close_to_float64(solved: Solve) -> None:

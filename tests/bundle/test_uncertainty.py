@@ -134,17 +134,6 @@ def test_scaled_by_the_variance_factor(estimated: Estimate) -> None:
     )
 
 
-@pytest.mark.slow
-def test_float32_stays_float32(estimated: Estimate) -> None:
-    # Proves that single precision costs digits only. Oracle: the float64 result.
-    exact, single = (estimated(*packed(WELL, at_truth=True, dtype=dtype)) for dtype in (np.float64, np.float32))
-    assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {np.dtype(np.float32)}
-    np.testing.assert_allclose(single.inverse_depth, exact.inverse_depth, rtol=1e-2)
-    spread = np.sqrt(np.diagonal(exact.poses, axis1=1, axis2=2))[1:]
-    error = np.abs(single.poses - exact.poses)[1:] / spread[:, :, None] / spread[:, None, :]
-    assert error.max() < 1e-2
-
-
 def test_on_a_system_that_no_camera_made() -> None:
     # Proves the blocks for hosts of unequal degree and arbitrary transports, one landmark undetermined. Oracle: the
     # dense inverse.

@@ -181,12 +181,12 @@ class EdgeTerm(AbstractTerm):
 
     def residuals(self, view: EdgeView) -> Float[Array, "m p"]:
         """Return the residuals of all slots of one edge; `self` has the prepared data of that edge."""
-        return self._moved(view, jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth)
+        return self._after(view, view.parts(jnp.zeros(view.size, view.inverse_depth.dtype)), view.inverse_depth)
 
     def along_all(self, view: EdgeView) -> tuple[Float[Array, "m p"], Float[Array, "m p"]]:
         """Return residuals of one edge, and the sum of their derivatives, which is not finite if one is not."""
         at = jnp.zeros(view.size, view.inverse_depth.dtype), view.inverse_depth
-        return jax.jvp(lambda x, d: self._moved(view, x, d), at, jax.tree.map(jnp.ones_like, at))
+        return jax.jvp(lambda x, d: self._after(view, view.parts(x), d), at, jax.tree.map(jnp.ones_like, at))
 
     def energy(self, view: EdgeView) -> Float[Array, ""]:
         """Return the energy of one edge."""
@@ -251,10 +251,6 @@ class EdgeTerm(AbstractTerm):
 
     def _energy_at(self, view: EdgeView, shared: Array, depth: Array, pixels: Array) -> Float[Array, ""]:
         return robust_energy(self.kernel, self.weights, self._after(view, view.parts(shared), depth, pixels))
-
-    def _moved(self, view: EdgeView, shared: Float[Array, " d"], depth: Float[Array, " p"]) -> Float[Array, "m p"]:
-        """Return residuals after a step of the shared coordinates, at the given depths."""
-        return self._after(view, view.parts(shared), depth)
 
     def _after(
         self,
