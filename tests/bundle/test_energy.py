@@ -17,8 +17,7 @@ from vggtgeo.bundle.objective import energy, energy_terms
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.depth import DepthPrior
-from vggtgeo.bundle.terms.line import LineTerm
-from vggtgeo.bundle.terms.point import PointTerm
+from vggtgeo.bundle.terms.image import LineTerm, PointTerm
 from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry.camera_models import MIN_RELATIVE_DEPTH, Pinhole
 

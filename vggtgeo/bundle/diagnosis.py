@@ -28,7 +28,8 @@ from vggtgeo.bundle.linearise import free_coordinates
 from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, prepared, prepared_energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows, term_residuals, used_slots
-from vggtgeo.bundle.terms.edge import EdgeTerm, ImageTerm
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.image import ImageTerm
 from vggtgeo.bundle.terms.node import NodeTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie

@@ -17,10 +17,9 @@ from vggtgeo.bundle.padding import COUNTED, PaddedSize
 from vggtgeo.bundle.terms.baseline import BaselinePrior
 from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.image import LineTerm, PointTerm
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.node import NodeTerm
-from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.relative_pose import RelativePose
 from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.bundle.terms.slot import SlotTerm
