@@ -1,4 +1,4 @@
-"""Arrow-shaped normal equations of an edge-factored least-squares problem, and their Schur complement.
+"""Arrow-shaped normal equations of an edge-factored least-squares problem; `assembly.py` has their Schur complement.
 
 Unknowns: `n` nodes of `b` coordinates each, `q` shared coordinates (together `c = n b + q`: the dense part `x`), and
 `h` rows of `s` scalar landmarks `z`. A node hosts one row or several, so that rows are short even if one node hosts

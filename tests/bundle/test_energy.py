@@ -16,7 +16,6 @@ from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import energy, energy_terms
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import State
-from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.image import LineTerm, PointTerm
 from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry.camera_models import MIN_RELATIVE_DEPTH, Pinhole
@@ -183,12 +182,6 @@ def test_line_residual_is_the_distance_to_the_line() -> None:
     found = of_one(LineTerm, coefficients=line).residual(view(RELATIVE, 1 / DEPTH))
     assert found.shape == (1,)
     assert float(found[0]) == pytest.approx(3.5, abs=1e-10)
-
-
-def test_depth_residual_counts_standard_deviations() -> None:
-    # Proves the unit of the depth residual. Oracle: a value two standard deviations above its prior.
-    prior = of_one(DepthPrior, mean=0.5, sigma=0.05)
-    assert float(prior.residual(jnp.asarray(0.6))) == pytest.approx(2.0)
 
 
 def test_the_identity_projects_a_pixel_onto_itself() -> None:

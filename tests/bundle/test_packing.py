@@ -16,7 +16,6 @@ from vggtgeo.solvers.assembly import Reduced, dense_schur_complement
 import vggtgeo as vg
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
@@ -27,20 +26,6 @@ SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)
 
 UNCHECKED = inspect.unwrap(pack)
 """As a user calls it: in the tests a check of types comes before the words that are proved here."""
-
-
-def shuffled(scene: Scene) -> tuple[Observations, np.ndarray]:
-    """The same observations with edges and landmarks in another order, and the landmarks' new order."""
-    seen, rng = scene.observations, np.random.default_rng(0)
-    edges, landmarks = rng.permutation(len(seen.edges)), rng.permutation(len(seen.host))
-    edge_at, landmark_at = np.argsort(edges), np.argsort(landmarks)
-    changes = {
-        name: getattr(seen, name)[landmarks] for name in ("host", "pixel", "depth_mean", "depth_sigma", "depth_weight")
-    }
-    for kind in ("point", "line"):
-        changes[f"{kind}_edge"] = edge_at[getattr(seen, f"{kind}_edge")]
-        changes[f"{kind}_landmark"] = landmark_at[getattr(seen, f"{kind}_landmark")]
-    return replace(seen, edges=seen.edges[edges], **changes), landmarks
 
 
 @pytest.mark.parametrize("double", [False, True])
@@ -80,18 +65,6 @@ def test_every_observation_is_packed_once(size: PaddedSize | None) -> None:
     assert observed(problem) == expected
     assert int(jnp.sum(problem.lines.weight > 0)) == len(seen.line_edge)
     assert float(jnp.sum(problem.depth.weight)) == pytest.approx(seen.depth_weight.sum())
-
-
-def test_the_order_of_the_lists_does_not_matter() -> None:
-    # Proves that edges need not be sorted nor landmarks grouped. Oracle: the packing of the sorted lists.
-    mixed, landmarks = shuffled(SCENE)
-    problem, _, _ = SCENE.pack()
-    scene = replace(SCENE, observations=mixed, start_inverse_depth=SCENE.start_inverse_depth[landmarks])
-    other, state, index = scene.pack()
-    assert observed(other) == observed(problem)
-    np.testing.assert_array_equal(index.gather(state.inverse_depth), scene.start_inverse_depth)
-    np.testing.assert_array_equal(index.gather(other.pixels), mixed.pixel)
-    assert np.all(np.diff(other.edges.source) >= 0)
 
 
 def test_padding_is_harmless_and_held() -> None:

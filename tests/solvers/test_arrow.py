@@ -148,7 +148,7 @@ def grouped() -> tuple[ArrowSystem, Dense]:
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_groups_are_solved_and_inverted_by_every_solver(name: str, grouped: tuple[ArrowSystem, Dense]) -> None:
-    # Proves a damped step, the covariances of nodes, shared coordinates and landmarks, in every storage of the blocks.
+    # Proves a damped step, the covariances of nodes, neighbours, shared coordinates and landmarks, in every storage.
     # Oracle: numpy's solve and inverse of the dense matrix.
     (system, dense), solver, damping = grouped, SOLVERS[name], 0.1
     free, size = free_part(system), len(system.free)
@@ -169,6 +169,10 @@ def test_groups_are_solved_and_inverted_by_every_solver(name: str, grouped: tupl
     for node in range(NODES):
         own = slice(node * BLOCK, (node + 1) * BLOCK)
         np.testing.assert_allclose(known.nodes[node], inverse[own, own], atol=1e-9 * np.abs(inverse).max())
+    for host, rank in np.argwhere(np.asarray(system.graph.of_host) < len(system.graph.source)):
+        own, other = (slice(k * BLOCK, (k + 1) * BLOCK) for k in (host, int(system.neighbours()[host, rank])))
+        np.testing.assert_allclose(known.neighbours[host, rank], inverse[own, other], atol=1e-9 * np.abs(inverse).max())
+    assert int(known.rank) == len(free)
     variances = np.ravel(known.landmarks)
     seen = np.isfinite(variances)
     assert seen.sum() == NODES * SLOTS - 1
