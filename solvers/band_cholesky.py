@@ -12,15 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, back_substitute, dense_gradient
-from vggtgeo.solvers.block_band import (
-    BandLayout,
-    Bands,
-    band_layout,
-    damped_band,
-    factorise_bands,
-    prepare_bands,
-    solve_band,
-)
+from vggtgeo.solvers.block_band import BandLayout, Bands, band_layout, band_solver, damped_band, prepare_bands
 from vggtgeo.solvers.block_elimination import (
     Elimination,
     SelectedInverse,
@@ -162,8 +154,7 @@ class BandCholesky(AbstractReducedSolver[Bands]):
     ) -> tuple[ArrowVector, Float[Array, ""]]:
         shrink = 1 / (1 + damping)
         rhs = jnp.where(system.free, shrink * prepared.schur_gradient - prepared.gradient, 0.0)
-        factor, shared = factorise_bands(system, prepared, damping), len(prepared.hessian.corner)
-        inverse = lambda columns: prepared.layout.flat(solve_band(factor, prepared.layout.columns(columns, shared)))
+        inverse = band_solver(system, prepared, damping)
         dense = solve_pinned(*pinned_update(system, prepared.stiffness, prepared.diagonal), inverse, rhs)
         step = ArrowVector(dense, shrink * back_substitute(system, dense))
         return step, predicted_decrease(system, prepared.gradient, prepared.diagonal, step, damping)

@@ -15,6 +15,7 @@ Cost: `7/3 w^3` operations a group, so linear in the number of nodes, compared w
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -297,7 +298,8 @@ def damped_band(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) ->
     return add_to_diagonal(matrix, bands.layout.columns(added[:, None], shared))
 
 
-def factorise_bands(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandFactor:
-    """Factorise `damped_band` over the free coordinates."""
-    moves = bands.layout.columns(system.free[:, None], len(bands.hessian.corner))
-    return factorise(damped_band(system, bands, damping), moves)
+def band_solver(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> Callable[[Array], Array]:
+    """Factorise `damped_band` over the free coordinates; return its inverse, times columns `[c, m]`."""
+    layout, shared = bands.layout, len(bands.hessian.corner)
+    factor = factorise(damped_band(system, bands, damping), layout.columns(system.free[:, None], shared))
+    return lambda columns: layout.flat(solve_band(factor, layout.columns(columns, shared)))

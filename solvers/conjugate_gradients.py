@@ -29,7 +29,7 @@ from vggtgeo.solvers.arrow import (
     to_relative,
 )
 from vggtgeo.solvers.assembly import AbstractLayout, Blocks, assemble, schur_products_of_hosts
-from vggtgeo.solvers.block_band import Bands, band_layout, factorise_bands, prepare_bands, solve_band
+from vggtgeo.solvers.block_band import Bands, band_layout, band_solver, prepare_bands
 from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, free_gauge
 from vggtgeo.solvers.local_inverse import LocalInverse, local_coordinates
 from vggtgeo.solvers.minres import minres
@@ -119,13 +119,8 @@ class BandPreconditioner(AbstractPreconditioner[Bands]):
         return prepare_bands(system, band_layout(system, self.reach, None))
 
     def inverse(self, system: ArrowSystem, prepared: Bands, damping: Float[Array, ""]) -> Apply:
-        factor, layout = factorise_bands(system, prepared, damping), prepared.layout
-
-        def apply(residual: Array) -> Array:
-            columns = layout.columns(residual[:, None], len(prepared.hessian.corner))
-            return layout.flat(solve_band(factor, columns))[:, 0]
-
-        return apply
+        solve = band_solver(system, prepared, damping)
+        return lambda residual: solve(residual[:, None])[:, 0]
 
 
 class IterativeFactor(AbstractFactor):

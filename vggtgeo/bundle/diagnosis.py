@@ -225,26 +225,17 @@ def _observed(problem: Problem, term: AbstractTerm, state: State, slopes: _Slope
     if isinstance(term, EdgeTerm):
         return _observed_on_edges(problem, term, state)
     if slopes is not None:
-        residual, jacobian = slopes.residual[1], slopes.jacobian[1]
-        return Observed(
-            present=term.weights != 0,
-            squared=term.weights * jnp.sum(residual**2, 1),
-            value=jnp.all(jnp.isfinite(residual), 1),
-            derivative=jnp.all(jnp.isfinite(jacobian), (1, 2)),
-            entries=residual.shape[1],
-        )
-    zero = jnp.zeros(state.num_unknowns, state.inverse_depth.dtype)
-    # The derivative along the sum of all coordinates is not finite if any derivative is not.
-    residuals = lambda step: term_residuals(problem, term, state.moved(step))
-    residual, slope = jax.jvp(residuals, (zero,), (jnp.ones_like(zero),))
-    if jnp.ndim(term.weight) == 0:  # one observation, whose residual is a vector
-        residual, slope = residual[:, None], slope[:, None]
-    shape = jnp.shape(term.weight)
+        # The sum of the derivatives by all coordinates is not finite if any derivative is not.
+        residual, slope = slopes.residual[1].T, jnp.sum(slopes.jacobian[1], 2).T
+    else:
+        zero = jnp.zeros(state.num_unknowns, state.inverse_depth.dtype)
+        residuals = lambda step: term_residuals(problem, term, state.moved(step))
+        residual, slope = jax.jvp(residuals, (zero,), (jnp.ones_like(zero),))
     return Observed(
         present=term.weights != 0,
-        squared=term.weights * jnp.sum(residual**2, 0).reshape(shape),
-        value=jnp.all(jnp.isfinite(residual), 0).reshape(shape),
-        derivative=jnp.all(jnp.isfinite(slope), 0).reshape(shape),
+        squared=term.weights * jnp.sum(residual**2, 0),
+        value=jnp.all(jnp.isfinite(residual), 0),
+        derivative=jnp.all(jnp.isfinite(slope), 0),
         entries=len(residual),
     )
 
