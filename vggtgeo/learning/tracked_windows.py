@@ -263,10 +263,10 @@ def track_window(
     parts = []
     for e, (i, j) in enumerate(edges):
         true, visible = known.correspond(i, j, corners[i])
-        found_there = np.isfinite(true).all(axis=1) & np.isfinite(depth[first[i] : first[i + 1]])
-        guess = np.where(found_there[:, None], true, corners[i]) + rng.normal(0, _SEARCH, true.shape)
+        usable = np.isfinite(true).all(axis=1) & np.isfinite(depth[first[i] : first[i + 1]])
+        guess = np.where(usable[:, None], true, corners[i]) + rng.normal(0, _SEARCH, true.shape)
         found = _follow(grey[i], grey[j], corners[i], guess)
-        kept = found.kept & found_there & _inside(true, grey[j])
+        kept = found.kept & usable & _inside(true, grey[j])
         features = _features(grey[i], grey[j], saliency[i], saliency[j], corners[i], found)
         error = np.where(visible, np.linalg.norm(found.pixels - true, axis=1), np.inf)
         rows = np.nonzero(kept)[0]
