@@ -216,42 +216,6 @@ def test_second_derivatives_with_several_cameras() -> None:
     assert error < 1e-10, error
 
 
-class Ratio(vg.terms.CameraTerm):
-    """Of the first focal lengths of two cameras."""
-
-    ratio: jax.Array
-
-    def residual(self, parameters):
-        return jnp.stack([parameters[0] / parameters[4] - self.ratio, (parameters[1] - parameters[5]) / 100])
-
-
-def test_a_term_on_all_cameras() -> None:
-    # Proves the model of a term that two cameras are part of, under a robust kernel. Oracle: the energy written out,
-    # differentiated, and `sum w rho' J'J`.
-    term = Ratio(ratio=jnp.array([1.0, 1.3]), weight=jnp.array([4.0, 25.0]), kernel=vg.kernels.Huber(0.7))
-    at = jnp.asarray(PINHOLES.reshape(-1))
-    one = lambda p, ratio: jnp.stack([p[0] / p[4] - ratio, (p[1] - p[5]) / 100])
-
-    def energy(p):
-        squared = term.weight * jnp.stack([jnp.sum(one(p, ratio) ** 2) for ratio in term.ratio])
-        return jnp.sum(jnp.where(squared <= 0.49, squared, 1.4 * jnp.sqrt(squared) - 0.49)) / 2
-
-    (hessian, gradient), (reweighted, force) = jax.jit(
-        lambda p: (term.model(p, None, True), term.model(p, None, False))
-    )(at)
-    curved, slope = jax.jit(lambda p: (jax.hessian(energy)(p), jax.grad(energy)(p)))(at)
-    np.testing.assert_allclose(hessian, curved, atol=1e-14)
-    np.testing.assert_allclose(gradient, slope, atol=1e-14)
-    expected = np.zeros((8, 8))
-    both = jax.jit(lambda p, ratio: (jax.jacfwd(one)(p, ratio), one(p, ratio)))
-    for weight, ratio in zip(np.asarray(term.weight), np.asarray(term.ratio), strict=True):
-        jacobian, value = map(np.asarray, both(at, ratio))
-        size = np.sqrt(weight * np.sum(value**2))
-        expected += weight * min(1.0, 0.7 / size) * jacobian.T @ jacobian
-    np.testing.assert_allclose(reweighted, expected, atol=1e-14)
-    np.testing.assert_allclose(force, gradient, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("model", "truth"),
     [

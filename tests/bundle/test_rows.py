@@ -13,7 +13,7 @@ from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 import vggtgeo as vg
-from vggtgeo.bundle.padding import PaddedSize, Slots, row_lengths
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_problem, save_problem
 
@@ -158,25 +158,6 @@ def test_a_saved_problem_keeps_its_rows(tmp_path: Path) -> None:
     matches = SCENE.observations.point_edge, SCENE.observations.point_landmark
     np.testing.assert_array_equal(index.stored_edge(*matches), ROWS[2].stored_edge(*matches))
     np.testing.assert_array_equal(problem.host, ROWS[0].host)
-
-
-def hosts(counts: list[int], degree: int) -> tuple[int, int]:
-    """Rows, and slots in each, that are chosen for hosts of so many points."""
-    slots = Slots(np.zeros(0, bool), np.zeros(0, int), np.array(counts), np.zeros(len(counts), int), None)
-    points, lines = row_lengths(slots, degree)
-    return int(slots.rows(points, lines).sum()), points
-
-
-def test_one_rich_host_costs_what_its_landmarks_cost() -> None:
-    # Proves that even hosts keep one row each, and that what is stored goes by the number of landmarks, not by the
-    # richest host. Oracle: the same landmarks spread evenly.
-    rich, wide = [7200] + [13] * 48, 6 * 48
-    assert hosts([160] * 49, 48) == (49, 160)
-    assert hosts([160 + i % 7 for i in range(49)], 48)[0] == 49
-    rows, points = hosts(rich, 48)
-    assert rows * (points + wide) < 2 * 49 * (160 + wide) < 49 * (7200 + wide) / 8
-    twice, more = hosts([14400] + [13] * 48, 48)
-    assert twice * (more + wide) < 2.1 * rows * (points + wide)
 
 
 def test_pack_chooses_rows_by_itself() -> None:

@@ -141,34 +141,6 @@ def test_a_step_that_is_not_finite(solved: Solve) -> None:
     assert finite(solution)
 
 
-def test_depth_that_counts_nothing(solved: Solve) -> None:
-    # Proves that `alpha` of 0 is a problem without depth, not one that is no number. Oracle: depth weights of 0.
-    problem, start, _ = NOISY.pack(**OPTIONS)
-    assert float(problem.depth.weight.max()) > 0
-    none = eqx.tree_at(lambda p: p.depth.alpha, problem, jnp.zeros(()))
-    solution = solved(none, start)
-    expected = solved(problem.with_term(problem.depth.reweighted(0 * problem.depth.weight)), start)
-    assert bool(solution.converged)
-    np.testing.assert_allclose(solution.state.inverse_depth, expected.state.inverse_depth, rtol=1e-9)
-
-
-def test_a_keyframe_that_nothing_was_matched_in(solved: Solve) -> None:
-    # Proves that an unconnected keyframe does no harm: the others come out as they should, it stays finite and, having
-    # depth priors only, where it was. Oracle: the truth of the others, its start.
-    seen = EXACT.observations
-    with_last = {kind: np.any(seen.edges[getattr(seen, f"{kind}_edge")] == 2, 1) for kind in ("point", "line")}
-    scene = EXACT.with_observations(
-        point_weight=np.where(with_last["point"], 0.0, seen.point_weight),
-        line_weight=np.where(with_last["line"], 0.0, seen.line_weight),
-    )
-    problem, start, truth = exact_problem(scene)
-    solution = solved(problem, start)
-    first_two = lambda state: State(jaxlie.SE3(state.poses.wxyz_xyz[:2]), state.intrinsics, state.inverse_depth)
-    assert bool(solution.converged), solution.message
-    assert distance(first_two(solution.state), first_two(truth)) < 1e-7
-    np.testing.assert_allclose(solution.state.poses.wxyz_xyz[2], start.poses.wxyz_xyz[2], atol=1e-12)
-
-
 def test_without_depth_the_scale_is_held(solved: Solve) -> None:
     # Proves that with no metric depth the scale stays that of the start instead of drifting, and all else is found.
     # Oracle: the truth of all that was matched, brought to the solution's scale by its translations.
@@ -223,19 +195,6 @@ def test_a_jitted_function_may_close_over_the_problem(solved: Solve) -> None:
     nothing = problem.with_terms((replace(problem.points, weight=weightless),))
     with raises("`problem`", "weights"):
         jax.jit(lambda state: solve(nothing, state))(start)
-
-
-def test_vmap_solves_each(solved: Solve) -> None:
-    # Proves that a batch of problems of one shape is solved one by one, each with its own count. Oracle: two solves.
-    problems = [scene.pack(**OPTIONS)[:2] for scene in (NOISY, make_scene(noise=1.0, depth_error=0.1, seed=5))]
-    alone = [solved(*problem) for problem in problems]
-    stacked = jax.tree.map(lambda a, b: jnp.stack([a, b]), *problems)
-    batch = jax.jit(jax.vmap(lambda problem, state: solve(problem, state, solver=SOLVER)))(*stacked)
-    for i, solution in enumerate(alone):
-        one = jax.tree.map(lambda leaf, i=i: leaf[i], batch.state)
-        assert float(batch.energy[i]) == pytest.approx(float(solution.energy), rel=1e-10)
-        assert distance(one, solution.state) < 1e-7
-    assert [int(n) for n in batch.iterations] == [int(solution.iterations) for solution in alone]
 
 
 def test_float32_is_close_to_float64(solved: Solve) -> None:
