@@ -27,6 +27,7 @@ A landmark at an active bound is fixed: its multiplier is not zero.
 from __future__ import annotations
 
 import numbers
+from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
@@ -39,14 +40,16 @@ from jaxtyping import Array, Bool, Float
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
     ArrowVector,
+    carry_to_nodes,
+    couple,
     dense_gradient,
+    inverse_landmark_hessian,
     moving_landmarks,
 )
-from vggtgeo.solvers.exact_model import ExactModel, exact_model
-from vggtgeo.solvers.landmark_basis import expand, restrict
+from vggtgeo.solvers.flat_directions import at_least
 from vggtgeo.solvers.levenberg_marquardt import LevenbergMarquardtState, SchurLevenbergMarquardt
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
-from vggtgeo.solvers.reduced import AbstractReducedSolver
+from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, DenseCholesky
 
 STATIONARY = 1e-6
 """Gradient after the refinement, scaled by the root of the curvature (the unit of `sqrt(energy)`), above which a point
@@ -92,7 +95,7 @@ class ArrowAdjoint(optx.AbstractAdjoint):
         del rewrite_fn, tags
         problem = _only(AbstractArrowProblem, inputs)
         # The derivative belongs to the optimum, not to the iterations that found it.
-        detached = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs)
+        detached = _detached(inputs)
 
         def loop(*arguments: Any, **options: Any) -> Any:
             # Nothing is differentiated through the loop, so it needs no bound and no stored iterates.
@@ -108,6 +111,56 @@ class ArrowAdjoint(optx.AbstractAdjoint):
         )
         is_state = lambda node: isinstance(node, LevenbergMarquardtState)
         return point, jax.tree.map(lambda node: reported if is_state(node) else node, rest, is_leaf=is_state)
+
+
+class ExactModel(eqx.Module):
+    """A Hessian, definite or not, with the factor of its Schur complement `S` over the free coordinates."""
+
+    system: ArrowSystem
+    factor: AbstractFactor
+    diagonal: Float[Array, " c"]
+
+    def solve(self, vector: ArrowVector) -> ArrowVector:
+        """Return `H^-1 vector` over the free coordinates; zero for fixed or undetermined ones, or if not finite.
+
+        `S x = v_c - W V^-1 v_d`, `z = V^-1 (v_d - W' x)`, with a stiffness added along flat gauge directions.
+        """
+        return self.checked(vector)[0]
+
+    def checked(self, vector: ArrowVector) -> tuple[ArrowVector, Bool[Array, ""]]:
+        """Return the solution of `solve`, and whether an iterative solver has converged."""
+        inverse = inverse_landmark_hessian(self.system)
+        rest = vector.dense - carry_to_nodes(self.system, inverse * vector.landmarks)
+        dense, found = self.factor.solve(self.system, rest)
+        # A singular matrix gives no step, so the chord iteration ends and the derivative is zero, not NaN.
+        dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
+        return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0))), found
+
+    def largest(self, gradient: ArrowVector) -> Float[Array, ""]:
+        """Return the largest entry of a gradient, each scaled by the root of its curvature."""
+        # An exact Hessian may have negative curvature, so its size is the scale.
+        landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
+        dense = jnp.max(gradient.dense**2 / self.diagonal, initial=0.0)
+        return jnp.sqrt(jnp.maximum(dense, jnp.max(landmarks, initial=0.0)))
+
+    def size(self, gradient: ArrowVector) -> Float[Array, ""]:
+        """Return the squared norm of a gradient, each squared entry divided by its curvature."""
+        landmarks = gradient.landmarks**2 * jnp.abs(inverse_landmark_hessian(self.system))
+        return jnp.sum(gradient.dense**2 / self.diagonal) + jnp.sum(landmarks)
+
+
+def exact_model(
+    system: ArrowSystem,
+    solver: AbstractReducedSolver | None = None,
+    definite: Callable[[], ArrowSystem] | None = None,
+) -> ExactModel:
+    """Return the model of an exact Hessian, with the linear algebra of `solver`; None = dense.
+
+    definite: returns a nearby system with a positive Hessian; None = `system` is positive.
+    """
+    solver = DenseCholesky() if solver is None else solver
+    factor = solver.factor(system, (lambda: system) if definite is None else definite)
+    return ExactModel(system, factor, at_least(dense_gradient(system)[1]))
 
 
 def _only(kind: type, tree: Any) -> Any:
@@ -286,11 +339,11 @@ def _along(system: ArrowSystem, problem: AbstractArrowProblem) -> ArrowSystem:
 
 
 def _expanded(system: ArrowSystem, step: ArrowVector) -> ArrowVector:
-    return ArrowVector(step.dense, expand(system.basis, step.landmarks))
+    return ArrowVector(step.dense, system.basis.expand(step.landmarks))
 
 
 def _restricted(system: ArrowSystem, gradient: ArrowVector) -> ArrowVector:
-    return ArrowVector(gradient.dense, restrict(system.basis, gradient.landmarks))
+    return ArrowVector(gradient.dense, system.basis.restrict(gradient.landmarks))
 
 
 def _free(vector: ArrowVector, system: ArrowSystem) -> ArrowVector:

@@ -15,6 +15,7 @@ Cost: `7/3 w^3` operations a group, so linear in the number of nodes, compared w
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -23,15 +24,16 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Shaped
-from vggtgeo.solvers.arrow import (
+from vggtgeo.solvers.arrow import ArrowSystem, carry_to_nodes, dense_gradient, inverse_landmark_hessian
+from vggtgeo.solvers.assembly import (
     AbstractLayout,
-    ArrowSystem,
     Blocks,
     add_prior_blocks,
     assemble_edges,
     assemble_hosts,
     schur_products_of_hosts,
 )
+from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, pins
 
 
 class BandLayout(AbstractLayout):
@@ -150,7 +152,7 @@ def assemble_bands(system: ArrowSystem, layout: BandLayout) -> tuple[BandMatrix,
     diagonal of a positive semidefinite matrix), so the band is a valid preconditioner.
     """
     near = layout.near(system, layout.group // 2)
-    block = system.source_adjoint.shape[-1]
+    block = system.block
     # The border of a far edge couples its nodes through the shared coordinates, so it is dropped with the coupling.
     border = jnp.where(near[:, None, None], system.gram[:, :block, block:], 0.0)
     near_system = eqx.tree_at(lambda s: s.gram, system, system.gram.at[:, :block, block:].set(border))
@@ -241,7 +243,7 @@ def _band(blocks: Blocks, layout: BandLayout) -> BandMatrix:
 def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "h t t"]:
     """Return the entries of the hosts' products that do not couple a far edge with other coordinates."""
     hosts, degree = system.graph.of_host.shape
-    block = system.source_adjoint.shape[-1]
+    block = system.block
     tail = system.cross.shape[1] - 1 - degree * block
     far = jnp.append(~near, False)[system.graph.of_host]
     # Each far edge is a separate class (1 + its index); near edges, shared coordinates and the gradient are class 0.
@@ -264,3 +266,40 @@ def held(matrix: BandMatrix, moves: BandVector) -> BandMatrix:
 
 def _positive_root(diagonal: Array) -> Array:
     return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+
+
+class Bands(eqx.Module):
+    """Data of the band solvers for one linearisation."""
+
+    layout: BandLayout
+    hessian: BandMatrix
+    schur: BandMatrix
+    gradient: Float[Array, " c"]
+    schur_gradient: Float[Array, " c"]
+    diagonal: Float[Array, " c"]
+    stiffness: Float[Array, " g"]
+
+
+def prepare_bands(system: ArrowSystem, layout: BandLayout) -> Bands:
+    """Assemble both matrices for the edges inside the band, and the right-hand side."""
+    hessian, schur = assemble_bands(system, layout)
+    gradient, diagonal = dense_gradient(system)
+    schur_gradient = carry_to_nodes(system, inverse_landmark_hessian(system) * system.landmark_gradient)
+    return Bands(layout, hessian, schur, gradient, schur_gradient, at_least(diagonal), flat_stiffness(system))
+
+
+def damped_band(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> BandMatrix:
+    """Return the damped Schur complement, flat directions pinned."""
+    shrink, shared = 1 / (1 + damping), len(bands.hessian.corner)
+    matrix: BandMatrix = jax.tree.map(lambda whole, taken: whole - shrink * taken, bands.hessian, bands.schur)
+    # The stiffness along a gauge direction is dense. A pin on one coordinate keeps the band, and `solve_pinned`
+    # corrects it.
+    added = damping * bands.diagonal + pins(system, bands.stiffness, bands.diagonal).sum(1)
+    return add_to_diagonal(matrix, bands.layout.columns(added[:, None], shared))
+
+
+def band_solver(system: ArrowSystem, bands: Bands, damping: Float[Array, ""]) -> Callable[[Array], Array]:
+    """Factorise `damped_band` over the free coordinates; return its inverse, times columns `[c, m]`."""
+    layout, shared = bands.layout, len(bands.hessian.corner)
+    factor = factorise(damped_band(system, bands, damping), layout.columns(system.free[:, None], shared))
+    return lambda columns: layout.flat(solve_band(factor, layout.columns(columns, shared)))

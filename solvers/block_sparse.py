@@ -12,15 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
-from vggtgeo.solvers.arrow import (
-    AbstractLayout,
-    ArrowSystem,
-    Blocks,
-    add_prior_blocks,
-    assemble_edges,
-    assemble_hosts,
-    schur_products_of_hosts,
-)
+from vggtgeo.solvers.arrow import ArrowSystem
+from vggtgeo.solvers.assembly import AbstractLayout, Blocks, assemble
 
 
 class SparseLayout(AbstractLayout):
@@ -68,7 +61,5 @@ def reduced_blocks(system: ArrowSystem, layout: SparseLayout) -> Blocks:
 
     The prior must be on the shared coordinates only: one that couples all nodes is not sparse.
     """
-    hessian = add_prior_blocks(assemble_edges(system, layout), system, layout)
-    schur = assemble_hosts(system, schur_products_of_hosts(system), layout)
-    reduced: Blocks = jax.tree.map(lambda whole, taken: whole - taken, hessian, schur)
+    reduced: Blocks = jax.tree.map(lambda whole, taken: whole - taken, *assemble(system, layout))
     return reduced

@@ -14,6 +14,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.scipy as jsp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
@@ -24,42 +26,26 @@ from vggtgeo.solvers.arrow import (
     from_relative,
     hessian_times,
     inverse_landmark_hessian,
-    schur_products_of_hosts,
     to_relative,
 )
-from vggtgeo.solvers.bands import Bands, factorise_bands, prepare_bands
-from vggtgeo.solvers.block_band import band_layout, solve_band
-from vggtgeo.solvers.block_jacobi import JacobiBlocks, apply_blocks, invert_blocks, prepare_blocks
+from vggtgeo.solvers.assembly import AbstractLayout, Blocks, assemble, schur_products_of_hosts
+from vggtgeo.solvers.block_band import Bands, band_layout, band_solver, prepare_bands
 from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, free_gauge
 from vggtgeo.solvers.local_inverse import LocalInverse, local_coordinates
-from vggtgeo.solvers.minres import MinresSolved, minres
+from vggtgeo.solvers.minres import minres
 from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, predicted_decrease
 
 Apply = Callable[[Float[Array, " c"]], Float[Array, " c"]]
 Prepared = TypeVar("Prepared")
 
 
-class AbstractProduct(eqx.Module):
-    """Application of `W V^-1 W'`; each subclass is one method."""
+def _eliminated(system: ArrowSystem, products: Float[Array, "h t t"], dense: Float[Array, " c"]) -> Float[Array, " c"]:
+    """Return `W V^-1 W' dense`.
 
-    @abc.abstractmethod
-    def prepare(self, system: ArrowSystem) -> Array:
-        """Compute the part shared by all products at one linearisation."""
-
-    @abc.abstractmethod
-    def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
-        """Return `W V^-1 W' dense`."""
-
-
-class HostProduct(AbstractProduct):
-    """Use one matrix `[b k + q, b k + q]` for each host, formed once: faster from about five products."""
-
-    def prepare(self, system: ArrowSystem) -> Array:
-        return schur_products_of_hosts(system)
-
-    def apply(self, system: ArrowSystem, prepared: Array, dense: Float[Array, " c"]) -> Float[Array, " c"]:
-        relative = jnp.pad(to_relative(system, dense), ((0, 0), (0, 1)))
-        return from_relative(system, jnp.einsum("nrt,nt->nr", prepared, relative)[:, :-1])
+    products: of `schur_products_of_hosts`, formed once: faster from about five products with a vector.
+    """
+    relative = jnp.pad(to_relative(system, dense), ((0, 0), (0, 1)))
+    return from_relative(system, jnp.einsum("nrt,nt->nr", products, relative)[:, :-1])
 
 
 class AbstractPreconditioner(eqx.Module, Generic[Prepared]):
@@ -74,15 +60,54 @@ class AbstractPreconditioner(eqx.Module, Generic[Prepared]):
         """Return the approximate inverse at one damping; fixed coordinates are passed through."""
 
 
+class DiagonalLayout(AbstractLayout):
+    """The blocks of the diagonal, `[n, b, b]`; others are dropped."""
+
+    def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
+        return jnp.zeros((nodes, block, block), dtype)
+
+    def add(
+        self, stored: Array, row: Int[Array, "*t"], column: Int[Array, "*t"], value: Float[Array, "*t b b"]
+    ) -> Array:
+        return stored.at[jnp.where(row == column, row, len(stored))].add(value, mode="drop")
+
+
+class JacobiBlocks(eqx.Module):
+    """Diagonal blocks of `H` and of `W V^-1 W'`, and the diagonal for the damping."""
+
+    hessian: Blocks
+    schur: Blocks
+    diagonal: Float[Array, " c"]
+
+
 class BlockJacobi(AbstractPreconditioner[JacobiBlocks]):
     """The diagonal blocks of the nodes and the block of the shared coordinates (Schur-Jacobi)."""
 
     def prepare(self, system: ArrowSystem) -> JacobiBlocks:
-        return prepare_blocks(system)
+        hessian, schur = assemble(system, DiagonalLayout())
+        return JacobiBlocks(hessian, schur, at_least(dense_gradient(system)[1]))
 
     def inverse(self, system: ArrowSystem, prepared: JacobiBlocks, damping: Float[Array, ""]) -> Apply:
-        inverses = invert_blocks(system, prepared, damping)
-        return lambda residual: apply_blocks(inverses, residual)
+        free_nodes, free_shared = system.split(system.free)
+        nodes, shared = system.split(damping * prepared.diagonal)
+
+        def invert(hessian: Array, schur: Array, added: Array, free: Bool[Array, " m"]) -> Array:
+            eye = jnp.eye(len(free), dtype=hessian.dtype)
+            # Unit rows for fixed coordinates.
+            matrix = jnp.where(free[:, None] & free, hessian - schur / (1 + damping) + jnp.diag(added), eye)
+            # By Cholesky, not `inv`: NaN tells the caller that a block is not definite.
+            return jsp.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), eye)
+
+        of_nodes = jax.vmap(invert)(prepared.hessian.nodes, prepared.schur.nodes, nodes, free_nodes)
+        # Without the gradient, the last shared coordinate of `Blocks`.
+        corners = prepared.hessian.corner[:-1, :-1], prepared.schur.corner[:-1, :-1]
+        of_shared = invert(*corners, shared, free_shared)
+
+        def apply(residual: Array) -> Array:
+            nodes, shared = system.split(residual)
+            return jnp.concatenate([jnp.einsum("nab,nb->na", of_nodes, nodes).reshape(-1), of_shared @ shared])
+
+        return apply
 
 
 class BandPreconditioner(AbstractPreconditioner[Bands]):
@@ -94,36 +119,23 @@ class BandPreconditioner(AbstractPreconditioner[Bands]):
         return prepare_bands(system, band_layout(system, self.reach, None))
 
     def inverse(self, system: ArrowSystem, prepared: Bands, damping: Float[Array, ""]) -> Apply:
-        factor, layout = factorise_bands(system, prepared, damping), prepared.layout
-
-        def apply(residual: Array) -> Array:
-            columns = layout.columns(residual[:, None], len(prepared.hessian.corner))
-            return layout.flat(solve_band(factor, columns))[:, 0]
-
-        return apply
+        solve = band_solver(system, prepared, damping)
+        return lambda residual: solve(residual[:, None])[:, 0]
 
 
 class IterativeFactor(AbstractFactor):
     """Minimum residuals: products with the exact Hessian, and a preconditioner from a definite one."""
 
     solver: ConjugateGradients
-    product: Array
+    products: Array
     preconditioner: Any
     stiffness: Float[Array, " g"]
 
-    def solve(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> Float[Array, " c"]:
-        return self.solved(system, rhs).solution
-
-    def checked(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
-        found = self.solved(system, rhs)
-        return found.solution, found.converged
-
-    def solved(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> MinresSolved:
-        """Return the solution with the status of the iteration."""
+    def solve(self, system: ArrowSystem, rhs: Float[Array, " c"]) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
         gauge, zero = free_gauge(system), jnp.zeros((), rhs.dtype)
 
         def apply(dense: Array) -> Array:
-            whole = hessian_times(system, dense) - self.solver.product.apply(system, self.product, dense)
+            whole = hessian_times(system, dense) - _eliminated(system, self.products, dense)
             return jnp.where(system.free, whole + gauge @ (self.stiffness * (gauge.T @ dense)), 0.0)
 
         inverse = self.solver.preconditioner.inverse(system, self.preconditioner, zero + _LIFT)
@@ -138,7 +150,7 @@ _LIFT = 1e-8
 
 
 class _Prepared(eqx.Module):
-    product: Array
+    products: Array
     preconditioner: Any
     gradient: Float[Array, " c"]
     schur_gradient: Float[Array, " c"]
@@ -150,7 +162,6 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
     """Inexact Newton steps by preconditioned conjugate gradients, for thousands of nodes and any graph."""
 
     preconditioner: AbstractPreconditioner = BlockJacobi()
-    product: AbstractProduct = HostProduct()
     rtol: float = 1e-2
     """Largest forcing term: relative residual that ends the iteration."""
     max_iterations: int = eqx.field(static=True, default=200)
@@ -162,7 +173,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         gradient, diagonal = dense_gradient(system)
         eliminated = carry_to_nodes(system, inverse_landmark_hessian(system) * system.landmark_gradient)
         return _Prepared(
-            product=self.product.prepare(system),
+            products=schur_products_of_hosts(system),
             preconditioner=self.preconditioner.prepare(system),
             gradient=gradient,
             schur_gradient=eliminated,
@@ -182,19 +193,19 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         return step, predicted + solved.solution @ solved.residual / 2
 
     def factor(self, system: ArrowSystem, definite: Callable[[], ArrowSystem]) -> IterativeFactor:
-        product, preconditioner = self.product.prepare(system), self.preconditioner.prepare(definite())
-        return IterativeFactor(self, product, preconditioner, flat_stiffness(system))
+        products, preconditioner = schur_products_of_hosts(system), self.preconditioner.prepare(definite())
+        return IterativeFactor(self, products, preconditioner, flat_stiffness(system))
 
     def inverse(self, system: ArrowSystem, rows: Int[Array, " h"]) -> LocalInverse:
         """Compute the inverse column by column, host by host, so for few hosts; converged columns are determined."""
         factor = self.factor(system, lambda: system)
         gauge = free_gauge(system)
-        along = jax.vmap(lambda column: factor.solve(system, column), 1, 1)(gauge)
+        along = jax.vmap(lambda column: factor.solve(system, column)[0], 1, 1)(gauge)
 
         def around(index: Int[Array, " l"]) -> tuple[Array, Array]:
-            unit = lambda at: factor.solved(system, jnp.zeros_like(gauge[:, 0]).at[at].set(1.0))
-            found = jax.vmap(unit)(index)
-            return found.solution[:, index], ~found.converged
+            unit = lambda at: factor.solve(system, jnp.zeros_like(gauge[:, 0]).at[at].set(1.0))
+            found, converged = jax.vmap(unit)(index)
+            return found[:, index], ~converged
 
         index = local_coordinates(system, rows)
         covariance, undetermined = jax.lax.map(around, index)
@@ -214,7 +225,7 @@ class ConjugateGradients(AbstractReducedSolver[_Prepared]):
         shrink, gauge = 1 / (1 + damping), free_gauge(system)
 
         def apply(dense: Array) -> Array:
-            eliminated = shrink * self.product.apply(system, prepared.product, dense)
+            eliminated = shrink * _eliminated(system, prepared.products, dense)
             whole = hessian_times(system, dense) + damping * prepared.diagonal * dense - eliminated
             return jnp.where(system.free, whole + gauge @ (prepared.stiffness * (gauge.T @ dense)), 0.0)
 

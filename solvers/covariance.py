@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, inverse_landmark_hessian, moving_landmarks, restricted
-from vggtgeo.solvers.landmark_basis import expand, expand_variance
 from vggtgeo.solvers.local_inverse import LocalInverse, to_relative, visible
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
@@ -52,7 +51,7 @@ def covariance(
     """
     rows = jnp.arange(len(system.graph.of_host)) if rows is None else rows
     found = (DenseCholesky() if solver is None else solver).inverse(system, rows)
-    degree, block = system.graph.of_host.shape[1], system.source_adjoint.shape[-1]
+    degree, block = system.graph.of_host.shape[1], system.block
     local = _marked(found.covariance, found.undetermined)
     own, end = slice(degree * block, (degree + 1) * block), (degree + 1) * block
     beside = local[:, own, : degree * block].reshape(len(rows), block, degree, block).transpose(0, 2, 1, 3)
@@ -72,12 +71,12 @@ def _landmarks(system: ArrowSystem, found: LocalInverse, rows: Int[Array, " h"])
     hessian_inverse, basis = inverse_landmark_hessian(system)[rows], jax.tree.map(lambda leaf: leaf[rows], system.basis)
     cross = restricted(basis.triples, system.cross[rows, :-2])
     # In this order, since the square of a large inverse may overflow, but its product with the coupling does not.
-    pulled = expand(basis, hessian_inverse[:, None] * cross)
+    pulled = basis.expand(hessian_inverse[:, None] * cross)
     spread = lambda local, side: jnp.einsum("nrs,nrt,nts->ns", side, to_relative(system, rows, local), side)
-    variance = expand_variance(basis, hessian_inverse) + spread(found.covariance, pulled)
+    variance = basis.expand_variance(hessian_inverse) + spread(found.covariance, pulled)
     lost = hessian_inverse * spread(found.null, cross) > visible(cross.dtype)
     unknown = (system.landmark_hessian[rows] == 0) | lost
-    known = (expand_variance(basis, unknown.astype(cross.dtype)) == 0) & jnp.isfinite(variance)
+    known = (basis.expand_variance(unknown.astype(cross.dtype)) == 0) & jnp.isfinite(variance)
     return jnp.where(known, variance, jnp.inf)
 
 

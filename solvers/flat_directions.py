@@ -7,14 +7,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from vggtgeo.solvers.arrow import (
-    ArrowSystem,
-    Reduced,
-    couple,
-    dense_gradient,
-    hessian_times,
-    inverse_landmark_hessian,
-)
+from vggtgeo.solvers.arrow import ArrowSystem, couple, dense_gradient, hessian_times, inverse_landmark_hessian
+from vggtgeo.solvers.assembly import Reduced
 from vggtgeo.solvers.local_inverse import rank_tolerance
 
 MIN_DIAGONAL = 1e-6

@@ -26,7 +26,6 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_gradient
-from vggtgeo.solvers.landmark_basis import expand
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
@@ -332,7 +331,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ) -> _Try:
         """Accept the step if the actual decrease is close to the predicted one, else raise the damping."""
         energy = state.energy
-        candidate = problem.retract(point, ArrowVector(step.dense, expand(system.basis, step.landmarks)))
+        candidate = problem.retract(point, ArrowVector(step.dense, system.basis.expand(step.landmarks)))
         new_energy = problem.energy(candidate)
         # A step without a predicted decrease is rejected below, so its gain does not matter but must be finite.
         gain = (energy - new_energy) / jnp.where(predicted > 0, predicted, 1.0)

@@ -36,7 +36,7 @@ def local_nodes(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array, "h m"
 
 def local_coordinates(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array, "h l"]:
     """Return the dense coordinates of the local ones of each row."""
-    block = system.source_adjoint.shape[-1]
+    block = system.block
     nodes = local_nodes(system, rows)[:, :, None] * block + jnp.arange(block)
     shared = jnp.arange(system.num_nodes * block, len(system.free))
     return jnp.concatenate([nodes.reshape(len(rows), -1), jnp.broadcast_to(shared, (len(rows), len(shared)))], 1)
@@ -44,7 +44,7 @@ def local_coordinates(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array,
 
 def to_relative(system: ArrowSystem, rows: Int[Array, " h"], local: Float[Array, "h l l"]) -> Float[Array, "h r r"]:
     """Return `J C J'`: a covariance of the local coordinates in those of the cross terms, `(eta, shared)`."""
-    degree, block = system.graph.of_host.shape[1], system.source_adjoint.shape[-1]
+    degree, block = system.graph.of_host.shape[1], system.block
     wide, shared = degree * block, system.shared
     seen = seen_by_hosts(system)
     selected = jnp.eye(shared, dtype=local.dtype)

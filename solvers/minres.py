@@ -11,17 +11,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 Apply = Callable[[Float[Array, " c"]], Float[Array, " c"]]
-
-
-class MinresSolved(NamedTuple):
-    """Result of `minres`."""
-
-    solution: Float[Array, " c"]
-    iterations: Int[Array, ""]
-    converged: Bool[Array, ""]
+Solved = tuple[Float[Array, " c"], Bool[Array, ""]]
 
 
 class _Loop(NamedTuple):
@@ -41,8 +34,11 @@ class _Loop(NamedTuple):
     iterations: Array
 
 
-def minres(apply: Apply, inverse: Apply, rhs: Float[Array, " c"], rtol: float, max_iterations: int) -> MinresSolved:
-    """Solve `A x = rhs` from zero until the residual, in the preconditioner's norm, has decreased by `rtol`."""
+def minres(apply: Apply, inverse: Apply, rhs: Float[Array, " c"], rtol: float, max_iterations: int) -> Solved:
+    """Solve `A x = rhs` from zero until the residual, in the preconditioner's norm, has decreased by `rtol`.
+
+    Returns the solution, and whether the iteration has converged.
+    """
     zero, one = jnp.zeros((), rhs.dtype), jnp.ones((), rhs.dtype)
     first = inverse(rhs)
     start = jnp.sqrt(jnp.maximum(rhs @ first, 0.0))
@@ -56,7 +52,7 @@ def minres(apply: Apply, inverse: Apply, rhs: Float[Array, " c"], rtol: float, m
         *((-one, zero), zero, zero, start, jnp.asarray(0)),
     )
     last = jax.lax.while_loop(go_on, lambda loop: _advanced(loop, apply, inverse), begin)
-    return MinresSolved(last.solution, last.iterations, last.left <= rtol * start)
+    return last.solution, last.left <= rtol * start
 
 
 def _advanced(loop: _Loop, apply: Apply, inverse: Apply) -> _Loop:

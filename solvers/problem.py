@@ -54,10 +54,6 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
         """Return the part of `point` for the record of the iterations."""
         return point
 
-    @abc.abstractmethod
-    def zero_step(self, point: Point) -> ArrowVector:
-        """Return the zero of the tangent space at `point`."""
-
 
 def energy_of(point: Point, problem: AbstractArrowProblem[Point]) -> Float[Array, ""]:
     """Return the energy: the function for `optimistix.least_squares`, with the problem as `args`."""

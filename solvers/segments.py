@@ -7,22 +7,44 @@ the segment: `z_s = (1 - t_s) a + t_s b`. In `(a, b)` the landmark block `V` has
     z_s = (1 - t_s) y_a + (t_s - l (1 - t_s)) y_b,      V_y = diag(V_aa, V_bb - l V_ab),
 
 so that the code for scalar landmarks (Schur complement, damping, covariance) also applies to segments. Only inputs and
-outputs of the system are transformed by this basis, see `landmark_basis.py`.
+outputs of the system are transformed by this basis, see `LandmarkBasis`.
 """
 
 from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
-from vggtgeo.solvers.arrow import ArrowSystem, SegmentLandmarks
+from jaxtyping import Array, Bool, Float
 
 
-def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> ArrowSystem:
-    """Return the system whose last `m q` landmarks a host are restricted to `m` affine functions of `fraction`."""
-    _, segments, samples = fraction.shape
-    alone = system.cross.shape[-1] - segments * samples
-    rows = system.cross[..., alone:].reshape(*system.cross.shape[:2], segments, samples)
+class SegmentLandmarks(eqx.Module):
+    """Landmarks that lie on straight lines: the coordinates `(y_a, y_b)`."""
+
+    fraction: Float[Array, "h g q"]
+    """Position of each sample along its segment."""
+    ratio: Float[Array, "h g"]
+    """`l`, which makes the landmark block diagonal."""
+    determined: Bool[Array, "h g"]
+    """Whether the samples determine `y_b`."""
+
+    @property
+    def basis(self) -> Float[Array, "h g q 2"]:
+        """Samples by `(y_a, y_b)`."""
+        first = 1 - self.fraction
+        second = self.fraction - self.ratio[..., None] * first
+        return jnp.stack([first, jnp.where(self.determined[..., None], second, 0.0)], -1)
+
+
+def join_segments(
+    cross: Float[Array, "n r z"], held: Bool[Array, "n z"] | None, fraction: Float[Array, "n m q"]
+) -> tuple[Float[Array, "n r s"], SegmentLandmarks, Bool[Array, "n s"] | None]:
+    """Restrict the last `m q` landmarks of a host to `m` affine functions of `fraction`.
+
+    cross, held: of an `ArrowSystem`, returned for the new landmarks.
+    """
+    _, count, samples = fraction.shape
+    alone = cross.shape[-1] - count * samples
+    rows = cross[..., alone:].reshape(*cross.shape[:2], count, samples)
     curvature = rows[:, -1]
     first, second = 1 - fraction, fraction
     total = lambda left, right: jnp.sum(curvature * left * right, -1)
@@ -36,10 +58,8 @@ def join_segments(system: ArrowSystem, fraction: Float[Array, "n m q"]) -> Arrow
     joint = SegmentLandmarks(fraction, ratio, determined)
     joined = jnp.einsum("nrms,nmsk->nrkm", rows, joint.basis)
     joined = joined.at[:, -1].set(jnp.stack([own, jnp.where(determined, rest, 0.0)], 1))
-    cross = jnp.concatenate([system.cross[..., :alone], joined.reshape(*joined.shape[:2], 2 * segments)], -1)
-    held = None if system.held is None else jnp.pad(system.held[:, :alone], ((0, 0), (0, 2 * segments)))
-    changed = (cross, joint, held)
-    return eqx.tree_at(lambda s: (s.cross, s.segments, s.held), system, changed, is_leaf=lambda leaf: leaf is None)
+    cross = jnp.concatenate([cross[..., :alone], joined.reshape(*joined.shape[:2], 2 * count)], -1)
+    return cross, joint, None if held is None else jnp.pad(held[:, :alone], ((0, 0), (0, 2 * count)))
 
 
 def expand_segments(segments: SegmentLandmarks, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:

@@ -68,7 +68,6 @@ LONGEST = (
     "test_known_map",
     "test_uncertainty",
     "test_diagnosis",
-    "test_adjoint_choice",
     "test_solve",
     "test_resume",
     "test_run_folder",

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vggtgeo.solvers.finite import is_finite
+from vggtgeo.solvers.arrow import is_finite
 
 import vggtgeo as vg
 from vggtgeo.bundle.diagnosis import Diagnosis, diagnose

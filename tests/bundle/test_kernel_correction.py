@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
+from arrow_systems import dense_matrix, zero_step
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene
-from vggtgeo.solvers.arrow import dense_schur_complement, multiply
+from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
@@ -28,8 +29,7 @@ def dense(problem: Problem, state: State, correction: jax.Array | None) -> tuple
     """Matrix and gradient of the system, written out."""
     ba = BundleAdjustment(problem)
     system = ba.linearise(state, correction)
-    flat, unflat = ravel_pytree(ba.zero_step(state))
-    matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat)))
+    matrix = dense_matrix(system, zero_step(ba, state))
     return matrix, jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
 
 
@@ -37,7 +37,7 @@ def dense(problem: Problem, state: State, correction: jax.Array | None) -> tuple
 def curved(problem: Problem, state: State) -> jax.Array:
     """Hessian of the energy with every residual replaced by its linearisation: `J' B J`, `B` from the kernel."""
     ba = BundleAdjustment(problem)
-    flat, unflat = ravel_pytree(ba.zero_step(state))
+    flat, unflat = ravel_pytree(zero_step(ba, state))
     moved = lambda step: ba.retract(state, unflat(step))
     residuals = lambda step: oracle.residuals(problem, moved(step))
     constant, jacobian, weights = residuals(flat), jax.jacfwd(residuals)(flat), oracle.weights(problem)

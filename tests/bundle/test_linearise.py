@@ -1,17 +1,18 @@
-"""The solver's normal equations against automatic differentiation of residuals written by hand."""
+"""The solver's normal equations and exact Hessian against automatic differentiation of residuals written by hand."""
 
-from dataclasses import dataclass
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
+from arrow_systems import dense_matrix, zero_step
 from jax.flatten_util import ravel_pytree
+from priors import prior_on
 from scenes import make_scene, matrix
 from scipy.linalg import expm
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_schur_complement, multiply
-from vggtgeo.solvers.reduced import DenseCholesky
+from vggtgeo.solvers.arrow import ArrowVector
+from vggtgeo.solvers.assembly import dense_schur_complement
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State
@@ -19,82 +20,40 @@ from vggtgeo.bundle.problem import Problem, State
 SCENE = make_scene(noise=0.7, outliers=0.2, depth_error=0.1, seed=1)
 
 
-@dataclass(frozen=True)
-class Linearised:
-    """The system of the solver beside `J' J` and `J' r` of the same residuals in the same coordinates."""
-
-    system: ArrowSystem
-    matrix: np.ndarray
-    """Of the system, dense: poses, intrinsics, inverse depths."""
-    gradient: np.ndarray
-    jacobian: np.ndarray
-    residual: np.ndarray
-
-
-def one_behind_its_target(state: State) -> State:
-    """The state with one landmark so near that it lies behind every other camera."""
-    return State(state.poses, state.intrinsics, state.inverse_depth.at[0, 0].set(60.0))
-
-
 @jax.jit
 def linearise_both(problem: Problem, state: State):
     ba = BundleAdjustment(problem)
-    system, zero = ba.linearise(state), ba.zero_step(state)
+    system, zero = ba.linearise(state), zero_step(ba, state)
     flat, unflat = ravel_pytree(zero)
     weights = oracle.reweighted(problem, state)
     vector = lambda step: oracle.weighted_residuals(problem, ba.retract(state, unflat(step)), weights)
-    matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
+    matrix = dense_matrix(system, zero)
     gradient = jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
-    return system, matrix, gradient, jax.jacfwd(vector)(flat), vector(flat)
+    return matrix, gradient, jax.jacfwd(vector)(flat), vector(flat)
 
 
-@pytest.fixture(scope="module")
-def linearised() -> Linearised:
-    problem, state, _ = SCENE.pack()
-    return Linearised(*linearise_both(problem, one_behind_its_target(state)))
-
-
-def test_gradient_and_hessian_are_those_of_the_columns(linearised: Linearised) -> None:
+def test_gradient_and_hessian_are_those_of_the_columns() -> None:
     # Proves every derivative column, the edge factoring and the assembly at once, outliers and a point behind a camera
     # included. Oracle: J' J and J' r with J from forward-mode differentiation of the residuals.
-    hessian, gradient = linearised.jacobian.T @ linearised.jacobian, linearised.jacobian.T @ linearised.residual
+    problem, state, _ = SCENE.pack()
+    state = State(state.poses, state.intrinsics, state.inverse_depth.at[0, 0].set(60.0))  # behind other cameras
+    seen = (problem.edges.source == 0) & (problem.points.weight[:, 0] > 0)
+    assert float(jnp.min(oracle.seen_from(problem, state)[:, 0, 2], where=seen, initial=jnp.inf)) < oracle.LEAST_DEPTH
+    matrix, found, jacobian, residual = linearise_both(problem, state)
+    hessian, gradient = np.asarray(jacobian.T @ jacobian), jacobian.T @ residual
     # Each unknown in units of its own curvature: pixels, metres and 1/m side by side.
     unit = 1 / np.sqrt(np.diag(hessian))
-    error = np.abs((linearised.matrix - hessian) * np.outer(unit, unit)).max()
+    error = np.abs((matrix - hessian) * np.outer(unit, unit)).max()
     assert error < 1e-10
-    error = np.abs((linearised.gradient - gradient) * unit).max() / np.abs(gradient * unit).max()
+    error = np.abs((found - gradient) * unit).max() / np.abs(gradient * unit).max()
     assert error < 1e-10
-
-
-def test_the_bound_on_depth_is_met() -> None:
-    # Proves that the case behind a camera is in the test above. Oracle: the depth of that point, by hand.
-    problem, state, _ = SCENE.pack()
-    z = oracle.seen_from(problem, one_behind_its_target(state))[:, 0, 2]
-    seen = (problem.edges.source == 0) & (problem.points.weight[:, 0] > 0)
-    assert float(jnp.min(jnp.where(seen, z, jnp.inf))) < oracle.LEAST_DEPTH
-
-
-def test_one_step_is_the_dense_step(linearised: Linearised) -> None:
-    # Proves one Levenberg-Marquardt step of bundle adjustment. Oracle: a dense solve of the damped normal equations
-    # made of the automatic Jacobian, the first pose held.
-    damping, solver = 1e-3, DenseCholesky()
-    step, _ = jax.jit(lambda system: solver.step(system, solver.prepare(system), jnp.asarray(damping)))(
-        linearised.system
-    )
-    hessian, gradient = linearised.jacobian.T @ linearised.jacobian, linearised.jacobian.T @ linearised.residual
-    matrix = (hessian + damping * np.diag(np.diag(hessian)))[6:, 6:]
-    expected = np.concatenate([np.zeros(6), np.linalg.solve(matrix, -gradient[6:])])
-    found = np.concatenate([step.dense, np.ravel(step.landmarks)])
-    unit = np.sqrt(np.diag(hessian))
-    error = np.abs((found - expected) * unit).max() / np.abs(expected * unit).max()
-    assert error < 1e-8
 
 
 def test_retract_moves_poses_by_left_tangents() -> None:
     # Proves `T <- exp(x) T`, and that inverse depths stop at their bound. Oracle: the exponential of 4 x 4 matrices.
     problem, state, _ = SCENE.pack()
     ba, rng = BundleAdjustment(problem), np.random.default_rng(0)
-    zero = ba.zero_step(state)
+    zero = zero_step(ba, state)
     dense = rng.normal(0, 0.3, zero.dense.shape)
     landmarks = jnp.full_like(zero.landmarks, -100.0).at[0, 0].set(0.25)
     moved = ba.retract(state, ArrowVector(jnp.asarray(dense), landmarks))
@@ -114,3 +73,40 @@ def as_matrices(poses: jax.Array) -> np.ndarray:
     whole = np.tile(np.eye(4), (len(poses), 1, 1))
     whole[:, :3, :3], whole[:, :3, 3] = rotations, translations
     return whole
+
+
+BENT = make_scene(2, 4, 1, 2, noise=0.7, outliers=0.3, depth_error=0.2, seed=3)
+
+
+@jax.jit
+def energy_and_system(problem: Problem, state: State) -> tuple[jax.Array, ...]:
+    """Gradient and Hessian, dense, of the solver's arrow and of the energy in the same coordinates."""
+    ba = BundleAdjustment(problem)
+    zero = zero_step(ba, state)
+    flat, unflat = ravel_pytree(zero)
+    total = lambda step: oracle.energy(problem, ba.retract(state, unflat(step)))
+    system = ba.hessian(state)
+    matrix = dense_matrix(system, zero)
+    gradient = jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
+    return gradient, matrix, jax.grad(total)(flat), jax.hessian(total)(flat)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("strength", [0.0, 3.0], ids=["no prior", "marginal prior"])
+@pytest.mark.parametrize("depth", [None, 60.0], ids=["in front", "behind"])
+def test_hessian_is_that_of_automatic_differentiation(strength: float, depth: float | None) -> None:
+    # Proves the exact Hessian: points, lines, outliers on Huber's linear branch, curvature of the poses, intrinsics,
+    # the marginalisation prior, and a point behind its target. Oracle: `jax.hessian` of the energy after a retraction.
+    problem, state, _ = BENT.pack()
+    offset = (state.inverse_depth - problem.depth.mean) / problem.depth.sigma
+    squared = problem.depth.alpha * problem.depth.weight * offset**2
+    assert 0 < int(jnp.sum(squared > 1.5**2)) < squared.size  # on both branches of Huber's kernel
+    problem = problem.with_term(prior_on(state, strength))
+    if depth is not None:
+        state = eqx.tree_at(lambda s: s.inverse_depth, state, state.inverse_depth.at[0, 0].set(depth))
+    gradient, matrix, expected_gradient, expected = energy_and_system(problem, state)
+    unit = 1 / np.sqrt(np.abs(np.diag(expected)) + 1.0)
+    error = np.abs((matrix - expected) * np.outer(unit, unit)).max()
+    assert error < 1e-9
+    error = np.abs((gradient - expected_gradient) * unit).max() / np.abs(expected_gradient * unit).max()
+    assert error < 1e-11

@@ -1,7 +1,8 @@
-"""Packing flat lists into padded arrays: nothing is lost, nothing is invented, wrong lists are refused."""
+"""Packing flat lists into padded arrays and back: nothing is lost or invented, wrong lists are refused."""
 
 import inspect
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,11 @@ import numpy as np
 import pytest
 from reported import raises
 from scenes import Scene, make_scene
-from vggtgeo.solvers.arrow import Reduced, dense_schur_complement
+from vggtgeo.solvers.assembly import Reduced, dense_schur_complement
 
 import vggtgeo as vg
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
@@ -26,20 +26,6 @@ SCENE = make_scene(noise=0.5, outliers=0.2, depth_error=0.05)
 
 UNCHECKED = inspect.unwrap(pack)
 """As a user calls it: in the tests a check of types comes before the words that are proved here."""
-
-
-def shuffled(scene: Scene) -> tuple[Observations, np.ndarray]:
-    """The same observations with edges and landmarks in another order, and the landmarks' new order."""
-    seen, rng = scene.observations, np.random.default_rng(0)
-    edges, landmarks = rng.permutation(len(seen.edges)), rng.permutation(len(seen.host))
-    edge_at, landmark_at = np.argsort(edges), np.argsort(landmarks)
-    changes = {
-        name: getattr(seen, name)[landmarks] for name in ("host", "pixel", "depth_mean", "depth_sigma", "depth_weight")
-    }
-    for kind in ("point", "line"):
-        changes[f"{kind}_edge"] = edge_at[getattr(seen, f"{kind}_edge")]
-        changes[f"{kind}_landmark"] = landmark_at[getattr(seen, f"{kind}_landmark")]
-    return replace(seen, edges=seen.edges[edges], **changes), landmarks
 
 
 @pytest.mark.parametrize("double", [False, True])
@@ -79,27 +65,6 @@ def test_every_observation_is_packed_once(size: PaddedSize | None) -> None:
     assert observed(problem) == expected
     assert int(jnp.sum(problem.lines.weight > 0)) == len(seen.line_edge)
     assert float(jnp.sum(problem.depth.weight)) == pytest.approx(seen.depth_weight.sum())
-
-
-def test_the_order_of_the_lists_does_not_matter() -> None:
-    # Proves that edges need not be sorted nor landmarks grouped. Oracle: the packing of the sorted lists.
-    mixed, landmarks = shuffled(SCENE)
-    problem, _, _ = SCENE.pack()
-    scene = replace(SCENE, observations=mixed, start_inverse_depth=SCENE.start_inverse_depth[landmarks])
-    other, state, index = scene.pack()
-    assert observed(other) == observed(problem)
-    np.testing.assert_array_equal(index.gather(state.inverse_depth), scene.start_inverse_depth)
-    np.testing.assert_array_equal(index.gather(other.pixels), mixed.pixel)
-    assert np.all(np.diff(other.edges.source) >= 0)
-
-
-@pytest.mark.parametrize("size", [None, PaddedSize(5, 7, 4, 4), PaddedSize(5, 7, 4, 4, edges=11)])
-def test_ranks_invert_the_graph(size: PaddedSize | None) -> None:
-    # Proves that `of_host` finds each edge by host and rank. Oracle: the definition of both.
-    edges = SCENE.pack(size=size)[0].edges
-    for edge, (host, rank) in enumerate(zip(edges.source, edges.index_at_host, strict=True)):
-        assert int(edges.of_host[host, rank]) == edge
-    assert int(jnp.sum(edges.of_host < len(edges.source))) == len(edges.source)
 
 
 def test_padding_is_harmless_and_held() -> None:
@@ -160,12 +125,9 @@ def test_wrong_lists_are_refused_by_name() -> None:
         (bad(line_landmark=seen.line_landmark + 1000), ("`line_landmark`",)),
         (bad(edges=seen.edges + 0.5), ("`edges`", "float64")),
         (replace(SCENE, start_poses=np.nan * SCENE.start_poses), ("`poses[0]`", "finite", "nan")),
-        (
-            bad(point_edge=wrong_host),
-            ("`point_edge[0]`", 2, 0),
-        ),
+        (bad(point_edge=wrong_host), ("`point_edge[0]`", "hosts", len(seen.edges) - 1)),
         (bad(line_landmark=both_kinds, line_edge=its_edge), ("`point_landmark`", "`line_landmark`")),
-        (bad(point_landmark=twice), ("`point_landmark`", "landmark 0", "edge 0")),
+        (bad(point_landmark=twice), ("`point_edge` and `point_landmark[1]`", "distinct", 0)),
         (replace(SCENE, start_intrinsics=np.array([300.0, -1.0, 0.0, 0.0])), ("`intrinsics`", "positive", "-1")),
         (replace(SCENE, start_poses=2 * SCENE.start_poses), ("`poses[0]`", "quaternion", 2)),
         (bad(point_weight=seen.point_weight[1:]), ("`point_weight`", "shape")),
@@ -223,3 +185,69 @@ def test_a_problem_in_which_nothing_is_observed_is_refused() -> None:
     assert float(jnp.abs(solution.state.poses.wxyz_xyz - state.poses.wxyz_xyz).max()) == 0.0
     fix = vg.terms.BaselinePrior(first=[0], second=[1], length=jnp.ones(1), sigma=jnp.ones(1), weight=jnp.ones(1))
     assert float(vg.energy(pack(replace(seen, **zero), *start, terms=[fix])[0], state)) > 0
+
+
+class Packed(NamedTuple):
+    """A window of unequal hosts in room for more, packed, and without any weight."""
+
+    seen: vg.Observations
+    problem: vg.Problem
+    initial: vg.State
+    index: vg.SlotIndex
+    empty: vg.Problem
+
+
+def random_order(seen: vg.Observations, seed: int) -> vg.Observations:
+    """The same matches and samples in another order, some of them left out."""
+    rng = np.random.default_rng(seed)
+    points, lines = (rng.permutation(len(given))[:-7] for given in (seen.point_edge, seen.line_edge))
+    fields = {name: getattr(seen, name)[points] for name in vars(seen) if name.startswith("point_")}
+    fields |= {name: getattr(seen, name)[lines] for name in vars(seen) if name.startswith("line_")}
+    fields["point_weight"] = rng.uniform(0.5, 2.0, len(points))
+    fields["line_weight"] = rng.uniform(0.5, 2.0, len(lines))
+    return replace(seen, **fields, depth_weight=rng.uniform(0.5, 2.0, len(seen.host)))
+
+
+@pytest.fixture(scope="module", params=[None, vg.PaddedSize(6, 15, 12, 5)], ids=["smallest", "padded"])
+def packed(request: pytest.FixtureRequest) -> Packed:
+    window = vg.simulate_window(4, points=10, lines=2)
+    window = replace(window, observations=random_order(window.observations, 1))
+    problem, initial, index = window.pack(size=request.param)
+    nothing = [term.reweighted(jnp.zeros_like(term.weight)) for term in problem.terms]
+    return Packed(window.observations, problem, initial, index, problem.with_terms(tuple(nothing)))
+
+
+def test_scattered_weights_are_those_that_pack_places(packed: Packed) -> None:
+    """Weights of points, lines and depths written into arrays of zeros under `jit` are those of `pack`, and vectors
+    are, too. Oracle: `pack`, which places them in numpy.
+    """
+    seen, problem, initial, index, empty = packed
+
+    @jax.jit
+    def weights(points: jax.Array, lines: jax.Array, depths: jax.Array) -> tuple[jax.Array, ...]:
+        return (
+            index.scatter_points(points, seen, empty.points.weight),
+            index.scatter_lines(lines, seen, empty.lines.weight),
+            index.scatter(depths, empty.depth.weight),
+        )
+
+    found = weights(*map(jnp.asarray, (seen.point_weight, seen.line_weight, seen.depth_weight)))
+    for array, term in zip(found, (problem.points, problem.lines, problem.depth), strict=True):
+        np.testing.assert_array_equal(array, term.weight)
+    target = index.scatter_points(seen.point_target, seen, jnp.ones_like(problem.points.target))
+    np.testing.assert_array_equal(target, problem.points.target)
+    back = index.gather(index.scatter(np.arange(len(seen.host)), initial.inverse_depth))
+    np.testing.assert_array_equal(back, np.arange(len(seen.host)))
+
+
+def test_the_gradient_by_flat_weights_is_that_by_the_padded_ones(packed: Packed) -> None:
+    """The derivative of the energy by one number a match is that by the padded weight at its place. Oracle: the
+    derivative by `problem.points.weight`, read by `gather_points`.
+    """
+    seen, problem, initial, index, _ = packed
+    energy = lambda weight: vg.energy(problem.with_term(problem.points.reweighted(weight)), initial)
+    flat = lambda values: energy(index.scatter_points(values, seen, problem.points.weight))
+    found = jax.jit(jax.grad(flat))(jnp.asarray(seen.point_weight))
+    expected = index.gather_points(jax.jit(jax.grad(energy))(problem.points.weight), seen)
+    assert float(np.abs(expected).max()) > 0
+    np.testing.assert_allclose(found, expected, rtol=1e-12)

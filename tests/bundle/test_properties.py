@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from property_scenes import (
     KEYFRAMES,
     SEEDS,
-    SIZE,
     SOLVER,
     Drawn,
     finite_problems,
@@ -112,15 +111,6 @@ def test_orders_leave_the_optimum(seed: int, order: int) -> None:
     mixed, keyframes = reordered(scene, np.random.default_rng(order))
     held = keyframes == 0
     _check_same(_solve(mixed, fixed_pose=held), _solve(scene), order=keyframes)
-
-
-@pytest.mark.long  # compiles once more; test_solve.py shows it in one case
-@examples(6)
-@given(SEEDS)
-def test_padding_leaves_the_optimum(seed: int) -> None:
-    """Places that hold nothing, of every kind; oracle: the solution of another padded size."""
-    scene, wide = good_scene(seed), replace(SIZE, keyframes=SIZE.keyframes + 2, points=SIZE.points + 3, degree=4)
-    _check_same(_solve(scene, size=wide), _solve(scene))
 
 
 @examples(6)

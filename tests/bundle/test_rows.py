@@ -13,7 +13,7 @@ from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 import vggtgeo as vg
-from vggtgeo.bundle.padding import PaddedSize, Slots, row_lengths
+from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_problem, save_problem
 
@@ -160,25 +160,6 @@ def test_a_saved_problem_keeps_its_rows(tmp_path: Path) -> None:
     np.testing.assert_array_equal(problem.host, ROWS[0].host)
 
 
-def hosts(counts: list[int], degree: int) -> tuple[int, int]:
-    """Rows, and slots in each, that are chosen for hosts of so many points."""
-    slots = Slots(np.zeros(0, bool), np.zeros(0, int), np.array(counts), np.zeros(len(counts), int), None)
-    points, lines = row_lengths(slots, degree)
-    return int(slots.rows(points, lines).sum()), points
-
-
-def test_one_rich_host_costs_what_its_landmarks_cost() -> None:
-    # Proves that even hosts keep one row each, and that what is stored goes by the number of landmarks, not by the
-    # richest host. Oracle: the same landmarks spread evenly.
-    rich, wide = [7200] + [13] * 48, 6 * 48
-    assert hosts([160] * 49, 48) == (49, 160)
-    assert hosts([160 + i % 7 for i in range(49)], 48)[0] == 49
-    rows, points = hosts(rich, 48)
-    assert rows * (points + wide) < 2 * 49 * (160 + wide) < 49 * (7200 + wide) / 8
-    twice, more = hosts([14400] + [13] * 48, 48)
-    assert twice * (more + wide) < 2.1 * rows * (points + wide)
-
-
 def test_pack_chooses_rows_by_itself() -> None:
     # Proves that `pack` and `pack_batch` split a rich host without being asked, and say what does not fit.
     rich = make_scene(seed=5, keyframes=3, points=60, lines=0, samples=1)
@@ -217,10 +198,7 @@ def test_pack_chooses_rows_by_itself() -> None:
 def test_segments_stay_whole() -> None:
     # Proves that the samples of a two-ends line share a row, and the solution of a scene with them. Oracle: one row.
     made = make_scene(3, points=6, lines=3, samples=4, noise=0.5, depth_error=0.05, seed=5)
-    number = np.full(len(made.observations.host), -1)
-    lines = np.unique(made.observations.line_landmark)
-    number[lines] = np.arange(len(lines)) // 4
-    scene = made.with_observations(segment=number)
+    scene = made.with_segments(4)
     whole = scene.pack(size=PaddedSize(3, 6, 12, 2, samples=4))
     rows = scene.pack(size=PaddedSize(3, 3, 4, 2, samples=4, rows=9))
     found = [solved(*packed[:2]) for packed in (whole, rows)]

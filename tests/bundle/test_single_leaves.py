@@ -1,4 +1,4 @@
-"""The derivative by one leaf alone is the same as by all at once, in both modes, and of any order."""
+"""Derivatives by one leaf alone, of any order, at a bound, and which of optimistix's adjoints `solve` takes."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,12 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from priors import prior_on
 from scenes import make_scene
 from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
+import vggtgeo as vg
 from vggtgeo.bundle.linearise import MIN_INVERSE_DEPTH
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
@@ -69,20 +71,6 @@ def test_one_leaf_alone(name: str, by_all: Problem) -> None:
     assert bool(jnp.all(jnp.isfinite(expected)))
     reverse = jax.jit(jax.grad(value))(leaf)
     np.testing.assert_allclose(reverse, expected, rtol=1e-6, atol=1e-9 * float(jnp.abs(expected).max()))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LEAVES)
-def test_one_leaf_alone_in_forward_mode(name: str, by_all: Problem) -> None:
-    # Proves the same for forward mode under `vmap`. Oracle: the gradient by all leaves.
-    problem, state = made()
-    get = LEAVES[name]
-    leaf, expected = get(problem), get(by_all)
-    value = lambda leaf: loss(eqx.tree_at(get, problem, leaf), state)
-    along = jnp.asarray(np.random.default_rng(0).normal(size=(2, *leaf.shape)))
-    forward = jax.jit(jax.vmap(lambda tangent: jax.jvp(value, (leaf,), (tangent,))[1]))(along)
-    products = jnp.sum(along * expected, tuple(range(1, along.ndim)))
-    np.testing.assert_allclose(forward, products, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow  # two minutes of compilation
@@ -147,3 +135,38 @@ def test_the_solution_says_that_it_was_polished() -> None:
     strict = ArrowAdjoint(polish=0, not_stationary="nan")
     refused = jax.jit(jax.grad(lambda alpha: value(alpha, adjoint=strict)[0]))(alpha)
     assert bool(jnp.isnan(refused))
+
+
+LOOPED = vg.SchurLevenbergMarquardt(rtol=0.0, atol=0.0, max_iterations=12)
+
+
+@pytest.fixture(scope="module")
+def distance() -> Callable[..., jax.Array]:
+    """Distance of a solution from the origin, of a small problem with its points weighted."""
+    problem, initial, _ = vg.simulate_window(2, points=8, lines=0, host_noise=False).pack(kernel=vg.kernels.Square())
+
+    def value(share: jax.Array, **options: optx.AbstractAdjoint) -> jax.Array:
+        points = problem.points.reweighted(share * problem.points.weight)
+        state = vg.solve(problem.with_term(points), initial, solver=LOOPED, **options).state
+        return jnp.sum(state.poses.inverse().translation() ** 2)
+
+    return value
+
+
+def test_the_adjoint_through_the_iterates_can_be_traced_alone(distance: Callable[..., jax.Array]) -> None:
+    """Reverse mode through `RecursiveCheckpointAdjoint()` alone raises nothing, with an explicit solver, too. Oracle:
+    JAX's own trace, which refuses a loop without bounds.
+    """
+    through = jax.grad(lambda share: distance(share, adjoint=optx.RecursiveCheckpointAdjoint()))
+    assert jax.eval_shape(through, jnp.ones(())).shape == ()
+
+
+@pytest.mark.long
+def test_the_adjoint_through_the_iterates_needs_no_option_of_the_solver(distance: Callable[..., jax.Array]) -> None:
+    """`RecursiveCheckpointAdjoint()` alone differentiates the iterates. Oracle: the implicit derivative, which is that
+    of the limit of the iterates.
+    """
+    through = jax.jit(jax.grad(lambda share: distance(share, adjoint=optx.RecursiveCheckpointAdjoint())))(jnp.ones(()))
+    implicit = jax.jit(jax.grad(distance))(jnp.ones(()))
+    assert abs(float(implicit)) > 1e-6
+    assert float(through) == pytest.approx(float(implicit), rel=1e-5)

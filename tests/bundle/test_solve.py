@@ -13,7 +13,6 @@ from reported import raises
 from scenes import Scene, make_scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 
@@ -142,48 +141,6 @@ def test_a_step_that_is_not_finite(solved: Solve) -> None:
     assert finite(solution)
 
 
-def test_depth_that_counts_nothing(solved: Solve) -> None:
-    # Proves that `alpha` of 0 is a problem without depth, not one that is no number. Oracle: depth weights of 0.
-    problem, start, _ = NOISY.pack(**OPTIONS)
-    assert float(problem.depth.weight.max()) > 0
-    none = eqx.tree_at(lambda p: p.depth.alpha, problem, jnp.zeros(()))
-    solution = solved(none, start)
-    expected = solved(problem.with_term(problem.depth.reweighted(0 * problem.depth.weight)), start)
-    assert bool(solution.converged)
-    np.testing.assert_allclose(solution.state.inverse_depth, expected.state.inverse_depth, rtol=1e-9)
-
-
-def test_no_weight_at_all(solved: Solve) -> None:
-    # Proves that a problem that asks for nothing leaves the state as it is. Oracle: the start.
-    scene = NOISY.with_observations(
-        point_weight=0 * NOISY.observations.point_weight,
-        line_weight=0 * NOISY.observations.line_weight,
-        depth_weight=0 * NOISY.observations.depth_weight,
-    )
-    problem, start, _ = scene.pack(**{**OPTIONS, "prior_sigma": None})
-    solution = solved(problem, start)
-    assert bool(solution.converged), solution.message
-    assert float(solution.energy) == 0.0
-    assert distance(solution.state, start) < 1e-15
-
-
-def test_a_keyframe_that_nothing_was_matched_in(solved: Solve) -> None:
-    # Proves that an unconnected keyframe does no harm: the others come out as they should, it stays finite and, having
-    # depth priors only, where it was. Oracle: the truth of the others, its start.
-    seen = EXACT.observations
-    with_last = {kind: np.any(seen.edges[getattr(seen, f"{kind}_edge")] == 2, 1) for kind in ("point", "line")}
-    scene = EXACT.with_observations(
-        point_weight=np.where(with_last["point"], 0.0, seen.point_weight),
-        line_weight=np.where(with_last["line"], 0.0, seen.line_weight),
-    )
-    problem, start, truth = exact_problem(scene)
-    solution = solved(problem, start)
-    first_two = lambda state: State(jaxlie.SE3(state.poses.wxyz_xyz[:2]), state.intrinsics, state.inverse_depth)
-    assert bool(solution.converged), solution.message
-    assert distance(first_two(solution.state), first_two(truth)) < 1e-7
-    np.testing.assert_allclose(solution.state.poses.wxyz_xyz[2], start.poses.wxyz_xyz[2], atol=1e-12)
-
-
 def test_without_depth_the_scale_is_held(solved: Solve) -> None:
     # Proves that with no metric depth the scale stays that of the start instead of drifting, and all else is found.
     # Oracle: the truth of all that was matched, brought to the solution's scale by its translations.
@@ -238,30 +195,6 @@ def test_a_jitted_function_may_close_over_the_problem(solved: Solve) -> None:
     nothing = problem.with_terms((replace(problem.points, weight=weightless),))
     with raises("`problem`", "weights"):
         jax.jit(lambda state: solve(nothing, state))(start)
-
-
-def test_vmap_solves_each(solved: Solve) -> None:
-    # Proves that a batch of problems of one shape is solved one by one, each with its own count. Oracle: two solves.
-    problems = [scene.pack(**OPTIONS)[:2] for scene in (NOISY, make_scene(noise=1.0, depth_error=0.1, seed=5))]
-    alone = [solved(*problem) for problem in problems]
-    stacked = jax.tree.map(lambda a, b: jnp.stack([a, b]), *problems)
-    batch = jax.jit(jax.vmap(lambda problem, state: solve(problem, state, solver=SOLVER)))(*stacked)
-    for i, solution in enumerate(alone):
-        one = jax.tree.map(lambda leaf, i=i: leaf[i], batch.state)
-        assert float(batch.energy[i]) == pytest.approx(float(solution.energy), rel=1e-10)
-        assert distance(one, solution.state) < 1e-7
-    assert [int(n) for n in batch.iterations] == [int(solution.iterations) for solution in alone]
-
-
-def test_padding_does_not_move_the_optimum(solved: Solve) -> None:
-    # Proves that the same problem in a larger shape has the same solution. Oracle: the tight packing.
-    problem, start, index = NOISY.pack(**OPTIONS)
-    padded, padded_start, padded_index = NOISY.pack(size=PaddedSize(4, 8, 5, 3), **OPTIONS)
-    tight, wide = solved(problem, start), solved(padded, padded_start)
-    assert float(wide.energy) == pytest.approx(float(tight.energy), rel=1e-12)
-    np.testing.assert_allclose(wide.state.poses.wxyz_xyz[:3], tight.state.poses.wxyz_xyz, atol=1e-6)
-    found, expected = padded_index.gather(wide.state.inverse_depth), index.gather(tight.state.inverse_depth)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_float32_is_close_to_float64(solved: Solve) -> None:

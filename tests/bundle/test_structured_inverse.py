@@ -1,6 +1,5 @@
 """Derivatives and covariances found with the structure of a linear solver are those of the dense matrix."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -8,24 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_schur_complement
+from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint, exact_model
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
+from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.band_cholesky import BandCholesky
-from vggtgeo.solvers.block_band import BandMatrix, BandVector
-from vggtgeo.solvers.block_elimination import eliminate, selected_inverse, solve_eliminated
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
-from vggtgeo.solvers.exact_model import exact_model
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.minres import minres
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.intrinsics import Intrinsics
-from vggtgeo.bundle.node_order import longest, narrow_order
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
-from vggtgeo.bundle.solver_choice import coupled_pairs
+from vggtgeo.bundle.solver_choice import coupled_pairs, longest, narrow_order
 from vggtgeo.simulation.loop import simulate_loop
 
 KEYFRAMES = 30
@@ -199,69 +194,3 @@ def test_a_derivative_whose_system_was_not_solved_can_be_refused(solved: State) 
     gradient, residual = jax.jit(jax.grad(value, has_aux=True))(PROBLEM.depth.mean)
     assert float(residual) < STATIONARY
     assert bool(jnp.isnan(gradient).any())
-
-
-@pytest.mark.slow
-def test_gradients_in_forward_mode(solved: State, by_dense: Tree) -> None:
-    # Proves that the band's derivative is the same forward. Oracle: the dense gradient, along a random direction.
-    rng = np.random.default_rng(1)
-    along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), MOVING)
-    forward: Callable = lambda moving: jax.jvp(lambda m: loss(m, BAND, solved), (moving,), (along,))[1]
-    expected = sum(float(jnp.vdot(a, b)) for a, b in zip(by_dense, along, strict=True))
-    assert float(jax.jit(forward)(MOVING)) == pytest.approx(expected, rel=1e-9)
-
-
-def random_band(rng: np.random.Generator, definite: bool) -> tuple[BandMatrix, np.ndarray]:
-    """Three groups of four coordinates and a border of two, and the same as a dense matrix."""
-    size = 14
-    near = np.abs(np.arange(size)[:, None] // 4 - np.arange(size) // 4) <= 1
-    near[12:], near[:, 12:] = True, True
-    dense = rng.normal(size=(size, size))
-    dense = (dense + dense.T) * near
-    dense += np.diag(10.0 * (np.ones(size) if definite else np.where(np.arange(size) % 3, 1.0, -1.0)))
-    groups = np.zeros((3, 2, 4, 4))
-    for k in range(3):
-        groups[k, 0] = dense[4 * k : 4 * k + 4, 4 * k : 4 * k + 4]
-        groups[k, 1] = dense[4 * k + 4 : 4 * k + 8, 4 * k : 4 * k + 4] if k < 2 else 0
-    border = dense[:12, 12:].reshape(3, 4, 2)
-    return BandMatrix(*(jnp.asarray(part) for part in (groups, border, dense[12:, 12:]))), dense
-
-
-def columns_of(values: np.ndarray) -> BandVector:
-    return BandVector(jnp.asarray(values[:12].reshape(3, 4, -1)), jnp.asarray(values[12:]))
-
-
-@pytest.mark.parametrize("definite", [True, False])
-def test_elimination_of_a_band(definite: bool) -> None:
-    # Proves solves and inverse blocks of matrices with eigenvalues of both signs, with held coordinates and a scale.
-    # Oracle: numpy's inverse.
-    rng = np.random.default_rng(3)
-    matrix, dense = random_band(rng, definite)
-    assert (np.linalg.eigvalsh(dense).min() > 0) == definite
-    free = np.arange(14) != 5
-    inverse = np.zeros((14, 14))
-    inverse[np.ix_(free, free)] = np.linalg.inv(dense[np.ix_(free, free)])
-    scale = rng.uniform(1, 3, (14, 1))
-    found = eliminate(matrix, columns_of(free[:, None]), columns_of(scale), 1e-12)
-    rhs = np.where(free[:, None], rng.normal(size=(14, 2)), 0.0)
-    got = solve_eliminated(found, columns_of(rhs))
-    np.testing.assert_allclose(np.concatenate([got.nodes.reshape(12, 2), got.shared]), inverse @ rhs, atol=1e-12)
-    known, unknown = selected_inverse(found)
-    sizes = np.where(free[:, None], scale, 1.0)
-    expected = inverse * sizes * sizes.T + np.diag(~free)
-    np.testing.assert_allclose(known.groups[1, 0], expected[4:8, 4:8], atol=1e-12)
-    np.testing.assert_allclose(known.groups[1, 1], expected[8:12, 4:8], atol=1e-12)
-    np.testing.assert_allclose(known.border[0], expected[:4, 12:], atol=1e-12)
-    np.testing.assert_allclose(known.corner, expected[12:, 12:], atol=1e-12)
-    assert int(found.rank) == 14
-    assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(unknown)) == 0.0
-
-
-def test_minimum_residuals_at_a_saddle() -> None:
-    # Proves the solution of an indefinite system with a definite preconditioner. Oracle: numpy's solve.
-    rng = np.random.default_rng(0)
-    _, matrix = random_band(rng, False)
-    rhs, diagonal = jnp.asarray(rng.normal(size=14)), jnp.asarray(np.abs(np.diag(matrix)))
-    found = jax.jit(lambda b: minres(lambda x: jnp.asarray(matrix) @ x, lambda r: r / diagonal, b, 1e-13, 50))(rhs)
-    assert bool(found.converged)
-    np.testing.assert_allclose(found.solution, np.linalg.solve(matrix, rhs), atol=1e-11)

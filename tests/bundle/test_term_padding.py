@@ -37,18 +37,6 @@ def packed() -> Packed:
     return SCENE.pack(terms=own_terms())
 
 
-def test_absent_weights_have_no_derivative(packed: Packed) -> None:
-    """What a term is prepared to has a derivative by the weights that are there, and none by those of 0.
-
-    Oracle: which weights are 0. Two of them are made so here.
-    """
-    term = packed[0].points
-    weight = term.weight.at[0, :2].set(0.0)
-    derivative = jax.grad(lambda given: jnp.sum(term.reweighted(given).prepared().weight))(weight)
-    np.testing.assert_array_equal(derivative, weight > 0)
-    assert float(weight.max()) > 0
-
-
 def test_a_small_weight_has_the_derivative_that_a_weight_of_0_lacks() -> None:
     """By a weight of 0 the energy has derivative 0, though it rises when the weight does; by a small positive weight it
     has that one-sided slope. Oracle: a one-sided difference.

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arrow_systems import dense_matrix, zero_step
 from jax.flatten_util import ravel_pytree
 from scenes import Scene, make_scene
-from vggtgeo.solvers.arrow import ArrowVector, multiply
-from vggtgeo.solvers.landmark_basis import expand, restrict
+from vggtgeo.solvers.arrow import ArrowVector
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
 
@@ -31,11 +31,7 @@ SOLVER = SchurLevenbergMarquardt(rtol=1e-12, max_iterations=100)
 def scene(noise: float = 0.5) -> Scene:
     """Segments of four samples, numbered."""
     made = make_scene(3, points=POINTS, lines=SEGMENTS, samples=SAMPLES, noise=noise, depth_error=0.05, seed=5)
-    seen = made.observations
-    number = np.full(len(seen.host), -1)
-    lines = np.unique(seen.line_landmark)
-    number[lines] = np.arange(len(lines)) // SAMPLES
-    return made.with_observations(segment=number)
+    return made.with_segments(SAMPLES)
 
 
 def affine(problem: Problem) -> np.ndarray:
@@ -60,9 +56,7 @@ def affine(problem: Problem) -> np.ndarray:
 def sampled_matrix(problem: Problem, state: State) -> tuple[jax.Array, jax.Array]:
     """Matrix and gradient of the same problem with a depth for each sample."""
     ba = BundleAdjustment(replace(problem, fraction=None))
-    system = ba.linearise(state)
-    flat, unflat = ravel_pytree(ba.zero_step(state))
-    matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat)))
+    matrix = dense_matrix(ba.linearise(state), zero_step(ba, state))
     return matrix, ravel_pytree(ba.gradient(state))[0]
 
 
@@ -81,7 +75,7 @@ def reduced_to_ends(problem: Problem, state: State) -> tuple[np.ndarray, np.ndar
 def newton(problem: Problem, state: State) -> ArrowVector:
     system, solver = BundleAdjustment(problem).linearise(state), DenseCholesky()
     step, _ = solver.step(system, solver.prepare(system), jnp.asarray(0.0))
-    return ArrowVector(step.dense, expand(system.basis, step.landmarks))
+    return ArrowVector(step.dense, system.basis.expand(step.landmarks))
 
 
 def test_the_step_is_the_constrained_dense_step() -> None:
@@ -102,7 +96,7 @@ def test_restrict_is_the_transpose_of_expand() -> None:
     rng = np.random.default_rng(0)
     inner = jnp.asarray(rng.normal(size=system.landmark_hessian.shape))
     outer = jnp.asarray(rng.normal(size=state.inverse_depth.shape))
-    left, right = jnp.sum(expand(system.basis, inner) * outer), jnp.sum(inner * restrict(system.basis, outer))
+    left, right = jnp.sum(system.basis.expand(inner) * outer), jnp.sum(inner * system.basis.restrict(outer))
     assert float(left) == pytest.approx(float(right), rel=1e-12)
 
 
@@ -131,7 +125,7 @@ def test_the_optimum_is_straight_and_stationary() -> None:
 def test_without_noise_both_find_the_truth() -> None:
     # Proves that the constraint is right: inverse depth is straight along the image of a line. Oracle: the truth.
     made = make_scene(3, points=POINTS, lines=SEGMENTS, samples=SAMPLES, seed=5)
-    made = made.with_observations(segment=scene().observations.segment)
+    made = made.with_segments(SAMPLES)
     problem, state, index = made.pack(prior_sigma=None)
     found = run(problem, state)
     np.testing.assert_allclose(index.gather(found.state.inverse_depth), made.inverse_depth, rtol=1e-5)
@@ -176,7 +170,7 @@ def test_a_step_beyond_infinity_is_shortened_as_a_whole() -> None:
     ba = BundleAdjustment(problem)
     steps = np.zeros(state.inverse_depth.shape)
     steps[:, POINTS:] = -10.0 * np.asarray(problem.fraction).reshape(3, -1)
-    moved = ba.retract(state, ArrowVector(ba.zero_step(state).dense, jnp.asarray(steps)))
+    moved = ba.retract(state, ArrowVector(zero_step(ba, state).dense, jnp.asarray(steps)))
     lines = np.asarray(moved.inverse_depth)[:, POINTS:].reshape(3, SEGMENTS, SAMPLES)
     assert np.all(lines > 0)
     ends = lines[..., :1] + np.asarray(problem.fraction) * (lines[..., -1:] - lines[..., :1])

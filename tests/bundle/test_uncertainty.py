@@ -9,10 +9,8 @@ import jax.numpy as jnp
 import monte_carlo
 import numpy as np
 import pytest
-from arrow_systems import assemble, free_part, random_system
 from degenerate_scenes import WELL, packed
 from vggtgeo.solvers.arrow import ArrowVector
-from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.kernels import Huber
 
 import vggtgeo as vg
@@ -132,42 +130,6 @@ def test_scaled_by_the_variance_factor(estimated: Estimate) -> None:
     assert float(estimated(fourfold, truth).variance_factor) == pytest.approx(
         4 * float(estimated(problem, truth).variance_factor)
     )
-
-
-@pytest.mark.slow
-def test_float32_stays_float32(estimated: Estimate) -> None:
-    # Proves that single precision costs digits only. Oracle: the float64 result.
-    exact, single = (estimated(*packed(WELL, at_truth=True, dtype=dtype)) for dtype in (np.float64, np.float32))
-    assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {np.dtype(np.float32)}
-    np.testing.assert_allclose(single.inverse_depth, exact.inverse_depth, rtol=1e-2)
-    spread = np.sqrt(np.diagonal(exact.poses, axis1=1, axis2=2))[1:]
-    error = np.abs(single.poses - exact.poses)[1:] / spread[:, :, None] / spread[:, None, :]
-    assert error.max() < 1e-2
-
-
-def test_on_a_system_that_no_camera_made() -> None:
-    # Proves the blocks for hosts of unequal degree and arbitrary transports, one landmark undetermined. Oracle: the
-    # dense inverse.
-    system = random_system()
-    free, dense = free_part(system), assemble(system).matrix
-    expected = np.zeros(len(dense))
-    inverse = np.linalg.inv(dense[np.ix_(free, free)])
-    expected[free] = np.diag(inverse)
-    dense = len(system.free)
-    expected[dense:][np.ravel(system.landmark_hessian == 0)] = np.inf
-    found = jax.jit(covariance)(system)
-    inside = free[free < dense]
-    whole = np.zeros((dense, dense))
-    whole[np.ix_(inside, inside)] = inverse[: len(inside), : len(inside)]
-    hosts, block = found.nodes.shape[:2]
-    blocks = whole[: hosts * block, : hosts * block].reshape(hosts, block, hosts, block).transpose(0, 2, 1, 3)
-    np.testing.assert_allclose(found.nodes, blocks[np.arange(hosts), np.arange(hosts)], rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(found.shared, whole[hosts * block :, hosts * block :], rtol=1e-7, atol=1e-12)
-    source, target, of_host = (np.asarray(part) for part in jax.tree.leaves(system.graph))
-    for i, k in zip(*np.nonzero(of_host < len(source)), strict=True):
-        np.testing.assert_allclose(found.neighbours[i, k], blocks[i, target[of_host[i, k]]], rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(np.ravel(found.landmarks), expected[dense:], rtol=1e-7)
-    assert int(found.rank) == len(free)
 
 
 @pytest.mark.long

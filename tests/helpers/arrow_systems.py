@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
+    ArrowVector,
     EdgeGraph,
     NodeFactors,
+    carry_to_nodes,
+    couple,
+    hessian_times,
 )
+from vggtgeo.solvers.problem import AbstractArrowProblem
 
 NODES, BLOCK, SHARED, SLOTS = 3, 2, 2, 4
 
@@ -136,6 +143,25 @@ def assemble(system: ArrowSystem) -> Dense:
             matrix += carry.T @ hessian @ carry
             gradient += carry.T @ force
     return Dense(matrix, gradient)
+
+
+def multiply(system: ArrowSystem, vector: ArrowVector) -> ArrowVector:
+    """The undamped matrix times a vector (held coordinates as if free)."""
+    return ArrowVector(
+        dense=hessian_times(system, vector.dense) + carry_to_nodes(system, vector.landmarks),
+        landmarks=couple(system, vector.dense, 0.0) + system.landmark_hessian * vector.landmarks,
+    )
+
+
+def dense_matrix(system: ArrowSystem, zero: ArrowVector) -> jax.Array:
+    """The same matrix, dense, of unknowns like `zero`."""
+    flat, unflat = ravel_pytree(zero)
+    return jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
+
+
+def zero_step(problem: AbstractArrowProblem, point: Any) -> ArrowVector:
+    """The zero of the tangent space at a point."""
+    return jax.tree.map(jnp.zeros_like, jax.eval_shape(problem.gradient, point))
 
 
 def free_part(system: ArrowSystem) -> np.ndarray:

@@ -44,6 +44,13 @@ class Scene:
         """The same scene with fields of its observations replaced."""
         return replace(self, observations=replace(self.observations, **changes))
 
+    def with_segments(self, samples: int) -> "Scene":
+        """The same scene with line samples numbered by segments, -1 for points: two unknowns a segment."""
+        number = np.full(len(self.observations.host), -1)
+        lines = np.unique(self.observations.line_landmark)
+        number[lines] = np.arange(len(lines)) // samples
+        return self.with_observations(segment=number)
+
 
 def _pack(
     observations: Observations, poses: np.ndarray, values: np.ndarray, inverse_depth: np.ndarray, **options: Any

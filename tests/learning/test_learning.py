@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import vggtgeo as vg
-from vggtgeo.datasets import Frame
 from vggtgeo.learning import (
     Batch,
     ConfidenceNetwork,
@@ -19,9 +18,8 @@ from vggtgeo.learning import (
     stack_sequences,
     tracked_windows,
 )
-from vggtgeo.learning.network import MIN_CONFIDENCE
-from vggtgeo.learning.recorded_windows import RecordedTruth
-from vggtgeo.learning.tracked_windows import FEATURES, INLIER
+from vggtgeo.learning.tracked_windows import FEATURES, INLIER, reproject
+from vggtgeo.learning.training import MIN_CONFIDENCE
 
 
 @pytest.fixture(scope="module")
@@ -59,13 +57,11 @@ def test_a_recording_tells_where_matches_belong() -> None:
     wall[:, 50:] = np.nan
     behind = wall.copy()
     behind[:20] = 1.0  # a board
-    image = np.zeros((40, 60, 3), np.uint8)
-    frames = tuple(Frame(k, float(k), image, depth, f"{k}") for k, depth in enumerate((wall, behind)))
     moved = np.eye(4)
     moved[0, 3] = -0.2  # 0.2 m to the right: 5 px at 50 px and 2 m
-    known = RecordedTruth(frames, np.array([np.eye(4), moved]), np.array([50.0, 50.0, 30.0, 20.0]))
     pixels = np.array([[40.0, 30.0], [40.0, 10.0], [55.0, 30.0], [2.0, 30.0]])
-    target, shown = known.correspond(0, 1, pixels)
+    camera = np.array([50.0, 50.0, 30.0, 20.0])
+    target, shown = reproject(pixels, (wall, behind), (np.eye(4), moved), camera)
     np.testing.assert_allclose(target[[0, 1, 3]], pixels[[0, 1, 3]] - [5.0, 0.0], atol=1e-9)
     assert np.isnan(target[2]).all(), "no depth there"
     np.testing.assert_array_equal(shown, [True, False, False, True])

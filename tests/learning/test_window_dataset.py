@@ -91,20 +91,6 @@ def test_a_batch_can_be_solved(folder: Path) -> None:
     assert off(solution.state) < 0.5 * off(batch.initial)
 
 
-def test_loaders_take_it_as_it_is(folder: Path) -> None:
-    # Proves the protocol of torch's and grain's loaders: length, rows by number, a function that stacks. Oracle: the
-    # loader of torch where it is installed, else the protocol by hand.
-    data = WindowDataset.open(folder)
-    try:
-        from torch.utils.data import DataLoader
-    except ImportError:
-        batches = [stack_windows([data[row] for row in rows]) for rows in ((0, 1), (2, 3))]
-    else:
-        batches = list(DataLoader(data, batch_size=2, collate_fn=stack_windows))  # type: ignore[arg-type]
-    assert batches[1].labels["seed"].tolist() == [2, 3]
-    assert batches[0].problem.points.weight.shape[0] == 2
-
-
 FORKED = """
 import multiprocessing, sys, warnings
 import jax

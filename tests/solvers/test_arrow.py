@@ -5,22 +5,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arrow_systems import BLOCK, NODES, SLOTS, Dense, assemble, free_part, random_system
+from arrow_systems import BLOCK, NODES, SLOTS, Dense, assemble, free_part, multiply, random_system
+from vggtgeo.solvers.adjoint import exact_model
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
     ArrowVector,
-    back_substitute,
-    carry_to_nodes,
     dense_gradient,
-    dense_schur_complement,
-    inverse_landmark_hessian,
-    multiply,
 )
+from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
-from vggtgeo.solvers.exact_model import exact_model
 from vggtgeo.solvers.reduced import DenseCholesky
 
 from vggtgeo.bundle.analysis.weakest import sparse_matrix
@@ -70,18 +66,6 @@ def test_reduce_is_the_dense_schur_complement(pair: tuple[ArrowSystem, Dense]) -
     gradient, diagonal = jax.jit(dense_gradient)(system)
     np.testing.assert_allclose(gradient, reduced.gradient, atol=1e-12 * scale)
     np.testing.assert_allclose(diagonal, np.diag(reduced.hessian), atol=1e-12 * scale)
-
-
-def test_back_substitute_and_carry(pair: tuple[ArrowSystem, Dense]) -> None:
-    # Proves `-V^-1 (h + W' x)` and `W z`. Oracle: the blocks of the dense matrix.
-    system, dense = pair
-    rng, size = np.random.default_rng(2), len(system.free)
-    x, z = rng.normal(size=size), rng.normal(size=NODES * SLOTS)
-    inverse = np.ravel(inverse_landmark_hessian(system))
-    expected = -inverse * (dense.gradient[size:] + dense.matrix[size:, :size] @ x)
-    np.testing.assert_allclose(np.ravel(jax.jit(back_substitute)(system, jnp.asarray(x))), expected, atol=1e-12)
-    carried = jax.jit(carry_to_nodes)(system, jnp.asarray(z.reshape(NODES, SLOTS)))
-    np.testing.assert_allclose(carried, dense.matrix[:size, size:] @ z, atol=1e-12)
 
 
 def test_solve_exactly_is_the_dense_solve(pair: tuple[ArrowSystem, Dense]) -> None:
@@ -164,7 +148,7 @@ def grouped() -> tuple[ArrowSystem, Dense]:
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_groups_are_solved_and_inverted_by_every_solver(name: str, grouped: tuple[ArrowSystem, Dense]) -> None:
-    # Proves a damped step, the covariances of nodes, shared coordinates and landmarks, in every storage of the blocks.
+    # Proves a damped step, the covariances of nodes, neighbours, shared coordinates and landmarks, in every storage.
     # Oracle: numpy's solve and inverse of the dense matrix.
     (system, dense), solver, damping = grouped, SOLVERS[name], 0.1
     free, size = free_part(system), len(system.free)
@@ -185,6 +169,10 @@ def test_groups_are_solved_and_inverted_by_every_solver(name: str, grouped: tupl
     for node in range(NODES):
         own = slice(node * BLOCK, (node + 1) * BLOCK)
         np.testing.assert_allclose(known.nodes[node], inverse[own, own], atol=1e-9 * np.abs(inverse).max())
+    for host, rank in np.argwhere(np.asarray(system.graph.of_host) < len(system.graph.source)):
+        own, other = (slice(k * BLOCK, (k + 1) * BLOCK) for k in (host, int(system.neighbours()[host, rank])))
+        np.testing.assert_allclose(known.neighbours[host, rank], inverse[own, other], atol=1e-9 * np.abs(inverse).max())
+    assert int(known.rank) == len(free)
     variances = np.ravel(known.landmarks)
     seen = np.isfinite(variances)
     assert seen.sum() == NODES * SLOTS - 1

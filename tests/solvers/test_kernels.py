@@ -63,12 +63,3 @@ def test_barron_contains_geman_mcclure() -> None:
     # Proves the shape parameter of the general kernel: alpha = -2 is Geman-McClure with delta scaled by 2 (b = 4).
     general, special = Barron(1.1, -2.0), GemanMcClure(2.2)
     assert _relative(general.rho(SQUARES), special.rho(SQUARES)) < 1e-9
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("name", KERNELS)
-def test_kernels_keep_the_dtype(name: str, dtype: type) -> None:
-    # Proves that a kernel whose parameters have the dtype of its argument answers in that dtype.
-    kernel = jax.tree.map(lambda leaf: leaf.astype(dtype), KERNELS[name])
-    s = jnp.ones(3, dtype)
-    assert kernel.rho(s).dtype == kernel.weight(s).dtype == kernel.curvature(s).dtype == dtype

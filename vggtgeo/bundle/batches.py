@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -64,8 +63,10 @@ def pack_batch(
         size = PaddedSize.largest(sizes)
     packed = []
     for number, (window, own) in enumerate(zip(windows, given, strict=True)):
-        with _named(number):
+        try:
             packed.append(pack(*window[:4], size=size, terms=own, **options))
+        except InputError as error:
+            raise InputError(f"`windows[{number}]`: {error}") from error
     problems, states, indices = zip(*packed, strict=True)
     _check_same_structure(problems)
     return stack(problems), stack(states), list(indices)
@@ -80,15 +81,6 @@ def _check_same_structure(problems: Sequence[Problem]) -> None:
                 f"`windows[{number}]` must have the camera model, the kind of kernel and the optional observations "
                 "(`segment`, `pixel_sigma`) of `windows[0]`: one program solves all"
             )
-
-
-@contextmanager
-def _named(number: int) -> Iterator[None]:
-    """Prefix errors with the index of the window."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"`windows[{number}]`: {error}") from error
 
 
 def _same_terms(windows: Sequence[Sequence[GivenTerm]]) -> list[list[GivenTerm]]:
@@ -159,10 +151,6 @@ def solve_batch(
 
     if devices is None:
         return here(problems, initials)
-    return _distributed(here, devices)(problems, initials)
-
-
-def _distributed(here: Any, devices: Sequence[jax.Device]) -> Any:
-    mesh = jax.sharding.Mesh(np.asarray(devices), ("batch",))
-    batch = PartitionSpec("batch")
-    return jax.jit(jax.shard_map(here, mesh=mesh, in_specs=batch, out_specs=batch, check_vma=False))
+    mesh, batch = jax.sharding.Mesh(np.asarray(devices), ("batch",)), PartitionSpec("batch")
+    distributed: Any = jax.jit(jax.shard_map(here, mesh=mesh, in_specs=batch, out_specs=batch, check_vma=False))
+    return distributed(problems, initials)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.linearise import energy_gradient, free_coordinates, linearise, num_offsets, offsets_of
+from vggtgeo.bundle.linearise import energy_gradient, linearise, num_offsets, offsets_of
 from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.geometry import lie
@@ -104,12 +104,6 @@ class BundleAdjustment(AbstractArrowProblem[State]):
     def recorded(self, point: State) -> Float[Array, "n 7"]:
         """Return the poses."""
         return point.poses.wxyz_xyz
-
-    def zero_step(self, point: State) -> ArrowVector:
-        return ArrowVector(
-            jnp.zeros(free_coordinates(self.problem).shape, point.inverse_depth.dtype),
-            jnp.pad(jnp.zeros_like(point.inverse_depth), ((0, 0), (num_offsets(point), 0))),
-        )
 
 
 def _shortened(depth: Float[Array, "h l"], moved: Float[Array, "h l"], segments: int) -> Float[Array, "h l"]:

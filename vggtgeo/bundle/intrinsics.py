@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.bundle.packing_checks import check_fixed
+from vggtgeo.bundle.packing_checks import check_fixed, check_range
 from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, with_shared_focal
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import real_numbers
@@ -82,7 +82,9 @@ def checked_intrinsics(given: Any, keyframes: int) -> CheckedIntrinsics:
     camera_of = None if own.camera_of is None else real_numbers("camera_of", own.camera_of)
     _check_values(model, values, several=camera_of is not None)
     if camera_of is not None:
-        _check_camera_of(camera_of, keyframes, len(values))
+        check_range("camera_of", camera_of, len(values), "rows of `intrinsics`")
+        if camera_of.shape != (keyframes,):
+            raise InputError(f"`camera_of` must have shape ({keyframes},), one a keyframe, got {camera_of.shape}")
     mean = values if own.prior_mean is None else real_numbers("prior_mean", own.prior_mean)
     if mean.shape != values.shape or not np.all(np.isfinite(mean)):
         raise InputError(f"`prior_mean` must be {' x '.join(map(str, values.shape))} finite numbers, got {mean}")
@@ -103,14 +105,3 @@ def _check_values(model: type[AbstractCamera], values: np.ndarray, *, several: b
     focal = [name in ("f", "fx", "fy") for name in model.names]
     if not np.all(np.isfinite(values)) or np.any(values[..., focal] <= 0):
         raise InputError(f"`intrinsics` must be finite with positive focal lengths, got {values}")
-
-
-def _check_camera_of(camera_of: np.ndarray, keyframes: int, cameras: int) -> None:
-    """Check that each keyframe has one of the cameras."""
-    if camera_of.shape != (keyframes,) or not np.issubdtype(camera_of.dtype, np.integer):
-        raise InputError(f"`camera_of` must be {keyframes} whole numbers, one a keyframe, got {camera_of!r:.60}")
-    if camera_of.size and (camera_of.min() < 0 or camera_of.max() >= cameras):
-        raise InputError(
-            f"`camera_of` must be from 0 to {cameras - 1}, the rows of `intrinsics`, got {camera_of.min()} to "
-            f"{camera_of.max()}"
-        )

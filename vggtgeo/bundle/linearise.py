@@ -11,30 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.objective import (
-    Place,
-    cameras_of,
-    edge_data,
-    hosts_of,
-    motions_of,
-    of_edge,
-    pixel_observations,
-    places,
-    relative_poses,
-    view_of,
-)
+from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, pixel_observations
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors, add_shared
-from vggtgeo.solvers.landmark_basis import join_landmarks
+from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors, add_shared, join_landmarks
 
 
 def linearise(
@@ -51,7 +38,7 @@ def linearise(
     see `terms/term.py`. Without `joined`, coupled landmarks (segments, points with free pixels) are not in the basis
     that makes them scalars, so that systems can be added.
     """
-    relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
+    cameras, (edges, seen_along) = cameras_of(problem, state), edge_views(problem, state)
     degree, size = problem.edges.of_host.shape[1], lie.TANGENT + cameras.seen
     apart = cameras.seen - cameras.size  # parameters of the target's camera, if it can differ from the host's
     # Rows of `cross`: `eta` of each edge, the target's camera of each edge (if several), the host's camera.
@@ -60,11 +47,9 @@ def linearise(
 
     sizes = num_offsets(state) // 2, state.inverse_depth.shape[1]
 
-    def body(carry: tuple[Array, Array | None], edge: Any) -> tuple[tuple[Array, Array | None], Array]:
-        (cross, blocks), (place, index, motion, data) = carry, edge
-        row = place.row
-        seen = of_edge(problem, view_of(cameras, hosts, place, motion), data)
-        gram, coupled, own = (_exact if exact else _reweighted)(seen, correction, sizes)
+    def body(carry: tuple[Array, Array | None], edge: Edge) -> tuple[tuple[Array, Array | None], Array]:
+        (cross, blocks), row, index = carry, edge.row, edge.index_at_host
+        gram, coupled, own = (_exact if exact else _reweighted)(seen_along(edge), correction, sizes)
         zero = jnp.zeros_like(row)
         for first, part in coupled:
             column = zero + first
@@ -83,7 +68,6 @@ def linearise(
     (points, slots), rows = sizes, len(state.inverse_depth)
     cross = jnp.zeros((rows, common + cameras.size + 2, 2 * points + slots), state.inverse_depth.dtype)
     if problem.edge_terms:
-        edges = (places(problem), problem.edges.index_at_host, motions_of(relative), edge_data(problem))
         (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
     else:
         gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
@@ -101,7 +85,7 @@ def linearise(
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     system = ArrowSystem(
         graph=_graph(problem),
-        source_adjoint=lie.adjoint(relative),
+        source_adjoint=lie.adjoint(edges.relative),
         gram=gram,
         cross=cross,
         lie_curvature=lie_curvature(force)
@@ -127,7 +111,7 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     Implicit differentiation differentiates it once more, so that one order of automatic differentiation suffices. The
     part by the relative pose of an edge is transformed to its two poses by `eta = x_j - Ad(M) x_i`.
     """
-    relative, cameras, hosts = relative_poses(problem, state), cameras_of(problem, state), hosts_of(problem, state)
+    cameras, (edges, seen_along) = cameras_of(problem, state), edge_views(problem, state)
     first = num_offsets(state)
     landmarks = jnp.pad(jnp.zeros_like(state.inverse_depth), ((0, 0), (first, 0)))
     for term in problem.slot_terms:
@@ -143,9 +127,9 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
 
     sizes = first // 2, state.inverse_depth.shape[1]
 
-    def edge(place: Place, motion: Any, data: Any) -> tuple[Array, Array]:
+    def along(edge: Edge) -> tuple[Array, Array]:
         local, own = jnp.zeros(lie.TANGENT + cameras.seen, landmarks.dtype), jnp.zeros_like(landmarks[0])
-        for term, seen in of_edge(problem, view_of(cameras, hosts, place, motion), data):
+        for term, seen in seen_along(edge):
             found = term.gradient(seen)
             local += found.shared
             by_unknown = [part[None] for part in (*([] if found.pixel is None else found.pixel), found.depth)]
@@ -153,10 +137,10 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
                 own = own.at[start : start + part.shape[1]].add(part[0])
         return local, own
 
-    local, by_depth = jax.vmap(edge)(places(problem), motions_of(relative), edge_data(problem))
+    local, by_depth = jax.vmap(along)(edges)
     eta = local[:, : lie.TANGENT]
     nodes = jnp.zeros((problem.num_keyframes, lie.TANGENT), local.dtype).at[problem.edges.target].add(eta)
-    nodes = nodes.at[problem.edges.source].add(-jnp.einsum("eba,eb->ea", lie.adjoint(relative), eta))
+    nodes = nodes.at[problem.edges.source].add(-jnp.einsum("eba,eb->ea", lie.adjoint(edges.relative), eta))
     graph = _graph(problem)
     seen = graph.seen(graph.ends(), cameras.size)
     shared = add_shared(local[:, lie.TANGENT :], seen, problem.num_parameters)

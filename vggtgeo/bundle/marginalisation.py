@@ -37,8 +37,8 @@ from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.io.kept_program import KeptProgram
-from vggtgeo.solvers.arrow import dense_schur_complement
-from vggtgeo.solvers.finite import is_finite, unless
+from vggtgeo.solvers.arrow import is_finite, unless
+from vggtgeo.solvers.assembly import dense_schur_complement
 
 _MAX_KEYFRAMES = 1000
 """Largest number of keyframes of a prior, whose matrix is dense: 0.3 GB."""

@@ -5,6 +5,7 @@ The solver minimises exactly this energy, with the same functions.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -21,9 +22,6 @@ from vggtgeo.bundle.terms.node import node_residuals
 from vggtgeo.bundle.terms.term import robust_energy
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Cameras
-
-EdgeData = tuple[dict[str, Any], ...]
-"""Data and weights of each edge term, for one edge or with a leading axis of edges."""
 
 
 def energy(problem: Problem, state: State) -> Float[Array, ""]:
@@ -79,14 +77,11 @@ def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
     if not problem.edge_terms:
         return total
 
-    cameras, hosts = cameras_of(problem, state), hosts_of(problem, state)
+    edges, seen_along = edge_views(problem, state)
 
-    def body(sum_: Array, edge: Any) -> tuple[Array, None]:
-        place, motion, data = edge
-        view = view_of(cameras, hosts, place, motion)
-        return sum_ + sum(term.energy(seen) for term, seen in of_edge(problem, view, data)), None
+    def body(sum_: Array, edge: Edge) -> tuple[Array, None]:
+        return sum_ + sum(term.energy(view) for term, view in seen_along(edge)), None
 
-    edges = (places(problem), motions_of(relative_poses(problem, state)), edge_data(problem))
     # A scan keeps one edge's projections in memory, not those of all edges.
     total, _ = jax.lax.scan(body, total, edges)
     return total
@@ -136,15 +131,7 @@ class Hosts(NamedTuple):
     """Offsets of the free pixels, already included in `pixels` and `rays`."""
 
 
-class Motions(NamedTuple):
-    """The relative pose of each edge, with its matrices."""
-
-    relative: jaxlie.SE3
-    rotation: Float[Array, "e 3 3"]
-    translation: Float[Array, "e 3"]
-
-
-def hosts_of(problem: Problem, state: State) -> Hosts:
+def _hosts_of(problem: Problem, state: State) -> Hosts:
     """Return the slots of all rows, with their viewing rays."""
     pixels, cameras = problem.pixels, cameras_of(problem, state)
     if state.pixel_offset is not None:
@@ -158,49 +145,55 @@ def hosts_of(problem: Problem, state: State) -> Hosts:
     return Hosts(slots_last, (rays_x, rays_y), state.inverse_depth, state.pixel_offset)
 
 
-def motions_of(relative: jaxlie.SE3) -> Motions:
-    """Return relative poses with their matrices."""
-    return Motions(relative, relative.rotation().as_matrix(), relative.translation())
-
-
-class Place(NamedTuple):
-    """Indices of an edge in the graph, for one edge or with a leading axis of edges."""
+class Edge(NamedTuple):
+    """Data of an edge, for one edge or with a leading axis of edges."""
 
     ends: tuple[Int[Array, "*e"], Int[Array, "*e"]]
     """Keyframes `(i, j)`."""
     row: Int[Array, "*e"]
     """Row of landmarks of keyframe i."""
+    index_at_host: Int[Array, "*e"]
+    relative: jaxlie.SE3
+    rotation: Float[Array, "*e 3 3"]
+    translation: Float[Array, "*e 3"]
+    data: tuple[dict[str, Any], ...]
+    """Data and weights in each edge term."""
 
 
-def places(problem: Problem) -> Place:
-    """Return the indices of all edges."""
-    return Place(problem.edges.ends, problem.edges.row)
+SeenAlong = Callable[[Edge], list[tuple[EdgeTerm, EdgeView]]]
 
 
-def view_of(cameras: Cameras, hosts: Hosts, place: Place, motion: Motions) -> EdgeView:
-    """Return the slots of a row, seen along the edge at `place` with that relative pose."""
-    own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, place.row, keepdims=False), hosts)
+def edge_views(problem: Problem, state: State) -> tuple[Edge, SeenAlong]:
+    """Return all edges of a prepared problem, to map or scan over, and a function of one of them.
+
+    The function returns each edge term with the data of that edge, and the slots that it observes.
+    """
+    cameras, hosts, relative = cameras_of(problem, state), _hosts_of(problem, state), relative_poses(problem, state)
+    graph, terms = problem.edges, problem.edge_terms
+    data = tuple({**term.data(), "weight": term.weight} for term in terms)
+    motions = relative, relative.rotation().as_matrix(), relative.translation()
+
+    def seen_along(edge: Edge) -> list[tuple[EdgeTerm, EdgeView]]:
+        view = _view_of(cameras, hosts, edge)
+        return [
+            (term.holding(own), view.slots(term.first_slot, term.weight.shape[-1]))
+            for term, own in zip(terms, edge.data, strict=True)
+        ]
+
+    return Edge(graph.ends, graph.row, graph.index_at_host, *motions, data), seen_along
+
+
+def _view_of(cameras: Cameras, hosts: Hosts, edge: Edge) -> EdgeView:
+    """Return the slots of a row, seen along an edge."""
+    own = jax.tree.map(lambda array: jax.lax.dynamic_index_in_dim(array, edge.row, keepdims=False), hosts)
     # Once for an edge: all its terms share the projection.
     free = 0 if hosts.offset is None else hosts.offset.shape[1]
-    motions = motion.rotation, motion.translation
-    seen = motion.relative, *motions, cameras, place.ends, own.pixels, own.inverse_depth
+    motions = edge.rotation, edge.translation
+    seen = edge.relative, *motions, cameras, edge.ends, own.pixels, own.inverse_depth
     if isinstance(own.rays, any_camera.Rays):
-        target = cameras.of(place.ends[1])
+        target = cameras.of(edge.ends[1])
         return EdgeView(*seen, any_camera.project(target, own.rays, own.inverse_depth, *motions), free)
     known = pinhole_parameters(cameras)
     assert known is not None
-    edge = pinhole.OneEdge(known, *motions)
-    return EdgeView(*seen, (edge, pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, edge)), free)
-
-
-def edge_data(problem: Problem) -> EdgeData:
-    """Return the data of each edge in the terms of a prepared problem."""
-    return tuple({**term.data(), "weight": term.weight} for term in problem.edge_terms)
-
-
-def of_edge(problem: Problem, view: EdgeView, data: EdgeData) -> list[tuple[EdgeTerm, EdgeView]]:
-    """Return each edge term with the data of one edge, and the slots that it observes."""
-    found = []
-    for term, own in zip(problem.edge_terms, data, strict=True):
-        found.append((term.holding(own), view.slots(term.first_slot, term.weight.shape[-1])))
-    return found
+    one = pinhole.OneEdge(known, *motions)
+    return EdgeView(*seen, (one, pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, one)), free)

@@ -1,7 +1,8 @@
 """Packing of flat lists of observations (numpy, unequal lengths) into a padded `Problem`.
 
-Padding is confined to this file, `padding.py` and `term_padding.py`: empty slots and edges get weight 0, a finite pixel
-and a positive inverse depth, so that no other file needs a mask.
+Padding is confined to this file and `padding.py`: empty slots and edges get weight 0, a finite pixel and a positive
+inverse depth, so that no other file needs a mask. Padding of a term is an observation of weight 0, whose data are ones,
+as in `AbstractTerm.prepared`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from jaxtyping import Array
 
 from vggtgeo.bundle.intrinsics import CheckedIntrinsics, Intrinsics, checked_intrinsics
 from vggtgeo.bundle.observations import FlatTerm, Observations
-from vggtgeo.bundle.observed import check_observed
 from vggtgeo.bundle.packing_checks import (
     as_poses,
     check_dtype,
@@ -28,9 +28,12 @@ from vggtgeo.bundle.packing_checks import (
     check_kernel,
     check_observations,
     check_positive,
+    check_resolution,
     check_size,
+    check_terms,
 )
 from vggtgeo.bundle.padding import (
+    COUNTED,
     GivenTerm,
     PaddedSize,
     SlotIndex,
@@ -38,20 +41,19 @@ from vggtgeo.bundle.padding import (
     needed_size,
     pad_edges,
     rows_of_keyframes,
-    sort_edges,
 )
-from vggtgeo.bundle.precision import weight_of
+from vggtgeo.bundle.pair_checks import check_observed
 from vggtgeo.bundle.problem import Edges, Problem, State
-from vggtgeo.bundle.resolution import check_resolution
-from vggtgeo.bundle.term_checks import check_terms
-from vggtgeo.bundle.term_padding import padded, placed
 from vggtgeo.bundle.terms.depth import DepthPrior
+from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.image import LineTerm, PointTerm
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.line import LineTerm
-from vggtgeo.bundle.terms.point import PointTerm
-from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.bundle.terms.node import DenseTerm
+from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry.line_segments import fractions, straightened
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
@@ -118,7 +120,7 @@ def pack(
     problem = Problem(
         pixels=_per_slot(index, observations.pixel, 0.0, dtype),
         edges=graph,
-        terms=(*seen, _intrinsics_prior(cameras, dtype), *(padded(term, index, size, dtype) for term in terms)),
+        terms=(*seen, _intrinsics_prior(cameras, dtype), *(_padded(term, index, size, dtype) for term in terms)),
         fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
         fixed_intrinsics=jnp.asarray(cameras.fixed),
         camera_of=None if camera_of is None else jnp.asarray(np.pad(camera_of, (0, padding)), jnp.int32),
@@ -161,19 +163,19 @@ def _layout(
     size = size or needed
     check_size(size, needed)
     rows = rows_of_keyframes(slots, size)
-    edges, order = sort_edges(observations.edges)
-    stored = pad_edges(edges, size, rows)
+    order = np.argsort(observations.edges[:, 0], kind="stable")
+    stored = pad_edges(observations.edges[order], size, rows)
     # At least 1, since a kind without slots has no landmark to divide for.
     length = np.where(slots.is_line, max(size.lines, 1), max(size.points, 1))
     part, within = (np.zeros_like(slots.within), slots.within) if size.rows is None else np.divmod(slots.within, length)
     slot = np.where(slots.is_line, size.points + within, within)
     row = (np.cumsum(rows) - rows)[observations.host] + part
     shape = (int(rows.sum()), len(stored.edges.source), size.points + size.lines)
-    place = stored.position[order]
+    place = np.argsort(order)  # of each edge among the sorted ones
     if size.rows is None:
-        return size, stored.edges, None, SlotIndex(row, slot, place, shape)
+        return size, stored.edges, None, SlotIndex(row, slot, stored.position[place], shape)
     host = jnp.asarray(np.repeat(np.arange(size.keyframes), rows), jnp.int32)
-    return size, stored.edges, host, SlotIndex(row, slot, place, shape, part, stored.step[order])
+    return size, stored.edges, host, SlotIndex(row, slot, stored.position[place], shape, part, stored.step[place])
 
 
 def _seen(
@@ -185,26 +187,32 @@ def _seen(
     lines = {"coefficients": seen.line_coefficients.astype(float), "weight": seen.line_weight, "kernel": kernel}
     end = size.points + size.lines
     terms = (
-        placed(FlatTerm(PointTerm, points, seen.point_landmark, seen.point_edge), index, (0, size.points), dtype),
-        placed(FlatTerm(LineTerm, lines, seen.line_landmark, seen.line_edge), index, (size.points, end), dtype),
-        placed(FlatTerm(DepthPrior, _depth_prior(seen, kernel, dtype), every), index, (0, end), dtype),
+        _placed(FlatTerm(PointTerm, points, seen.point_landmark, seen.point_edge), index, (0, size.points), dtype),
+        _placed(FlatTerm(LineTerm, lines, seen.line_landmark, seen.line_edge), index, (size.points, end), dtype),
+        _placed(FlatTerm(DepthPrior, _depth_prior(seen, kernel, dtype), every), index, (0, end), dtype),
     )
     if seen.pixel_sigma is None or not size.points:
         return terms
     sigma = np.broadcast_to(np.asarray(seen.pixel_sigma, float), len(seen.host))
     check_positive("pixel_sigma", sigma, len(seen.host))
     chosen = np.flatnonzero(index.slot < size.points)
-    pixels = FlatTerm(HostPixel, {"weight": weight_of("pixel_sigma", sigma[chosen], dtype)}, chosen)
-    return (*terms, placed(pixels, index, (0, size.points), dtype))
+    pixels = FlatTerm(HostPixel, {"weight": _weight_of(sigma[chosen])}, chosen)
+    return (*terms, _placed(pixels, index, (0, size.points), dtype))
 
 
 def _intrinsics_prior(cameras: CheckedIntrinsics, dtype: DTypeLike) -> IntrinsicsPrior:
     mean, sigma = cameras.prior_mean, cameras.prior_sigma
-    known = 0.0 if sigma is None else weight_of("prior_sigma", sigma, dtype)
+    known = 0.0 if sigma is None else _weight_of(sigma)
     weight = np.broadcast_to(known, mean.shape)
     return IntrinsicsPrior(
         index=jnp.arange(mean.size), mean=jnp.asarray(mean.ravel(), dtype), weight=jnp.asarray(weight.ravel(), dtype)
     )
+
+
+def _weight_of(sigma: np.ndarray) -> np.ndarray:
+    """Return `1 / sigma^2`; 0 if `sigma^2` overflows."""
+    with np.errstate(over="ignore", divide="ignore"):
+        return np.asarray(1 / np.square(np.asarray(sigma, np.float64)))
 
 
 def _depth_prior(observations: Observations, kernel: AbstractKernel, dtype: DTypeLike) -> dict[str, Any]:
@@ -241,3 +249,68 @@ def _with_segments(problem: Problem, depths: Array, present: Array, size: Padded
         replace(problem, fraction=jnp.asarray(fraction, dtype)),
         depths.at[:, size.points :].set(jnp.asarray(straight, dtype)),
     )
+
+
+def _padded(term: GivenTerm, index: SlotIndex, size: PaddedSize, dtype: DTypeLike) -> AbstractTerm:
+    """Return the term in the shape of a problem of `size`, with landmarks and edges positioned by `index`.
+
+    Raises:
+        InputError: the term has another padded shape, or more observations than `size` allows.
+
+    """
+    if isinstance(term, FlatTerm):
+        return _placed(term, index, (0, index.shape[2]), dtype)
+    if isinstance(term, DenseTerm):
+        return term.padded(size.keyframes)
+    if isinstance(term, COUNTED):
+        return _lengthened(term, dict(size.terms).get(term.name, len(term.weight)))
+    rows, edges, slots = index.shape
+    check_padded(term, (rows if isinstance(term, SlotTerm) else edges,), slots)
+    return term
+
+
+def _placed(term: FlatTerm, index: SlotIndex, slots: tuple[int, int], dtype: DTypeLike) -> AbstractTerm:
+    """Return a flat term with each row moved to its landmark's slot, over the slots `[first, end)` of every row."""
+    first, end = slots
+    rows, edges, _ = index.shape
+    on_edges = issubclass(term.kind, EdgeTerm)
+    outer, where = rows, index.host[term.landmark]
+    if on_edges and term.edge is not None:
+        outer, where = edges, index.stored_edge(term.edge, term.landmark)
+    at = (where, index.slot[term.landmark] - first)
+
+    def scatter(values: np.ndarray, empty: float = 1.0) -> Array:
+        real = np.issubdtype(values.dtype, np.floating)
+        whole = np.full((outer, end - first, *values.shape[1:]), empty if real else 0, dtype if real else values.dtype)
+        whole[at] = values
+        return jnp.asarray(whole)
+
+    given = term.rows()
+    weight = scatter(np.asarray(given.pop("weight"), float), 0.0)
+    data: dict[str, Any] = {name: jax.tree.map(scatter, values) for name, values in given.items()}
+    if on_edges:
+        data["first_slot"] = first
+    return term.kind(**data, **term.shared(), weight=weight)
+
+
+def _lengthened(term: AbstractTerm, count: int) -> AbstractTerm:
+    """Return a term of list form, padded to `count` observations."""
+    own = len(term.weight)
+    more = count - own
+    if more < 0:
+        raise InputError(f"`size.terms` must allow the {own} observations of the term `{term.name}`, got {count}")
+    if more == 0:
+        return term
+
+    def longer(leaf: Any) -> Any:
+        if not eqx.is_array(leaf):
+            return leaf
+        # Index 0 is valid in every problem, and an absent observation has no effect.
+        filling = jnp.ones if eqx.is_inexact_array(leaf) else jnp.zeros
+        return jnp.concatenate([leaf, filling((more, *leaf.shape[1:]), leaf.dtype)])
+
+    # Indices of keyframes are lengthened too, but are not data of an observation.
+    touched = {name: getattr(term, name) for name in term.structure - {"weight", "kernel"}}
+    changed = term.holding(jax.tree.map(longer, {**term.data(), **touched}))
+    weight = jnp.concatenate([term.weight, jnp.zeros(more, term.weight.dtype)])
+    return eqx.tree_at(lambda longer: longer.weight, changed, weight)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, overload
 
 import jax
@@ -123,8 +123,8 @@ class SlotIndex:
 
     host: np.ndarray
     slot: np.ndarray
-    edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    shape: tuple[int, int, int] = (0, 0, 0)
+    edge: np.ndarray
+    shape: tuple[int, int, int]
     part: np.ndarray | None = None
     step: np.ndarray | None = None
 
@@ -150,9 +150,9 @@ class SlotIndex:
             InputError: `per_slot` has another shape.
 
         """
-        found = _values(per_slot)
+        found = per_slot if isinstance(per_slot, jax.core.Tracer) else np.asarray(per_slot)
         rows, _, slots = self.shape
-        if found.ndim < 2 or (any(self.shape) and found.shape[:2] != (rows, slots)):
+        if found.shape[:2] != (rows, slots):
             raise InputError(
                 f"`per_slot` must have shape ({rows}, {slots}, ...), got {found.shape}: a value for each slot of each "
                 "row, such as `state.inverse_depth`"
@@ -172,9 +172,9 @@ class SlotIndex:
             InputError: `per_match` has another shape.
 
         """
-        found = _values(per_match)
+        found = per_match if isinstance(per_match, jax.core.Tracer) else np.asarray(per_match)
         _, edges, slots = self.shape
-        if found.ndim < 2 or (any(self.shape) and (found.shape[0] != edges or found.shape[1] > slots)):
+        if found.ndim < 2 or found.shape[0] != edges or found.shape[1] > slots:
             raise InputError(
                 f"`per_match` must have shape ({edges}, at most {slots}, ...), got {found.shape}: a value for each "
                 "point of each edge, such as `problem.points.weight`"
@@ -251,11 +251,6 @@ def _scattered(values: ArrayLike, into: ArrayLike, where: tuple[np.ndarray, np.n
         )
     # `pack` has checked that landmarks and matches are distinct, so XLA need not order the writes.
     return whole.at[where].set(given.astype(whole.dtype), unique_indices=True)
-
-
-def _values(given: Any) -> Any:
-    """Return a NumPy array; a traced array unchanged."""
-    return given if isinstance(given, jax.core.Tracer) else np.asarray(given)
 
 
 class Slots(NamedTuple):
@@ -354,14 +349,6 @@ def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray]
     within = np.empty(len(host), int)
     within[order] = np.arange(len(host)) - starts[host[order]]
     return within, np.bincount(host, minlength=keyframes)
-
-
-def sort_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sort edges by host; return them and the new position of each edge."""
-    order = np.argsort(edges[:, 0], kind="stable")
-    position = np.empty(len(edges), int)
-    position[order] = np.arange(len(edges))
-    return edges[order], position
 
 
 class StoredEdges(NamedTuple):

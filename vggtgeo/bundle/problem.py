@@ -19,11 +19,10 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.image import LineTerm, PointTerm
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
-from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
-from vggtgeo.bundle.terms.point import PointTerm
+from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry import lie
@@ -252,9 +251,9 @@ class Problem(eqx.Module):
         return tuple(self._of_kind(HostPixel))
 
     @property
-    def node_terms(self) -> tuple[PoseTerm | PairTerm, ...]:
+    def node_terms(self) -> tuple[NodeTerm, ...]:
         """Terms on poses and pairs of them."""
-        return tuple(term for term in self.terms if isinstance(term, PoseTerm | PairTerm))
+        return tuple(term for term in self.terms if isinstance(term, NodeTerm))
 
     @property
     def camera_terms(self) -> tuple[CameraTerm, ...]:

@@ -19,11 +19,10 @@ from jax.typing import DTypeLike
 from vggtgeo.bundle import terms as term_package
 from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
-from vggtgeo.bundle.observed import check_connected
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.packing_checks import check_dtype
 from vggtgeo.bundle.padding import SlotIndex
-from vggtgeo.bundle.pair_checks import check_kinds
+from vggtgeo.bundle.pair_checks import check_connected, check_kinds
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import camera_models as cameras

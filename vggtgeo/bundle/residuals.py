@@ -7,25 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.objective import (
-    EdgeData,
-    Motions,
-    Place,
-    cameras_of,
-    edge_data,
-    hosts_of,
-    motions_of,
-    of_edge,
-    places,
-    prepared,
-    relative_poses,
-    view_of,
-)
+from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, prepared
 from vggtgeo.bundle.pair_checks import check_kinds, check_pair
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.host_pixel import HostPixel
-from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm, node_residuals
+from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm, node_residuals
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.io.kept_program import KeptProgram
@@ -141,23 +127,22 @@ def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[
     if isinstance(term, HostPixel):
         assert state.pixel_offset is not None  # ensured by `check_pair`
         return term.residuals(state.pixel_offset)
-    if isinstance(term, PoseTerm | PairTerm):
+    if isinstance(term, NodeTerm):
         return node_residuals(term, state.poses.wxyz_xyz, cameras)
     if isinstance(term, CameraTerm):
         return term.residuals(state.parameters)
     if isinstance(term, DenseTerm):
         return term.residual(state.poses, state.parameters)
-    alone, hosts = problem.with_terms((term,)), hosts_of(problem, state)
+    alone = problem.with_terms((term,))
     if not alone.edge_terms:
         return jnp.zeros((1, *term.weight.shape), state.inverse_depth.dtype)
+    edges, seen_along = edge_views(alone, state)
 
-    def edge(place: Place, motion: Motions, data: EdgeData) -> Array:
-        ((one, view),) = of_edge(alone, view_of(cameras, hosts, place, motion), data)
-        assert isinstance(one, EdgeTerm)
+    def along(edge: Edge) -> Array:
+        ((one, view),) = seen_along(edge)
         return one.residuals(view)
 
-    each = jax.vmap(edge, out_axes=1)
-    return each(places(problem), motions_of(relative_poses(problem, state)), edge_data(alone))
+    return jax.vmap(along, out_axes=1)(edges)
 
 
 def count_rows(problem: Problem, term: AbstractTerm, state: State) -> Int[Array, ""]:

@@ -8,7 +8,6 @@ remaining poses, the cameras' parameters, and the flags of fixed poses.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -72,7 +71,8 @@ def slide(
     check_pair(problem, state)
     check_pair(next_problem, next_initial, "next_initial")
     _check_alike(problem, next_problem)
-    staying = _staying(leaving, problem.num_keyframes)
+    place = jnp.arange(problem.num_keyframes - 1)
+    staying = place + (place >= leaving)
     # The last position is the new keyframe, about which the prior knows nothing.
     prior = permute_prior(marginalise(problem, state, leaving), jnp.append(staying, -1))
     poses = state.poses.wxyz_xyz
@@ -86,12 +86,6 @@ def slide(
             intrinsics=state.intrinsics,
         ),
     )
-
-
-def _staying(leaving: Any, keyframes: int) -> Int[Array, " m"]:
-    """Return the indices of the keyframes that stay."""
-    place = jnp.arange(keyframes - 1)
-    return place + (place >= leaving)
 
 
 def _extrapolated(poses: Float[Array, "n 7"]) -> Float[Array, "7"]:

@@ -4,14 +4,14 @@ An example of research on top of `vggtgeo.solve`; nothing else of the package us
 `notebooks`).
 """
 
-from vggtgeo.learning.network import ConfidenceNetwork as ConfidenceNetwork
-from vggtgeo.learning.recorded_windows import recorded_windows as recorded_windows
 from vggtgeo.learning.slid_windows import cut as cut
 from vggtgeo.learning.slid_windows import slid_error_and_gradient as slid_error_and_gradient
 from vggtgeo.learning.slid_windows import stack_sequences as stack_sequences
 from vggtgeo.learning.tracked_windows import TrackedWindow as TrackedWindow
+from vggtgeo.learning.tracked_windows import recorded_windows as recorded_windows
 from vggtgeo.learning.tracked_windows import tracked_windows as tracked_windows
 from vggtgeo.learning.training import Batch as Batch
+from vggtgeo.learning.training import ConfidenceNetwork as ConfidenceNetwork
 from vggtgeo.learning.training import PoseErrors as PoseErrors
 from vggtgeo.learning.training import compare as compare
 from vggtgeo.learning.training import error_and_gradient as error_and_gradient

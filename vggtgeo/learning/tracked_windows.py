@@ -1,23 +1,28 @@
-"""Simulated windows with matches of a real tracker, which has realistic failures.
+"""Windows, simulated or recorded, with matches of a real tracker, which has realistic failures.
 
 Corners of each rendered keyframe are tracked into the others by pyramidal Lucas-Kanade (OpenCV) from a perturbed start.
 Failures have their natural causes: repeated texture, edges, occlusion, blur. The renderer gives the error of each
-match.
+match. In a recording a match is correct if depth camera and true poses project the corner to it. Both have errors,
+which confidences cannot reduce: pose errors fall less than in simulation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from vggtgeo.bundle.observations import Observations
+from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.frame import Sequence as Recording
+from vggtgeo.evaluation.association import nearest_in_time
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.camera import Undistorter
+from vggtgeo.io.errors import InputError
 from vggtgeo.models.classical import StructureTensor
 from vggtgeo.simulation import SimulatedOracle, SyntheticSequence
 
@@ -41,6 +46,16 @@ _PATCH = 9
 _DEPTH_NOISE = 0.05
 _START = 0.03
 """Standard deviation of the initial positions, metres."""
+SAME_SURFACE = 0.05
+"""Relative difference of depth up to which two frames see the same surface."""
+DEPTH_SIGMA = 0.02
+"""Relative standard deviation of the depth prior: that of indoor depth cameras at some metres."""
+SAME_TIME = 0.02
+"""Largest time between a frame and its true pose, seconds."""
+MIN_MATCHES = 12
+"""Of each keyframe of a window, in and out: fewer hardly determine its pose."""
+_TRIES = 20
+"""Random positions per window: at some, tracking fails or depth is missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,77 +117,156 @@ def tracked_windows(
     span = spacing * (keyframes - 1) + 1
     for number in range(count):
         first = int(rng.integers(0, len(sequence) - span))
-        frames = range(first, first + span, spacing)
-        name = f"{sequence.name}, window {number}"
-        yield track_window(_Simulated(oracle), name, frames, points, rng, (_DEPTH_NOISE, _DEPTH_NOISE))
+        known = _simulated(sequence, oracle, range(first, first + span, spacing))
+        yield track_window(known, f"{sequence.name}, window {number}", points, rng, (_DEPTH_NOISE, _DEPTH_NOISE))
 
 
-@runtime_checkable
-class KnownFrames(Protocol):
-    """Frames with ground truth, by number. intrinsics: fx, fy, cx, cy, pixels."""
+def recorded_windows(
+    sequence: Recording, count: int, *, keyframes: int = 4, points: int = 24, spacing: int = 3, seed: int = 0
+) -> Iterator[TrackedWindow]:
+    """Yield `count` windows at random positions of a recording with depth and ground truth.
 
-    @property
-    def intrinsics(self) -> np.ndarray: ...
+    Args:
+        sequence: the recording, for example of `vggtgeo.open_sequence`.
+        count: number of windows; fewer if too few positions have depth, ground truth and corners that can be tracked.
+        keyframes: per window.
+        points: hosted in each keyframe.
+        spacing: frames from keyframe to keyframe.
+        seed: of positions, corners and noise.
 
-    def image(self, index: int) -> np.ndarray: ...
+    Raises:
+        InputError: the recording has no depth or no truth, or is shorter than a window.
 
-    def depth(self, index: int) -> np.ndarray: ...
+    Example:
+        >>> import vggtgeo as vg
+        >>> from vggtgeo.learning import recorded_windows
+        >>> window = next(recorded_windows(vg.simulate("room", 40, size=(160, 120)), 1, points=8))
+        >>> window.features.shape[1], len(window.images)
+        (8, 4)
 
-    def pose(self, index: int) -> np.ndarray: ...
+    """
+    truth = sequence.ground_truth()
+    if truth is None or not sequence.has_depth:
+        missing = "true poses" if truth is None else "depth"
+        raise InputError(f"`sequence` ({sequence.name}) has no {missing}; learning needs depth and ground truth")
+    span = spacing * (keyframes - 1) + 1
+    if len(sequence) < span:
+        raise InputError(f"`sequence` ({sequence.name}) has {len(sequence)} frames; a window spans {span}")
+    rng = np.random.default_rng([seed, 6])
+    undistorter, intrinsics = sequence.camera.undistorter(), np.array(sequence.camera.intrinsics, np.float64)
+    found = 0
+    for _ in range(_TRIES * count):
+        if found == count:
+            return
+        first = int(rng.integers(0, len(sequence) - span + 1))
+        frames = [frame for frame in sequence.frames(first, first + span, spacing) if frame.depth is not None]
+        rows, nearest = nearest_in_time(np.array([f.timestamp for f in frames]), truth.timestamps, SAME_TIME)
+        if len(rows) < keyframes:
+            continue
+        known = _recorded(frames, rigid.invert(truth.poses[nearest]), intrinsics, undistorter)
+        window = track_window(known, f"{sequence.name}, window {found}", points, rng, (0, DEPTH_SIGMA))
+        if _determined(window):
+            found += 1
+            yield window
 
-    def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+def _recorded(frames: list[Frame], poses: np.ndarray, intrinsics: np.ndarray, undistorter: Undistorter) -> KnownFrames:
+    depths = [undistorter.depth(frame.depth) for frame in frames if frame.depth is not None]
+    return KnownFrames(
+        images=np.stack([undistorter.image(frame.image) for frame in frames]),
+        depths=depths,
+        poses=poses,
+        intrinsics=intrinsics,
+        correspond=lambda i, j, pixels: reproject(pixels, (depths[i], depths[j]), (poses[i], poses[j]), intrinsics),
+    )
+
+
+def _determined(window: TrackedWindow) -> bool:
+    seen = window.observations
+    ends = seen.edges[seen.point_edge].ravel()
+    return bool((np.bincount(ends, minlength=len(window.images)) >= MIN_MATCHES).all())
+
+
+def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return values at the nearest pixels, NaN outside."""
+    height, width = image.shape
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5), axis=1)
+    columns, rows = np.rint(pixels[inside]).astype(int).T
+    values = np.full(len(pixels), np.nan)
+    values[inside] = image[rows, columns]
+    return values
 
 
 @dataclass(frozen=True, eq=False)
-class _Simulated:
-    """Rendered frames."""
+class KnownFrames:
+    """Undistorted frames with depth and ground truth.
 
-    oracle: SimulatedOracle
+    images: uint8 [n, H, W, 3]. depths: [H, W] of each, metres, NaN = none. poses: world -> camera, [n, 4, 4].
+    intrinsics: fx, fy, cx, cy, pixels. correspond: takes two indices and pixels [m, 2] of the first frame; returns them
+    in the second, NaN where unknown, and whether they are visible there.
+    """
 
-    @property
-    def intrinsics(self) -> np.ndarray:
-        return self.oracle.intrinsics
+    images: UInt8[np.ndarray, "n h w 3"]
+    depths: Sequence[np.ndarray]
+    poses: np.ndarray
+    intrinsics: np.ndarray
+    correspond: Callable[[int, int, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
-    def image(self, index: int) -> np.ndarray:
-        return self.oracle.sequence.frame(index).image
 
-    def depth(self, index: int) -> np.ndarray:
-        return self.oracle.depth(index)
+def _simulated(sequence: SyntheticSequence, oracle: SimulatedOracle, frames: range) -> KnownFrames:
+    return KnownFrames(
+        images=np.stack([sequence.frame(k).image for k in frames]),
+        depths=[oracle.depth(k) for k in frames],
+        poses=np.array([oracle.pose(k) for k in frames]),
+        intrinsics=oracle.intrinsics,
+        correspond=lambda i, j, pixels: oracle.correspond(frames[i], frames[j], pixels),
+    )
 
-    def pose(self, index: int) -> np.ndarray:
-        return self.oracle.pose(index)
 
-    def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self.oracle.correspond(index_i, index_j, pixels)
+def reproject(
+    pixels: np.ndarray,
+    depths: tuple[np.ndarray, np.ndarray],
+    poses: tuple[np.ndarray, np.ndarray],
+    intrinsics: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Project `pixels` [n, 2] of one frame into another by the measured depth of the first: float64 [n, 2], NaN without
+    depth; and whether they are not occluded there, bool [n].
+
+    depths, poses: of both frames: [H, W], metres, NaN = none; world -> camera, [4, 4].
+    """
+    inverse = 1 / _nearest(depths[0], pixels)
+    known = np.isfinite(inverse)
+    points = rigid.unproject(pixels[known], inverse[known], poses[0], intrinsics)
+    target, shown = np.full(pixels.shape, np.nan), np.zeros(len(pixels), bool)
+    target[known] = rigid.project(points, poses[1], intrinsics)
+    expected = (points @ poses[1][2, :3]) + poses[1][2, 3]
+    measured = _nearest(depths[1], target[known])
+    shown[known] = (expected > 0) & ~(measured < (1 - SAME_SURFACE) * expected)
+    return target, shown
 
 
 def track_window(
-    oracle: KnownFrames,
-    name: str,
-    numbers: Iterable[int],
-    points: int,
-    rng: np.random.Generator,
-    depth_noise: tuple[float, float],
+    known: KnownFrames, name: str, points: int, rng: np.random.Generator, depth_noise: tuple[float, float]
 ) -> TrackedWindow:
-    """Return a window of the frames `numbers`. depth_noise: relative standard deviations of the noise added to the
-    depth, and of the depth prior.
+    """Return a window of all frames. depth_noise: relative standard deviations of the noise added to the depth, and of
+    the depth prior.
     """
-    frames = list(numbers)
-    images = np.stack([oracle.image(k) for k in frames])
+    images = known.images
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     saliency = [StructureTensor().confidence(image) for image in images]
     corners = [_corners(image, points, rng) for image in grey]
-    depth = np.concatenate([_read(oracle.depth(k), pixels) for k, pixels in zip(frames, corners, strict=True)])
-    host = np.repeat(np.arange(len(frames)), [len(pixels) for pixels in corners])
+    depth = np.concatenate([_read(depth, pixels) for depth, pixels in zip(known.depths, corners, strict=True)])
+    host = np.repeat(np.arange(len(images)), [len(pixels) for pixels in corners])
     first = np.concatenate([[0], np.cumsum([len(pixels) for pixels in corners])])
-    edges = np.array(list(permutations(range(len(frames)), 2)))
+    edges = np.array(list(permutations(range(len(images)), 2)))
     parts = []
     for e, (i, j) in enumerate(edges):
-        true, visible = oracle.correspond(frames[i], frames[j], corners[i])
-        known = np.isfinite(true).all(axis=1) & np.isfinite(depth[first[i] : first[i + 1]])
-        guess = np.where(known[:, None], true, corners[i]) + rng.normal(0, _SEARCH, true.shape)
+        true, visible = known.correspond(i, j, corners[i])
+        usable = np.isfinite(true).all(axis=1) & np.isfinite(depth[first[i] : first[i + 1]])
+        guess = np.where(usable[:, None], true, corners[i]) + rng.normal(0, _SEARCH, true.shape)
         found = _follow(grey[i], grey[j], corners[i], guess)
-        kept = found.kept & known & _inside(true, grey[j])
+        kept = found.kept & usable & _inside(true, grey[j])
         features = _features(grey[i], grey[j], saliency[i], saliency[j], corners[i], found)
         error = np.where(visible, np.linalg.norm(found.pixels - true, axis=1), np.inf)
         rows = np.nonzero(kept)[0]
@@ -196,10 +290,10 @@ def track_window(
         depth_weight=np.isfinite(depth).astype(float),
         alpha=2.0,
     )
-    poses = rigid.to_quaternion(np.array([oracle.pose(k) for k in frames]))
+    poses = rigid.to_quaternion(known.poses)
     start = poses.copy()
-    start[1:, 4:] += rng.normal(0, _START, (len(frames) - 1, 3))
-    return TrackedWindow(name, images, observations, poses, start, oracle.intrinsics, features, error, product)
+    start[1:, 4:] += rng.normal(0, _START, (len(images) - 1, 3))
+    return TrackedWindow(name, images, observations, poses, start, known.intrinsics, features, error, product)
 
 
 @dataclass(frozen=True, eq=False)

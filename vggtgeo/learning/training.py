@@ -1,4 +1,4 @@
-"""Training a confidence by the pose error after bundle adjustment, and comparing confidences on windows not seen.
+"""Training a confidence of matches by the pose error after adjustment, and comparing confidences on windows not seen.
 
 The loss of a window is `log(e)`, with `e` the RMS error of its camera centres: windows count alike, whatever their
 size. Its gradient reaches the network through the optimum (implicit function theorem), see `vggtgeo.solve`.
@@ -14,20 +14,46 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
-from vggtgeo.learning.network import MIN_CONFIDENCE, ConfidenceNetwork
 from vggtgeo.learning.tracked_windows import TrackedWindow
 
+MIN_CONFIDENCE = 1e-3
+"""Lower bound of the confidence, so that the optimum stays defined."""
 GAIN = 16.0
 """Weight of a match of confidence 1: its standard deviation is 0.25 px, what the tracker reaches where it is right."""
 _SMALLEST = 1e-6
 """Metres below which an error does not count as smaller."""
+
+
+class ConfidenceNetwork(eqx.Module):
+    """Features of a match, standardised, through two hidden layers to a confidence in (0, 1)."""
+
+    mean: Float[Array, " f"]
+    scale: Float[Array, " f"]
+    layers: eqx.nn.MLP
+
+    def __init__(self, features: Float[Array, "a f"], key: PRNGKeyArray, width: int = 16):
+        """Standardise by the `features` of the training matches; the initial confidence is about 0.7 for all."""
+        self.mean = jnp.mean(features, 0)
+        self.scale = jnp.std(features, 0) + 1e-6
+        layers = eqx.nn.MLP(
+            features.shape[1], "scalar", width, 2, activation=jax.nn.tanh, key=key, dtype=features.dtype
+        )
+        start = lambda layer: (0.1 * layer.weight, jnp.ones_like(layer.bias))
+        self.layers = eqx.tree_at(lambda m: (m.layers[-1].weight, m.layers[-1].bias), layers, start(layers.layers[-1]))
+
+    def __call__(self, features: Float[Array, "*b f"]) -> Float[Array, "*b"]:
+        """Return the confidence of each match."""
+        inputs = (features - jax.lax.stop_gradient(self.mean)) / jax.lax.stop_gradient(self.scale)
+        flat = inputs.reshape(-1, inputs.shape[-1])
+        confidence = jax.nn.sigmoid(jax.vmap(self.layers)(flat)).reshape(inputs.shape[:-1])
+        return MIN_CONFIDENCE + (1 - MIN_CONFIDENCE) * confidence
 
 
 class Batch(NamedTuple):

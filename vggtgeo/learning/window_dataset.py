@@ -9,7 +9,6 @@ own, forked ones too (collate function: `vggtgeo.learning.stack_windows`); `batc
 from __future__ import annotations
 
 import json
-import numbers
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -82,7 +81,15 @@ class WindowWriter:
         arrays = {name: _label(name, value) for name, value in labels.items()}
         if not self.count and is_there(self.folder / _name(0)):
             raise InputError(f"`{self.folder}` holds windows already; give a new folder")
-        self._check(problem, initial, arrays)
+        leaves, structure = jax.tree.flatten((problem, initial))
+        kinds = [(np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves]
+        shape = structure, kinds, {name: array.shape for name, array in arrays.items()}
+        if self._shape not in (None, shape):
+            raise InputError(
+                f"window {self.count} has another padded shape, other terms or other labels than window 0; pack all "
+                "of them with one `size` (`vggtgeo.PaddedSize`) and give the same labels"
+            )
+        self._shape = shape
         save_problem(self.folder / _name(self.count), problem, initial, index)
         LABELS.write(self.folder / f"{self.count:07d}.labels.npz", arrays)
         self.count += 1
@@ -93,16 +100,6 @@ class WindowWriter:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             write_json(self.folder / _INDEX, {"version": VERSION, "windows": self.count})
-
-    def _check(self, problem: Problem, initial: State, labels: Mapping[str, np.ndarray]) -> None:
-        shape = _shapes((problem, initial)), {name: array.shape for name, array in labels.items()}
-        if self._shape is None:
-            self._shape = shape
-        elif shape != self._shape:
-            raise InputError(
-                f"window {self.count} has another padded shape, other terms or other labels than window 0; pack all "
-                "of them with one `size` (`vggtgeo.PaddedSize`) and give the same labels"
-            )
 
 
 class RunWindows(Callback):
@@ -131,7 +128,9 @@ class RunWindows(Callback):
             return
         self._last = slam.window.solved
         adjustment, _ = slam.window.solved
-        labels = {"keyframes": _padded(adjustment.keyframes, len(adjustment.initial.poses.wxyz_xyz))}
+        room = len(adjustment.initial.poses.wxyz_xyz) - len(adjustment.keyframes)
+        # -1 where the window has room for more keyframes.
+        labels = {"keyframes": np.array([*adjustment.keyframes, *[-1] * room])}
         more = self._label(slam) if self._label is not None else {}
         self._writer.add((adjustment.problem, adjustment.initial, adjustment.index), **labels, **more)
 
@@ -175,7 +174,6 @@ class WindowDataset:
 
     def __getitem__(self, row: int) -> LabelledWindow:
         """Return window `row`, read from the disk, with numpy leaves."""
-        check_kind("row", row, numbers.Integral, "the number of a window")
         if not 0 <= row < self.count:
             raise IndexError(f"window {row} of {self.count}")
         problem, initial, _ = load_arrays(self.folder / _name(row), self.terms)
@@ -207,10 +205,7 @@ class WindowDataset:
         for name, value in (("seed", seed), ("epochs", epochs)):
             if value is not None:
                 check_whole(name, value)
-        check_kind("share", share, tuple, "(k, n) with 0 <= k < n")
         part, parts = share
-        for value in share:
-            check_whole("share", value)
         if not 0 <= part < parts:
             raise InputError(f"`share` is {share}; it must be (k, n) with 0 <= k < n")
         if not 1 <= size <= self.count // parts:
@@ -246,9 +241,6 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
         >>> loader = DataLoader(data, batch_size=8, collate_fn=vg.learning.stack_windows)  # doctest: +SKIP
 
     """
-    check_kind("windows", windows, Sequence, "a list of windows, as `WindowDataset` gives them")
-    for row, window in enumerate(windows):
-        check_kind(f"windows[{row}]", window, LabelledWindow, "a window, as `WindowDataset` gives it")
     stack: LabelledWindow = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
     return stack
 
@@ -265,13 +257,3 @@ def _label(name: str, given: Any) -> np.ndarray:
 
 def _name(row: int) -> str:
     return f"{row:07d}.npz"
-
-
-def _shapes(tree: Any) -> Any:
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, [(np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves]
-
-
-def _padded(numbers: Sequence[int], length: int) -> np.ndarray:
-    """Return numbers of the window's keyframes, -1 where it has room for more."""
-    return np.array([*numbers, *[-1] * (length - len(numbers))])

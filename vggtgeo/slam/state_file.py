@@ -16,10 +16,9 @@ from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.terms.baseline import BaselinePrior
 from vggtgeo.bundle.terms.depth import DepthPrior
+from vggtgeo.bundle.terms.image import LineTerm, PointTerm
 from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.line import LineTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
-from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
 from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.geometry.camera import Camera

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arrow_systems import dense_matrix, zero_step
 from jax.flatten_util import ravel_pytree
 from own_terms import with_own_terms
-from vggtgeo.solvers.arrow import dense_schur_complement, multiply
+from vggtgeo.solvers.assembly import dense_schur_complement
 
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
@@ -50,18 +51,17 @@ def test_second_derivatives_are_derived(own) -> None:
     # Proves gradient and exact Hessian with own terms of three kinds and an own kernel. Oracle: automatic
     # differentiation of the energy after a retraction.
     problem, state, _ = own
-    problem = problem.without_term("points").without_term("lines")  # tests/bundle/test_exact_hessian.py has theirs
-    ba = BundleAdjustment(problem)
-    flat, unflat = ravel_pytree(ba.zero_step(state))
+    problem = problem.without_term("points").without_term("lines")  # tests/bundle/test_linearise.py has theirs
+    zero = zero_step(BundleAdjustment(problem), state)
+    flat, unflat = ravel_pytree(zero)
 
     @jax.jit
     def both(problem, state):
         ba = BundleAdjustment(problem)
         total = lambda step: vg.energy(problem, ba.retract(state, unflat(step)))
         system = ba.hessian(state)
-        matrix = jax.vmap(lambda column: ravel_pytree(multiply(system, unflat(column)))[0])(jnp.eye(len(flat))).T
         gradients = ravel_pytree(ba.gradient(state))[0], dense_schur_complement(system).gradient
-        return matrix, gradients, jax.hessian(total)(flat), jax.grad(total)(flat)
+        return dense_matrix(system, zero), gradients, jax.hessian(total)(flat), jax.grad(total)(flat)
 
     matrix, (gradient, dense), hessian, expected = both(problem, state)
     unit = 1 / np.sqrt(np.abs(np.diag(hessian)) + 1.0)
@@ -93,24 +93,3 @@ def test_gradient_by_own_data(own) -> None:
     difference = float(values[1] - values[2]) / 2e-4
     found = float(jnp.sum(gradients[0] * along))
     assert abs(found - difference) < 1e-5 * abs(difference), (found, difference)
-
-
-@pytest.mark.long
-def test_own_terms_are_known_everywhere(own, solved) -> None:
-    # Proves that covariances shrink by an own fix, that observability and statistics name it, and that marginalisation
-    # takes it along. Oracle: the same problem without it; what is named.
-    problem, _, _ = own
-    known = eqx.filter_jit(vg.covariances)
-    less_known = without(problem, "position_fix")
-    sigma = lambda p: np.sqrt(np.trace(np.asarray(known(p, solved.state).poses)[2, :3, :3]))
-    assert sigma(problem) < 0.9 * sigma(less_known)
-    sizes = eqx.filter_jit(vg.analysis.residual_sizes)(problem, solved.state)
-    assert int(sizes.count["position_fix"]) == 2
-    assert "position_fix" in str(sizes)
-    found = eqx.filter_jit(vg.observability)(problem, solved.state)
-    assert "position_fix" in found.report()
-    gone = jax.jit(vg.marginalise)
-    prior = gone(problem.with_term(vg.empty_prior(3)), solved.state, jnp.asarray(1))
-    less = gone(less_known.with_term(vg.empty_prior(3)), solved.state, jnp.asarray(1))
-    information = lambda p: float(jnp.trace(p.root[:, 12:18].T @ p.root[:, 12:18]))
-    assert information(prior) > 1.001 * information(less)

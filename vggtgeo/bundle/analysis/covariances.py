@@ -24,22 +24,20 @@ from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
-from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm, node_derivatives
+from vggtgeo.bundle.terms.node import CameraTerm, NodeTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.io.readable import Readable
+from vggtgeo.solvers.arrow import is_finite, unless
 from vggtgeo.solvers.covariance import covariance
-from vggtgeo.solvers.finite import is_finite, unless
 from vggtgeo.solvers.flat_directions import flat_stiffness
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600
-"""Largest number of keyframes for a dense inverse: 104 MB and about 10 s (2.5 s for 355 keyframes)."""
-ITERATIVE_KEYFRAMES = 32
-"""Largest number of keyframes for conjugate gradients, which solve about 60 systems for each keyframe."""
+"""Number of keyframes above which a dense inverse is not advisable: 104 MB and about 10 s (2.5 s for 355)."""
 
 
 class Covariances(Readable):
@@ -141,14 +139,13 @@ def covariances(
     Args:
         problem: the problem that was solved.
         state: its solution (`solve(...).state`): the information is that of the linearisation there.
-        reduced_solver: linear solver that inverts the information, see `choose_reduced_solver`; None: dense, for up to
-            600 keyframes.
+        reduced_solver: linear solver that inverts the information, see `choose_reduced_solver`; None: dense, advisable
+            for up to 600 keyframes.
         keyframes: `h` indices of keyframes; None = all, `h = n`. The intrinsics and the variance factor are always
             those of the whole problem.
 
     Raises:
         InputError: `state` has another size or precision, or is not finite (checked unless traced).
-        ValueError: too many keyframes for a dense matrix, or for conjugate gradients.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
         >>> sigma = jax.jit(vg.covariances)(problem, solution.state).poses[1, :3, :3].diagonal() ** 0.5
@@ -162,7 +159,6 @@ def covariances(
     check_kind("reduced_solver", reduced_solver, AbstractReducedSolver | None, expected)
     solver = DenseCholesky() if reduced_solver is None else reduced_solver
     rows, first = _rows(problem, keyframes)
-    _check_size(solver, problem.num_keyframes, len(rows))
     found = _covariances_jit(problem, state, solver, rows, first)
     check_linearisation(problem, state, jnp.isfinite(found.variance_factor))
     return found
@@ -222,10 +218,6 @@ def _covariances_jit(
     return unless(is_finite(system), known)
 
 
-def _check_size(solver: AbstractReducedSolver, keyframes: int, asked: int) -> None:
-    """Raise ValueError for sizes that would fill the memory or take hours."""
-
-
 def variance_factor(problem: Problem, state: State, rank: Int[Array, ""]) -> Float[Array, ""]:
     """Return `2 E / (m - u)` of a prepared problem: `m` rows that depend on free unknowns, `u = rank`."""
     terms = tuple(changing(problem, term, state) for term in problem.terms)
@@ -246,12 +238,12 @@ def changing(problem: Problem, term: AbstractTerm, state: State) -> AbstractTerm
     if isinstance(term, CameraTerm):
         slopes = jnp.moveaxis(jax.jacfwd(term.residuals)(state.parameters), 1, 0)
         free = jnp.broadcast_to(free_parameters.reshape(-1), (len(slopes), problem.num_parameters))
-    elif isinstance(term, PoseTerm | PairTerm):
+    elif isinstance(term, NodeTerm):
         slopes = node_derivatives(term, state.poses.wxyz_xyz, cameras_of(problem, state))[1]
         parts = [jnp.repeat(~problem.fixed_pose[index][:, None], lie.TANGENT, 1) for index in term.touched()]
-        if isinstance(term, PoseTerm):
+        if term.needs_camera:
             cameras = problem.camera_of
-            own = free_parameters if cameras is None else free_parameters[cameras[term.keyframe]]
+            own = free_parameters if cameras is None else free_parameters[cameras[term.touched()[0]]]
             parts.append(jnp.broadcast_to(own, (len(slopes), free_parameters.shape[-1])))
         free = jnp.concatenate(parts, 1)
     else:

@@ -41,7 +41,8 @@ def common_directions(problem: Problem, state: State) -> Float[Array, "g c"]:
     in their order. Fixed coordinates are not masked. The aspect ratio changes `fx` by 100 % and `fy` by -100 %.
     """
     keyframes, tail = problem.num_keyframes, problem.num_parameters
-    common = jnp.concatenate([_scale(problem, state)[None], _common(problem, state)])
+    rigid = rigid_motions(problem, state).transpose(2, 0, 1).reshape(lie.TANGENT, -1)
+    common = jnp.concatenate([_scale(problem, state)[None], rigid])
     common = jnp.concatenate([common, jnp.zeros((len(common), tail), common.dtype)], 1)
     shared = _of_cameras(problem.parameter_names, state.parameters.astype(common.dtype))
     shared = jnp.concatenate([jnp.zeros((tail, lie.TANGENT * keyframes), common.dtype), shared], 1)
@@ -73,8 +74,7 @@ def _scale(problem: Problem, state: State) -> Float[Array, " camera"]:
     return jnp.concatenate([outward, jnp.zeros_like(outward)], 1).reshape(-1)
 
 
-def _common(problem: Problem, state: State) -> Float[Array, "6 camera"]:
-    """Return the rigid motions of all cameras, a unit twist in the anchor's frame: `xi_i = Ad(T_i T_anchor^-1) e_a`."""
-    anchor = _anchor(problem, state).wxyz_xyz
-    transport = lambda pose: lie.adjoint(lie.relative(jaxlie.SE3(anchor), jaxlie.SE3(pose)))
-    return jax.vmap(transport)(state.poses.wxyz_xyz).transpose(2, 0, 1).reshape(6, -1)
+def rigid_motions(problem: Problem, state: State) -> Float[Array, "n 6 6"]:
+    """Return the tangent of each pose by that of a rigid motion in the anchor's frame: `Ad(T_i T_anchor^-1)`."""
+    anchor = _anchor(problem, state)
+    return lie.adjoint(jax.vmap(lambda pose: lie.relative(anchor, jaxlie.SE3(pose)))(state.poses.wxyz_xyz))

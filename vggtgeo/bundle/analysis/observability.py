@@ -22,7 +22,7 @@ Cost: one linearisation a term, and for `k` terms `2 k + 1` Schur complements an
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -43,19 +43,17 @@ from vggtgeo.bundle.residuals import term_residuals, used_slots
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import (
     ArrowSystem,
-    Blocks,
     NodeFactors,
-    Reduced,
     couple,
     dense_gradient,
-    dense_schur_complement,
     inverse_landmark_hessian,
+    is_finite,
+    join_landmarks,
+    unless,
 )
+from vggtgeo.solvers.assembly import Blocks, Reduced, dense_schur_complement
 from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
-from vggtgeo.solvers.finite import is_finite, unless
-from vggtgeo.solvers.landmark_basis import expand, join_landmarks
-from vggtgeo.solvers.local_inverse import balance
-from vggtgeo.solvers.symmetric_eigen import symmetric_eigen
+from vggtgeo.solvers.local_inverse import balance, rank_tolerance
 
 DENSE_KEYFRAMES = 300
 """Largest number of keyframes for full spectra: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
@@ -164,7 +162,7 @@ def _depth_change(
 
     def following(direction: Float[Array, " c"]) -> Float[Array, ""]:
         moved = -inverse_landmark_hessian(system) * couple(system, jnp.where(system.free, direction, 0.0), 0.0)
-        relative = expand(system.basis, moved)[:, num_offsets(state) :] / state.inverse_depth
+        relative = system.basis.expand(moved)[:, num_offsets(state) :] / state.inverse_depth
         return jnp.sqrt(jnp.sum(jnp.where(used, relative, 0.0) ** 2) / jnp.maximum(jnp.sum(used), 1))
 
     return jax.vmap(following, in_axes=1)(directions)
@@ -258,6 +256,32 @@ def _combine(
         is_leaf=lambda leaf: leaf is None,
     )
     return join_landmarks(system, fraction)
+
+
+@jax.custom_jvp
+def symmetric_eigen(matrix: Float[Array, "c c"]) -> tuple[Float[Array, " c"], Float[Array, "c c"]]:
+    """Return eigenvalues, ascending, and eigenvectors as columns; the derivative is finite where values are equal.
+
+        dw = diag(V' dA V),     dV = V (F * V' dA V),     F_ij = 1 / (w_j - w_i),
+
+    with `F_ij = 0` if two eigenvalues are numerically equal. Their eigenvectors are then unique only up to a rotation,
+    and only functions invariant under it (their projector, the sum of their eigenvalues) have a derivative, which
+    is exact.
+    """
+    values, vectors = jnp.linalg.eigh(matrix)
+    return values, vectors
+
+
+@symmetric_eigen.defjvp
+def _symmetric_eigen_derivative(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Any, Any]:
+    values, vectors = symmetric_eigen(*primals)
+    changed = vectors.T @ ((tangents[0] + tangents[0].T) / 2) @ vectors
+    apart = values[None, :] - values[:, None]
+    size = rank_tolerance(len(values), values.dtype) * jnp.max(jnp.abs(values), initial=0.0)
+    distinct = jnp.abs(apart) > size
+    # Two `where`: the division by equal eigenvalues must not reach the derivative as NaN.
+    turn = jnp.where(distinct, changed / jnp.where(distinct, apart, 1.0), 0.0)
+    return (values, vectors), (jnp.diagonal(changed), vectors @ turn)
 
 
 def _spectrum(reduced: Reduced, coordinates: _Coordinates) -> Spectra:

@@ -91,7 +91,24 @@ class Observability(eqx.Module):
 
     def report(self) -> str:
         """Return the report as text (outside `jit`, for one problem)."""
-        return report(self)
+        free, size = int(np.sum(self.free)), len(self.free)
+        values = np.asarray(self.whole.values[0])[:free]
+        lost, used = undetermined_landmarks(self)
+        whole = weak_directions(self)
+        lines = [
+            f"Observability of {self.keyframes} keyframes: {free} coordinates free, {size - free} held",
+            f"weakest eigenvalues: {'  '.join(f'{max(value, 0):.1e}' for value in values[:6])}",
+            f"weak directions: {_spell(whole, self)}",
+            *(line for known in least_known(self) for line in (f"least known: {known}", f"  sigma: {known.sigma()}")),
+            *([f"pure rotation: {_spell_pairs(self)}"] if rotation_pairs(self) else []),
+            f"inverse depths in use: {used}, undetermined even with all else known: {lost}",
+        ]
+        counts = lambda weak: (len(weak), sum(direction.determined for direction in weak))
+        for kind in self.terms:
+            weak = weak_directions(self, kind)
+            more = counts(weak) != counts(whole) or _more_unknown(weak, self)
+            lines.append(f"weak without {kind}: {_spell(weak, self) if more else 'no more than with all'}")
+        return "\n".join([*lines, "", *_table(self)])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain values (outside `jit`, for one problem).
@@ -100,7 +117,23 @@ class Observability(eqx.Module):
         information about each named direction that would be lost without each kind. Above 300 keyframes only the 24
         smallest eigenvalues are listed; if all of them are weak, there may be more weak directions.
         """
-        return as_dict(self)
+        free, size = int(np.sum(self.free)), len(self.free)
+        lost, used = undetermined_landmarks(self)
+        return {
+            "keyframes": self.keyframes,
+            "free": free,
+            "held": size - free,
+            "eigenvalues": [float(value) for value in np.asarray(self.whole.values[0])[:free]],
+            "weak": [str(direction) for direction in weak_directions(self)],
+            "weak_without": {
+                kind: [str(direction) for direction in weak_directions(self, kind)] for kind in self.terms
+            },
+            "least_known": [direction.to_dict() for direction in least_known(self)],
+            "pure_rotation": [list(pair) for pair in rotation_pairs(self)],
+            "inverse_depths": used,
+            "inverse_depths_undetermined": lost,
+            "lost_without": lost_shares(self),
+        }
 
     def __str__(self) -> str:
         return self.report()
@@ -144,7 +177,7 @@ def weak_directions(found: Observability, without: str | None = None) -> list[We
     next that lies in it and adds something new, and so on; the remainder gets the nearest name. Undetermined directions
     are decomposed separately, since in a large map they would be hidden among those that are only weak.
     """
-    spectra, row = (found.whole, 0) if without is None else (found.without, _index_of(found, without))
+    spectra, row = (found.whole, 0) if without is None else (found.without, found.terms.index(without))
     values, vectors = np.asarray(spectra.values[row], float), np.asarray(spectra.vectors[row], float)
     floor = undetermined_below(len(found.free), spectra.values.dtype)
     lost, weak = values < floor, (values >= floor) & (values < WEAK)
@@ -310,7 +343,8 @@ def _decomposed(
         result.append(
             WeakDirection(names[best], float(part**2 @ np.maximum(values, 0.0)), float(within[best]), determined)
         )
-        rest = rest @ _complement(rest.T @ part)
+        # Orthonormal columns that span the complement of the part.
+        rest = rest @ np.linalg.svd((rest.T @ part)[None])[2][1:].T
     return result
 
 
@@ -325,45 +359,6 @@ def undetermined_landmarks(found: Observability) -> tuple[int, int]:
     """Return the numbers of landmarks undetermined (depth error above 100 % with all else known) and used."""
     used = np.asarray(found.landmark_used)
     return int(np.sum(used & (np.asarray(found.landmark_information) < UNKNOWN))), int(used.sum())
-
-
-def report(found: Observability) -> str:
-    """Return the report as text."""
-    free, size = int(np.sum(found.free)), len(found.free)
-    values = np.asarray(found.whole.values[0])[:free]
-    lost, used = undetermined_landmarks(found)
-    lines = [
-        f"Observability of {found.keyframes} keyframes: {free} coordinates free, {size - free} held",
-        f"weakest eigenvalues: {'  '.join(f'{max(value, 0):.1e}' for value in values[:6])}",
-        f"weak directions: {_spell(weak_directions(found), found)}",
-        *(line for known in least_known(found) for line in (f"least known: {known}", f"  sigma: {known.sigma()}")),
-        *([f"pure rotation: {_spell_pairs(found)}"] if rotation_pairs(found) else []),
-        f"inverse depths in use: {used}, undetermined even with all else known: {lost}",
-    ]
-    for kind in found.terms:
-        weak = weak_directions(found, kind)
-        more = _counts(weak) != _counts(weak_directions(found)) or _more_unknown(weak, found)
-        lines.append(f"weak without {kind}: {_spell(weak, found) if more else 'no more than with all'}")
-    return "\n".join([*lines, "", *_table(found)])
-
-
-def as_dict(found: Observability) -> dict[str, Any]:
-    """Return the result as plain values."""
-    free, size = int(np.sum(found.free)), len(found.free)
-    lost, used = undetermined_landmarks(found)
-    return {
-        "keyframes": found.keyframes,
-        "free": free,
-        "held": size - free,
-        "eigenvalues": [float(value) for value in np.asarray(found.whole.values[0])[:free]],
-        "weak": [str(direction) for direction in weak_directions(found)],
-        "weak_without": {kind: [str(direction) for direction in weak_directions(found, kind)] for kind in found.terms},
-        "least_known": [direction.to_dict() for direction in least_known(found)],
-        "pure_rotation": [list(pair) for pair in rotation_pairs(found)],
-        "inverse_depths": used,
-        "inverse_depths_undetermined": lost,
-        "lost_without": lost_shares(found),
-    }
 
 
 def lost_shares(found: Observability) -> dict[str, dict[str, float]]:
@@ -393,12 +388,9 @@ def _table(found: Observability) -> list[str]:
     ]
     for name, shares in lost_shares(found).items():
         if name in listed:
-            lines.append(f"{name:{width}}  {along[name]:9.2e}   {'':12} {_cells(shares)}")
+            cells = "  ".join(f"{share:{max(len(kind), 7)}.0%}" for kind, share in shares.items())
+            lines.append(f"{name:{width}}  {along[name]:9.2e}   {'':12} {cells}")
     return lines
-
-
-def _cells(shares: dict[str, float]) -> str:
-    return "  ".join(f"{share:{max(len(kind), 7)}.0%}" for kind, share in shares.items())
 
 
 def _spell(weak: list[WeakDirection], found: Observability) -> str:
@@ -415,24 +407,9 @@ def _spell(weak: list[WeakDirection], found: Observability) -> str:
     return "; ".join([*(str(direction) for direction in weak[:SHOWN]), *more])
 
 
-def _counts(weak: list[WeakDirection]) -> tuple[int, int]:
-    return len(weak), sum(direction.determined for direction in weak)
-
-
 def _more_unknown(weak: list[WeakDirection], found: Observability) -> bool:
     """Return whether all computed directions are weak and not all were computed."""
     return len(weak) == found.whole.values.shape[-1] < int(np.sum(found.free))
-
-
-def _complement(vector: np.ndarray) -> np.ndarray:
-    """Return orthonormal columns that span the complement of a unit vector."""
-    return np.linalg.svd(vector[None])[2][1:].T
-
-
-def _index_of(found: Observability, kind: str) -> int:
-    if kind not in found.terms:
-        raise ValueError(f"`without` must be one of {', '.join(found.terms)}, or None, got {kind!r}")
-    return found.terms.index(kind)
 
 
 def undetermined_below(size: int, dtype: np.dtype) -> float:

@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from jaxtyping import Float
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
-from vggtgeo.solvers.arrow import Blocks
+from vggtgeo.solvers.assembly import Blocks
 from vggtgeo.solvers.block_sparse import SparseLayout
 
 SHIFT = 1e-9

@@ -1,4 +1,4 @@
-"""The terms of the energy, one a file: a residual of ONE observation, its data, its weights, its robust kernel.
+"""The terms of the energy: a residual of ONE observation, its data, its weights, its robust kernel.
 
 | kind, by its unknowns | residual | terms of the package |
 |---|---|---|

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle.terms.term import (
     AbstractTerm,
-    Local,
     check_residual,
     local_model,
     reweighted_model,
@@ -38,7 +37,58 @@ def _indices(given: Any) -> Array:
     return jnp.asarray(given, jnp.int32)
 
 
-class PoseTerm(AbstractTerm):
+class NodeTerm(AbstractTerm):
+    """Observations of one or two poses: `weight` and data have the axis `[m]`.
+
+    Local coordinates of an observation: the tangents of its poses, then the parameters of the camera if its residual
+    depends on it.
+    """
+
+    needs_camera: ClassVar[bool] = False
+    """Whether the camera of the (first) keyframe is the last argument of `residual`."""
+
+    @abc.abstractmethod
+    def touched(self) -> tuple[_Index, ...]:
+        """Return the keyframes of each observation."""
+
+    def local_size(self, cameras: Cameras) -> int:
+        """Number of local coordinates."""
+        return lie.TANGENT * len(self.touched()) + (cameras.size if self.needs_camera else 0)
+
+    def value(
+        self,
+        data: dict,
+        touched: tuple[Array, ...],
+        poses: Float[Array, "n 7"],
+        cameras: Cameras,
+        step: Float[Array, " d"] | None = None,
+    ) -> Array:
+        """Return the residual of one observation, after a step of its local coordinates.
+
+        step: zero in value, to differentiate by; None: without derivatives.
+        """
+        known, end = [jaxlie.SE3(poses[index]) for index in touched], lie.TANGENT * len(touched)
+        if step is not None:
+            # The step is zero in value, so this cheaper form has the derivatives of `move`.
+            tangents = step[:end].reshape(-1, lie.TANGENT)
+            known = [lie.move_at_zero(pose, tangent) for pose, tangent in zip(known, tangents, strict=True)]
+        camera = [cameras.of(touched[0], None if step is None else step[end:])] if self.needs_camera else []
+        one: Any = self.holding(data)
+        return check_residual(self, one.residual(*known, *camera))
+
+    def derivatives(
+        self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
+    ) -> ValueAndJacobian:
+        """Return the residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
+        residual = lambda step: self.value(data, touched, poses, cameras, step)
+        zero = jnp.zeros(self.local_size(cameras), poses.dtype)
+        return residual(zero), jax.jacfwd(residual)(zero)
+
+    def observation_shape(self) -> tuple[int, ...]:
+        return self.touched()[0].shape
+
+
+class PoseTerm(NodeTerm):
     """Observations of single poses and their camera: `weight` and data have the axis `[m]`; a scalar weight is for all.
 
     Fields:
@@ -60,46 +110,17 @@ class PoseTerm(AbstractTerm):
     keyframe: _Index = eqx.field(converter=_indices, kw_only=True)
 
     structure = frozenset({"weight", "kernel", "keyframe"})
+    needs_camera = True
 
     @abc.abstractmethod
     def residual(self, pose: jaxlie.SE3, camera: AbstractCamera) -> Float[Array, "*m"]:
         """Return the residual of one observation; `pose` is world -> camera, `camera` that of the keyframe."""
 
-    def local(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Local:
-        """Return the residual of one observation as a function of `(xi, parameters of the keyframe's camera)`."""
-
-        def function(step: Array) -> Array:
-            # The step is zero in value, so this cheaper form has the derivatives of `move`.
-            pose = lie.move_at_zero(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
-            camera = cameras.of(touched[0], step[lie.TANGENT :])
-            return check_residual(self, self.holding(data).residual(pose, camera))
-
-        return function
-
-    def value(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Array:
-        """Return the residual of one observation."""
-        pose = jaxlie.SE3(poses[touched[0]])
-        return check_residual(self, self.holding(data).residual(pose, cameras.of(touched[0])))
-
-    def derivatives(
-        self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
-    ) -> ValueAndJacobian:
-        """Return the residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
-        return _differentiated(self, data, touched, poses, cameras)
-
     def touched(self) -> tuple[_Index, ...]:
-        """Return the keyframes of each observation."""
         return (self.keyframe,)
 
-    def observation_shape(self) -> tuple[int, ...]:
-        return self.keyframe.shape
 
-    def local_size(self, cameras: Cameras) -> int:
-        """Number of local coordinates."""
-        return lie.TANGENT + cameras.size
-
-
-class PairTerm(AbstractTerm):
+class PairTerm(NodeTerm):
     """Observations of two poses: `weight` and data have the axis `[m]`; a scalar weight is for all.
 
     Fields:
@@ -128,40 +149,8 @@ class PairTerm(AbstractTerm):
     def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, "*m"]:
         """Return the residual of one observation; poses are world -> camera: `second @ first.inverse()` is i to j."""
 
-    def local(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Local:
-        """Return the residual of one observation as a function of `(xi_i, xi_j)`."""
-
-        def function(step: Array) -> Array:
-            first = lie.move_at_zero(jaxlie.SE3(poses[touched[0]]), step[: lie.TANGENT])
-            second = lie.move_at_zero(jaxlie.SE3(poses[touched[1]]), step[lie.TANGENT :])
-            return check_residual(self, self.holding(data).residual(first, second))
-
-        return function
-
-    def value(self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras) -> Array:
-        """Return the residual of one observation."""
-        first, second = (jaxlie.SE3(poses[index]) for index in touched)
-        return check_residual(self, self.holding(data).residual(first, second))
-
-    def derivatives(
-        self, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
-    ) -> ValueAndJacobian:
-        """Return the residual of one observation and its derivatives by its local coordinates, `[k, d]`."""
-        return _differentiated(self, data, touched, poses, cameras)
-
     def touched(self) -> tuple[_Index, ...]:
-        """Return the keyframes of each observation."""
         return self.first, self.second
-
-    def observation_shape(self) -> tuple[int, ...]:
-        return self.first.shape
-
-    def local_size(self, cameras: Cameras) -> int:
-        """Number of local coordinates."""
-        return 2 * lie.TANGENT
-
-
-NodeTerm = PoseTerm | PairTerm
 
 
 class CameraTerm(AbstractTerm):
@@ -272,17 +261,9 @@ def node_models(
 
     def one(data: dict, weight: Array, touched: tuple[Array, ...]) -> tuple[Array, Array]:
         if exact:
-            residual = term.local(data, touched, poses, cameras)
+            residual = lambda step: term.value(data, touched, poses, cameras, step)
             return local_model(term, weight, residual, term.local_size(cameras), None, exact=True)
         value, jacobian = term.derivatives(data, touched, poses, cameras)
         return reweighted_model(term, weight, value, jacobian, correction)
 
     return jax.vmap(one)(term.data(), term.weights, term.touched())
-
-
-def _differentiated(
-    term: NodeTerm, data: dict, touched: tuple[Array, ...], poses: Float[Array, "n 7"], cameras: Cameras
-) -> ValueAndJacobian:
-    residual = term.local(data, touched, poses, cameras)
-    zero = jnp.zeros(term.local_size(cameras), poses.dtype)
-    return residual(zero), jax.jacfwd(residual)(zero)

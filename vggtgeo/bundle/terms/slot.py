@@ -45,16 +45,13 @@ class SlotTerm(AbstractTerm):
         ones = jnp.ones_like(inverse_depth)
         if exact:
             # Each gradient depends on its own depth only, so one product with ones is the whole diagonal.
-            return jax.jvp(self._gradient, (inverse_depth,), (ones,))
+            return jax.jvp(self.gradient, (inverse_depth,), (ones,))
         residual, slope = jax.jvp(self.residuals, (inverse_depth,), (ones,))
         rows, pull = reweighted_rows(self.kernel, self.weights, residual, slope[None], correction)
         return jnp.sum(rows[0] * pull, 0), jnp.sum(rows[0] * rows[0], 0)
 
     def gradient(self, inverse_depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
         """Return the first derivative of the energy, differentiable once more."""
-        return self._gradient(inverse_depth)
-
-    def _gradient(self, inverse_depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
         residual, slope = jax.jvp(self.residuals, (inverse_depth,), (jnp.ones_like(inverse_depth),))
         pull = self.weights * self.kernel.weight(self.weights * jnp.sum(residual**2, 0))
         return pull * jnp.sum(residual * slope, 0)

@@ -16,9 +16,9 @@ from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.image import PointTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import PairTerm
-from vggtgeo.bundle.terms.point import PointTerm
 from vggtgeo.geometry import lie, rigid
 
 TINY = float(np.finfo(np.float64).tiny)

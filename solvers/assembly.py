@@ -1,0 +1,232 @@
+"""Assembly of the dense part of an arrow system and of its Schur complement, in node and shared coordinates.
+
+The blocks of the nodes are stored by a layout: dense, a band, the diagonal, or sparse.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, Int
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    NodeFactors,
+    inverse_landmark_hessian,
+    padded_transports,
+    seen_by_factors,
+    seen_by_hosts,
+    sum_corners,
+)
+from vggtgeo.solvers.triples import TripleLandmarks, restricted_parts, split_triples
+
+
+class AbstractLayout(eqx.Module):
+    """Storage of the blocks of a matrix over the nodes; each subclass is one format."""
+
+    @abc.abstractmethod
+    def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
+        """Return a storage of zeros."""
+
+    @abc.abstractmethod
+    def add(
+        self, stored: Array, row: Int[Array, "*t"], column: Int[Array, "*t"], value: Float[Array, "*t b b"]
+    ) -> Array:
+        """Add blocks at `(row, column)`; a node index equal to the number of nodes means no block."""
+
+
+class DenseLayout(AbstractLayout):
+    """All blocks, `[n + 1, n + 1, b, b]`; the last row and column collect blocks of missing nodes."""
+
+    def empty(self, nodes: int, block: int, dtype: DTypeLike) -> Array:
+        return jnp.zeros((nodes + 1, nodes + 1, block, block), dtype)
+
+    def add(
+        self, stored: Array, row: Int[Array, "*t"], column: Int[Array, "*t"], value: Float[Array, "*t b b"]
+    ) -> Array:
+        return stored.at[row, column].add(value)
+
+
+class Blocks(eqx.Module):
+    """A symmetric matrix over nodes and shared coordinates, with a gradient as its last shared coordinate."""
+
+    nodes: Array
+    """In the storage of the layout."""
+    border: Float[Array, "n b o"]
+    """`o = q + 1`."""
+    corner: Float[Array, "o o"]
+
+
+class Reduced(eqx.Module):
+    """The dense part of an `ArrowSystem` and its undamped Schur complement."""
+
+    hessian: Float[Array, "c c"]
+    gradient: Float[Array, " c"]
+    schur: Float[Array, "c c"]
+    """`W V^-1 W'`."""
+    schur_gradient: Float[Array, " c"]
+    """`W V^-1 h`."""
+
+
+def dense_schur_complement(system: ArrowSystem) -> Reduced:
+    """Assemble the dense Hessian and the undamped Schur complement in node coordinates.
+
+    Cost: one product of `[r, s]` with its transpose a row, the rest is small matrices.
+    """
+    schur, schur_gradient = _dense(assemble_hosts(system, schur_products_of_hosts(system), DenseLayout()))
+    hessian, gradient = _dense(assemble_edges(system, DenseLayout()))
+    # The prior is on the last dense coordinates.
+    outside = len(gradient) - len(system.prior_hessian)
+    return Reduced(
+        hessian=hessian + jnp.pad(system.prior_hessian, (outside, 0)),
+        gradient=gradient + system.prior_gradient,
+        schur=schur,
+        schur_gradient=schur_gradient,
+    )
+
+
+def schur_products_of_hosts(system: ArrowSystem) -> Float[Array, "h t t"]:
+    """Return `C V^-1 C'` of each row in relative coordinates; `t = b k + p + 1`, the gradient comes last."""
+    inverse = inverse_landmark_hessian(system)
+    # A loop over rows is twice as fast on a CPU as one batched product (the scaled rows stay in the cache).
+    if system.triples is None:
+        product = lambda host: (host[0] * host[1]) @ host[0].T
+        products = jax.lax.map(product, (system.cross, inverse))
+    else:
+        products = jax.lax.map(_product_of_parts, (_each_part(system.cross), inverse, system.triples))
+    # The last row of `cross`, the curvature of the landmarks, is not a coordinate.
+    return products[:, :-1, :-1]
+
+
+def _each_part(cross: Float[Array, "h r s"]) -> tuple[Array, Array, Array, Array]:
+    """Return the same array four times: otherwise XLA copies a whole row before slicing its parts."""
+    four: tuple[Array, Array, Array, Array] = jax.lax.optimization_barrier((cross, cross, cross, cross))
+    return four
+
+
+def _product_of_parts(host: tuple[tuple[Array, ...], Array, TripleLandmarks]) -> Float[Array, "r r"]:
+    """Return `C V^-1 C'` of one row whose cross terms are by the unknowns of triples."""
+    cross, inverse, known = host
+    count = known.ratio_u.shape[-1]
+    u, v, d, others = (split_triples(whole, count)[k] for k, whole in enumerate(cross))
+    # The barrier keeps XLA from forming the parts again in both factors of each product.
+    parts = jax.lax.optimization_barrier(restricted_parts(known, (u, v, d, others)))
+    scaled = [part * factor for part, factor in zip(parts, split_triples(inverse, count), strict=True)]
+    return sum(left @ right.T for left, right in zip(scaled, parts, strict=True))
+
+
+def assemble(system: ArrowSystem, layout: AbstractLayout) -> tuple[Blocks, Blocks]:
+    """Return `H` with its priors (those on the nodes as in `add_prior_blocks`), and `W V^-1 W'`."""
+    hessian = add_prior_blocks(assemble_edges(system, layout), system, layout)
+    return hessian, assemble_hosts(system, schur_products_of_hosts(system), layout)
+
+
+def assemble_hosts(system: ArrowSystem, products: Float[Array, "h t t"], layout: AbstractLayout) -> Blocks:
+    """Transform each row's matrix from relative to node and shared coordinates, and sum over rows."""
+    hosts, degree = system.graph.of_host.shape
+    nodes, block = system.num_nodes, system.block
+    wide = degree * block
+    transports = padded_transports(system).reshape(hosts, wide, block)
+    # By the chain rule with `d eta / d x_i = -A` of each edge.
+    own = -jnp.einsum("nrw,nwb->nrb", products[:, :, :wide], transports)
+    corner = -jnp.einsum("nwa,nwb->nab", transports, own[:, :wide])
+    # Local order: neighbours (k blocks), the host itself, then shared coordinates and the gradient.
+    to_neighbour = jnp.swapaxes(own[:, :wide], 1, 2)
+    top = jnp.concatenate([products[:, :wide, :wide], own[:, :wide]], 2)
+    bottom = jnp.concatenate([to_neighbour, corner], 2)
+    local = jnp.concatenate([top, bottom], 1).reshape(hosts, degree + 1, block, degree + 1, block)
+    index = system.around()
+    rows, columns = jnp.broadcast_arrays(index[:, :, None], index[:, None, :])
+    blocks = layout.empty(nodes, block, products.dtype)
+    blocks = layout.add(blocks, rows, columns, local.transpose(0, 1, 3, 2, 4))
+    border = jnp.concatenate([products[:, wide:, :wide], own[:, wide:]], 2)
+    border = border.reshape(hosts, -1, degree + 1, block).transpose(0, 2, 3, 1)
+    seen = seen_by_hosts(system)
+    borders = _add_border(jnp.zeros((nodes + 1, block, system.shared + 1), products.dtype), index, border, seen)[:-1]
+    return Blocks(blocks, borders, sum_corners(system, products[:, wide:, wide:], seen))
+
+
+def _add_border(
+    stored: Float[Array, "m b o"],
+    node: Int[Array, "t *d"],
+    value: Float[Array, "t *d b l"],
+    seen: Int[Array, "t p"] | None,
+) -> Float[Array, "m b o"]:
+    """Add rows of nodes over their shared coordinates and the gradient (`l = p + 1`) to all shared coordinates."""
+    if seen is None:
+        return stored.at[node].add(value)
+    block, shared = stored.shape[1], stored.shape[2] - 1
+    columns = jnp.pad(seen, ((0, 0), (0, 1)), constant_values=shared)
+    columns = columns.reshape(len(columns), *(1,) * node.ndim, -1)
+    return stored.at[node[..., None, None], jnp.arange(block)[:, None], columns].add(value)
+
+
+def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
+    """Return Hessian and gradient of all edges in node and shared coordinates."""
+    hosts, block = system.num_nodes, system.block
+    source, target = system.graph.source, system.graph.target
+    eta, border = system.gram[:, :block, :block], system.gram[:, :block, block:]
+    own = jnp.einsum("eba,ebc,ecd->ead", system.source_adjoint, eta, system.source_adjoint)
+    # The curvature of `eta` is a product of `x_j` and `x_i`, so the blocks on the diagonal do not have it.
+    mixed = -jnp.einsum("eab,ebc->eac", eta + system.lie_curvature, system.source_adjoint)
+    blocks = layout.empty(hosts, block, eta.dtype)
+    # Both triangles; a layout that stores one of them drops the other.
+    blocks = layout.add(layout.add(blocks, target, target, eta), source, source, own)
+    blocks = layout.add(blocks, target, source, mixed)
+    blocks = layout.add(blocks, source, target, jnp.swapaxes(mixed, 1, 2))
+    seen = system.graph.seen(system.graph.ends(), system.seen)
+    borders = _add_border(jnp.zeros((hosts, block, system.shared + 1), eta.dtype), target, border, seen)
+    at_source = -jnp.einsum("eba,ebc->eac", system.source_adjoint, border)
+    borders = _add_border(borders, source, at_source, seen)
+    whole = Blocks(blocks, borders, sum_corners(system, system.gram[:, block:, block:], seen))
+    return whole if system.factors is None else _add_factors(system, whole, system.factors, layout)
+
+
+def _add_factors(system: ArrowSystem, whole: Blocks, factors: NodeFactors, layout: AbstractLayout) -> Blocks:
+    hosts, block = whole.border.shape[:2]
+    first, second = factors.first, factors.second
+    cut = lambda a, b: factors.hessian[:, a * block : (a + 1) * block, b * block : (b + 1) * block]
+    nodes = whole.nodes
+    for row, column, value in (
+        *((first, first, cut(0, 0)), (second, second, cut(1, 1))),
+        *((first, second, cut(0, 1)), (second, first, cut(1, 0))),
+    ):
+        # A block with a missing second node must not be added to the first node's row either.
+        absent = (row == hosts) | (column == hosts)
+        nodes = layout.add(nodes, jnp.where(absent, hosts, row), jnp.where(absent, hosts, column), value)
+    tail = jnp.concatenate([factors.hessian[:, :, 2 * block :], factors.gradient[..., None]], 2)
+    borders = jnp.concatenate([whole.border, jnp.zeros_like(whole.border[:1])])
+    seen = seen_by_factors(system, factors)
+    borders = _add_border(borders, first, tail[:, :block], seen)
+    borders = _add_border(borders, second, tail[:, block : 2 * block], seen)[:-1]
+    own = jnp.pad(tail[:, 2 * block :], ((0, 0), (0, 1), (0, 0)))
+    own = sum_corners(system, own, seen)[:-1]
+    corner = whole.corner.at[:-1].add(own).at[-1, :-1].add(own[:, -1])
+    return Blocks(nodes, borders, corner)
+
+
+def add_prior_blocks(blocks: Blocks, system: ArrowSystem, layout: AbstractLayout) -> Blocks:
+    """Return the blocks plus the prior on the shared coordinates, and on the nodes if it couples them."""
+    hosts, block = blocks.border.shape[:2]
+    shared, prior = blocks.corner.shape[0] - 1, system.prior_hessian
+    corner = blocks.corner.at[:shared, :shared].add(prior[-shared:, -shared:])
+    nodes = blocks.nodes
+    if len(prior) > shared:
+        # Its diagonal blocks only: the whole prior would fill any sparse layout, and a preconditioner may approximate.
+        square = prior[: hosts * block, : hosts * block].reshape(hosts, block, hosts, block)
+        every = jnp.arange(hosts)
+        nodes = layout.add(nodes, every, every, square[every, :, every])
+    return Blocks(nodes, blocks.border, corner)
+
+
+def _dense(blocks: Blocks) -> tuple[Float[Array, "c c"], Float[Array, " c"]]:
+    """Convert dense blocks to one matrix; the last shared coordinate is the gradient, returned separately."""
+    inner = blocks.nodes[:-1, :-1]
+    nodes = inner.shape[0] * inner.shape[2]
+    square = inner.transpose(0, 2, 1, 3).reshape(nodes, nodes)
+    border = blocks.border.reshape(nodes, -1)
+    whole = jnp.block([[square, border], [border.T, blocks.corner]])
+    return whole[:-1, :-1], whole[:-1, -1]
