@@ -45,7 +45,7 @@ RADIAL = 0.3
 MIN_WARP = 0.5
 """Largest displacement by the lens, pixels, for which it is removed: the noise of a match."""
 FIRST_WARP, PROBE = 1.0, 0.02
-"""Displacements of a corner, pixels, by either coefficient: of the adjustments for second derivatives, and of the finite
+"""Displacements of a corner by a coefficient, pixels: of the adjustments for second derivatives, and of the finite
 differences for first ones."""
 MAX_STEP = 10.0
 """Displacement of a corner by a step, pixels."""
@@ -89,7 +89,10 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
     bent = _Undistorted.of(problem, state, size)
     warp, found, gradient = np.zeros(2), state, bent.gradient(np.zeros(2), state)
     first = DIRECTIONS * FIRST_WARP
-    changes = [bent.gradient(warp, solve(bent.at(warp), state)) - gradient for warp in first]
+    probes = [solve(bent.at(warp), state) for warp in first]
+    if not all(_is_camera(pinhole_of(problem, probe)) for probe in probes):
+        return None
+    changes = [bent.gradient(warp, probe) - gradient for warp, probe in zip(first, probes, strict=True)]
     hessian = np.linalg.solve(first, np.array(changes))
     hessian, largest = (hessian + hessian.T) / 2, MAX_STEP
     if not np.isfinite(hessian).all():
@@ -154,7 +157,9 @@ class _Undistorted:
         camera, count = pinhole_of(problem, state), problem.points.weight.shape[1]
         poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
         host, target = np.asarray(problem.edges.source), np.asarray(problem.edges.target)
-        pixels, inverse = (np.asarray(values, np.float64)[:, count:] for values in (problem.pixels, state.inverse_depth))
+        pixels, inverse = (
+            np.asarray(values, np.float64)[:, count:] for values in (problem.pixels, state.inverse_depth)
+        )
         lines, _ = carried(pixels[host], inverse[host], poses[target] @ rigid.invert(poses[host]), camera)
         inside = np.all((lines > 0) & (lines < size[::-1]), -1, keepdims=True)
         return cls(problem, camera, size, np.where(inside, lines, camera[2:]))
@@ -199,7 +204,8 @@ class _Undistorted:
     def gradient(self, warp: np.ndarray, state: State) -> np.ndarray:
         """Return the derivative of the energy at an adjusted map, float64 [2]."""
         steps = PROBE * np.eye(2)
-        return np.array([self.energy(warp + step, state) - self.energy(warp - step, state) for step in steps]) / (2 * PROBE)
+        changes = [self.energy(warp + step, state) - self.energy(warp - step, state) for step in steps]
+        return np.array(changes) / (2 * PROBE)
 
 
 def largest_shift(camera: Camera) -> float:
