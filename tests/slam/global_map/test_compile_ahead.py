@@ -96,6 +96,23 @@ def test_the_program_of_the_end_is_compiled_during_the_run(monkeypatch: pytest.M
     _check_asked(monkeypatch, compiled, metric, settings)
 
 
+def test_a_map_without_depth_is_adjusted_by_programs_compiled_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that no round of the last adjustment, nor its search for shutter and lens, needs another program. Oracle:
+    # structure and shapes of all that it solves.
+    compiled, slam = _compiled(monkeypatch), _with_or_without_depth(metric=False)
+    compile_before_runs(SETTINGS, 320, 240)
+    solve, asked = global_adjustment.solve_jit, []
+
+    def solved(*args: Any) -> Any:
+        asked.append(_program(*args))
+        return solve(*args)
+
+    monkeypatch.setattr(global_adjustment, "solve_jit", solved)
+    global_adjustment.adjust_all(slam, SETTINGS, uncertainty=False)
+    assert len(asked) > global_adjustment.ROUNDS + 3, "shutter, camera or lens were not searched"
+    assert set(asked) <= set(compiled)
+
+
 def test_the_command_takes_the_size_of_images(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that `vggtgeo warm-up` compiles for the default settings and the size that was asked for.
     asked: list[Any] = []
