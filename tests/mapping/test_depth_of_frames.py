@@ -13,9 +13,8 @@ from recorded_run import RecordedRun, recorded_run
 
 from vggtgeo.cli.run_sequence import _reopen
 from vggtgeo.datasets import open_sequence
-from vggtgeo.mapping.consistency import PosedDepth
 from vggtgeo.mapping.dense import dense_depths
-from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.depth_map import DepthMap, PosedDepth
 from vggtgeo.mapping.frame_depth import rendered_depth
 from vggtgeo.results.reread_frames import depth_of_frames
 from vggtgeo.slam.run import default_roles

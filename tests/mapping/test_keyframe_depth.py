@@ -46,7 +46,7 @@ def test_slots_correct_what_is_around_them() -> None:
     one = np.ones(count)
     slots = Slots(pixels, np.full(count, 1 / WALL), inverse, 0.05 * inverse, one, one, np.nan * one)
     error = lambda depth: np.sqrt(np.mean((depth - WALL) ** 2))
-    assert error(optimised_depth(keyframe(0, prior, slots))) < 0.5 * error(prior)
+    assert error(optimised_depth(keyframe(0, prior, slots), prior.astype(np.float32))) < 0.5 * error(prior)
     assert error(optimised_depth(keyframe(0, prior, slots), np.full(SIZE, 1.02 * WALL, np.float32))) < 0.01 * WALL
 
 

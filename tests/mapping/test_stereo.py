@@ -11,12 +11,11 @@ from posed_keyframes import keyframe_of, slots_of
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.mapping.consistency import PosedDepth, confirm
 from vggtgeo.mapping.dense import dense_depths
-from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.depth_map import DepthMap, PosedDepth, confirm
 from vggtgeo.mapping.plane_sweep import Photo, plane_homographies
 from vggtgeo.mapping.semi_global import EDGE, semi_global
-from vggtgeo.mapping.stereo import StereoSettings, stereo_depths
+from vggtgeo.mapping.stereo import stereo_depths
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 SIZE = (200, 150)
@@ -45,7 +44,7 @@ def room() -> tuple[list[Keyframe], list[np.ndarray], np.ndarray]:
 @cache
 def room_depths() -> list[DepthMap | None]:
     keyframes, _, intrinsics = room()
-    return stereo_depths(keyframes, intrinsics, StereoSettings(planes=64))
+    return stereo_depths(keyframes, intrinsics)
 
 
 def test_path_costs_follow_their_recursion() -> None:
