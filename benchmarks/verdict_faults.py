@@ -24,7 +24,7 @@ from vggtgeo.simulation.degradations import (
     wrong_focal,
     zooming,
 )
-from vggtgeo.simulation.depth_sensors import KINECT, STEREO
+from vggtgeo.simulation.sensor import KINECT, STEREO
 from vggtgeo.simulation.sequence import camera_of
 from vggtgeo.simulation.trajectories import HandheldMotion
 

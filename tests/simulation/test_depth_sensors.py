@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vggtgeo.simulation.depth_sensors import KINECT, NATIVE_WIDTH, STEREO, DisparitySensor
+from vggtgeo.simulation.sensor import KINECT, NATIVE_WIDTH, STEREO, DisparitySensor
 
 CLEAN = DisparitySensor(focal_baseline=40.0, noise=0.0, grain=0.0, step=0.0, window=0.0, far=100.0)
 

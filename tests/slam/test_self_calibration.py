@@ -138,13 +138,6 @@ def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
-def test_how_free_a_guess_is() -> None:
-    # Proves that the focal length of a guess is free, and that its principal point stays near the middle. Oracle: the
-    # settings' words.
-    sigma = begin(GUESS, ROLES).camera.sigma
-    assert sigma == pytest.approx([0.3 * GUESS.intrinsics[0]] * 2 + [0.02 * 320, 0.02 * 240])
-
-
 def test_windows_hold_a_found_camera() -> None:
     # Proves that a self-calibrated camera stays where it is while frames are tracked, and that a guess does not: a
     # focal length that is 10 % too long. Oracle: the number that it began with.

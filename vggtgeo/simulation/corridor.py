@@ -7,8 +7,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.simulation.furniture import DARK, METAL, WHITE, Place, hang, lamp_panel, table, wall
-from vggtgeo.simulation.room import floor_and_ceiling
+from vggtgeo.simulation.furniture import (
+    DARK,
+    METAL,
+    WHITE,
+    Place,
+    floor_and_ceiling,
+    hang,
+    lamp_panel,
+    skirting,
+    table,
+    wall,
+)
 from vggtgeo.simulation.scene import Scene, finish
 from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
 from vggtgeo.simulation.trajectories import Walk
@@ -73,8 +83,7 @@ def build_corridor(seed: int) -> Scene:
 def _plain_wall(b: SceneBuilder, start: Vector, end: Vector, doors: bool = True) -> None:
     """Add white paint, a skirting, and the same grey door with its sign every 3.2 m."""
     wall(b, start, end, _HEIGHT, WHITE, edges=True)
-    length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-    hang(b, start, end, 0.5 * length, 0.0, (length, 0.10), _GREY, 0.012, _GREY)
+    length = skirting(b, start, end, 0.10, 0.012, _GREY)
     if not doors:
         return
     for along in np.arange(1.6, length - 0.7, 3.2):

@@ -1,10 +1,12 @@
-"""Pieces of furniture, built of boxes and cylinders at a place and a heading.
+"""What rooms are made of: floors, walls, and furniture built of boxes and cylinders at a place and a heading.
 
 `at` is (x, y) or (x, y, z) of the middle of the piece on the floor; `yaw` turns it about the vertical; its front is
-local -y. All sizes in metres.
+local -y. Walls are listed clockwise seen from above, so that they face inwards. All sizes in metres, z up.
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +17,8 @@ WOOD = Look("wood", 1.1)
 METAL = Look("metal", 0.9, tint=(0.55, 0.55, 0.56))
 DARK = Look("fabric", 0.8, tint=(0.05, 0.05, 0.06))
 WHITE = Look("white", 1.0, detail=0.015)
+PLASTER = Look("plaster", 2.3, detail=0.055)
+BRICK = Look("brick", 1.7)
 
 
 class Place:
@@ -29,12 +33,41 @@ class Place:
         return self.at + self.turn @ np.array([x, y, z])
 
 
+def floor_and_ceiling(b: SceneBuilder, low: Vector, high: Vector, height: float, floor: Look, ceiling: Look) -> None:
+    """Add floor at z = 0 facing up, ceiling at `height` facing down, over the rectangle low .. high (x, y)."""
+    dx, dy = high[0] - low[0], high[1] - low[1]
+    b.rectangle((*low, 0.0), (dx, 0, 0), (0, dy, 0), floor)
+    b.rectangle((low[0], high[1], height), (dx, 0, 0), (0, -dy, 0), ceiling)
+
+
 def wall(
     b: SceneBuilder, start: Vector, end: Vector, height: float, look: Look, base: float = 0.0, edges: bool = True
 ) -> None:
     """Add a wall from `start` to `end` (x, y); it faces the right-hand side of that way."""
     (x0, y0), (x1, y1) = start, end
     b.rectangle((x0, y0, base), (x1 - x0, y1 - y0, 0), (0, 0, height), look, edges=edges)
+
+
+def sides_of(size: tuple[float, float]) -> list[tuple[Vector, Vector]]:
+    """Return start and end of the four walls of a room from (0, 0) to `size`: west, north, east, south."""
+    sx, sy = size
+    corners = [(0.0, 0.0), (0.0, sy), (sx, sy), (sx, 0.0), (0.0, 0.0)]
+    return list(pairwise(corners))
+
+
+def skirting(
+    b: SceneBuilder,
+    start: Vector,
+    end: Vector,
+    height: float,
+    depth: float,
+    look: Look = DARK,
+    base: float = 0.0,
+) -> float:
+    """Add a skirting board along a wall; return the length of the wall."""
+    length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
+    hang(b, start, end, 0.5 * length, base, (length, height), look, depth, look)
+    return length
 
 
 def hang(

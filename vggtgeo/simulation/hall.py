@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from vggtgeo.simulation.furniture import (
+    BRICK,
     DARK,
     METAL,
     WOOD,
     beam,
     bench,
+    floor_and_ceiling,
     hang,
     kiosk,
     lamp_panel,
     plant,
     railing,
+    sides_of,
+    skirting,
     sofa,
     wall,
 )
-from vggtgeo.simulation.room import BRICK, floor_and_ceiling
 from vggtgeo.simulation.scene import Scene, finish
 from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
 from vggtgeo.simulation.trajectories import Walk
@@ -56,19 +57,15 @@ HALL_WALK = Walk(
 def build_hall(seed: int) -> Scene:
     """Build two rows of columns, a gallery on the north side, windows high up, and islands of seats and kiosks."""
     b = SceneBuilder(seed)
-    sx, sy = _SIZE
     floor_and_ceiling(b, (0, 0), _SIZE, _HEIGHT, Look("terrazzo", 2.4, detail=0.07), Look("metal", 2.5, detail=0.06))
-    corners = [(0.0, 0.0), (0.0, sy), (sx, sy), (sx, 0.0), (0.0, 0.0)]
-    for side, (start, end) in enumerate(pairwise(corners)):
+    for side, (start, end) in enumerate(sides_of(_SIZE)):
         wall(b, start, end, _HEIGHT, BRICK if side == 2 else _CONCRETE)
-        length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-        hang(b, start, end, 0.5 * length, 0.0, (length, 0.15), DARK, 0.02)
-        _dress(b, start, end, length, side)
+        _dress(b, start, end, skirting(b, start, end, 0.15, 0.02), side)
     for x in np.arange(6.0, 31.0, 6.0):
         for y in (7.6, 16.6):
             b.cylinder((x, y, 0), 0.38, _HEIGHT, _CONCRETE)
             b.cylinder((x, y, 0), 0.50, 0.35, Look("terrazzo", 1.2))
-        beam(b, (x, 0, 7.5), (x, sy, 7.5), (0.35, 0.6), METAL)
+        beam(b, (x, 0, 7.5), (x, _SIZE[1], 7.5), (0.35, 0.6), METAL)
     _gallery(b)
     _islands(b)
     for x in np.arange(3.0, 36.0, 6.0):

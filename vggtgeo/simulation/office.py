@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from vggtgeo.simulation.furniture import (
+    BRICK,
     DARK,
+    PLASTER,
     Place,
     cabinet,
     chair,
     desk,
+    floor_and_ceiling,
     hang,
     lamp_panel,
     plant,
     shelf,
+    sides_of,
+    skirting,
     sofa,
     table,
     wall,
 )
-from vggtgeo.simulation.room import BRICK, PLASTER, floor_and_ceiling
 from vggtgeo.simulation.scene import Scene, finish
 from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
 from vggtgeo.simulation.trajectories import Walk
@@ -59,14 +61,10 @@ def build_office(seed: int) -> Scene:
     """Build four islands of four desks, lined by shelves, boards, doors and windows."""
     b = SceneBuilder(seed)
     floor_and_ceiling(b, (0, 0), _SIZE, _HEIGHT, Look("carpet", 1.3), Look("ceiling", 1.2, detail=0.05))
-    sx, sy = _SIZE
-    corners = [(0.0, 0.0), (0.0, sy), (sx, sy), (sx, 0.0), (0.0, 0.0)]
     looks = (BRICK, PLASTER, PLASTER.tinted(0.86, 0.93, 1.0), PLASTER.tinted(1.0, 0.95, 0.85))
-    for side, (start, end) in enumerate(pairwise(corners)):
+    for side, (start, end) in enumerate(sides_of(_SIZE)):
         wall(b, start, end, _HEIGHT, looks[side])
-        length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-        hang(b, start, end, 0.5 * length, 0.0, (length, 0.10), DARK, 0.015)
-        _dress(b, start, end, length, side)
+        _dress(b, start, end, skirting(b, start, end, 0.10, 0.015), side)
     variant = 0
     for x in (4.5, 11.5):
         for y in (3.4, 7.7):

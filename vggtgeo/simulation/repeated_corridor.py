@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.simulation.furniture import hang, lamp_panel, wall
-from vggtgeo.simulation.room import floor_and_ceiling
+from vggtgeo.simulation.furniture import floor_and_ceiling, hang, lamp_panel, wall
 from vggtgeo.simulation.scene import Scene, finish
 from vggtgeo.simulation.sensor import Sensor
 from vggtgeo.simulation.sequence import SyntheticSequence, camera_of

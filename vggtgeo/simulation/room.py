@@ -1,33 +1,29 @@
-"""The built-in `room`, and what all rooms are made of.
-
-A builder makes a scene from a seed alone. Walls are listed clockwise seen from above, so that they face
-inwards. Metres, z up.
-"""
+"""The built-in `room`: 6 x 5 x 3 m, furnished."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 
 from vggtgeo.simulation.furniture import (
+    BRICK,
+    PLASTER,
     cabinet,
     chair,
     desk,
+    floor_and_ceiling,
     hang,
     lamp_panel,
     plant,
     shelf,
+    sides_of,
+    skirting,
     sofa,
     table,
     wall,
-)  # fmt: skip
+)
 from vggtgeo.simulation.scene import Scene, finish
-from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
+from vggtgeo.simulation.shapes import Look, SceneBuilder
 from vggtgeo.simulation.trajectories import Walk
-
-PLASTER = Look("plaster", 2.3, detail=0.055)
-BRICK = Look("brick", 1.7)
 
 ROOM_WALK = Walk(
     way=np.array(
@@ -55,27 +51,18 @@ ROOM_WALK = Walk(
 )
 
 
-def floor_and_ceiling(b: SceneBuilder, low: Vector, high: Vector, height: float, floor: Look, ceiling: Look) -> None:
-    """Add floor at z = 0 facing up, ceiling at `height` facing down, over the rectangle low .. high (x, y)."""
-    dx, dy = high[0] - low[0], high[1] - low[1]
-    b.rectangle((*low, 0.0), (dx, 0, 0), (0, dy, 0), floor)
-    b.rectangle((low[0], high[1], height), (dx, 0, 0), (0, -dy, 0), ceiling)
-
-
 def build_room(seed: int) -> Scene:
     """Return a living room of 6 x 5 x 3 m with a desk corner."""
     b = SceneBuilder(seed)
-    sx, sy, height = 6.0, 5.0, 3.0
-    floor_and_ceiling(b, (0, 0), (sx, sy), height, Look("parquet", 1.9), Look("plaster", 2.9, detail=0.06))
-    corners = [(0.0, 0.0), (0.0, sy), (sx, sy), (sx, 0.0), (0.0, 0.0)]
-    west, north, east, south = list(pairwise(corners))
+    size, height = (6.0, 5.0), 3.0
+    floor_and_ceiling(b, (0, 0), size, height, Look("parquet", 1.9), Look("plaster", 2.9, detail=0.06))
+    west, north, east, south = sides_of(size)
     wall(b, *west, height, BRICK)
     wall(b, *north, height, Look("wallpaper", 2.1, detail=0.05))
     wall(b, *east, height, PLASTER.tinted(0.92, 0.97, 1.0))
     wall(b, *south, height, PLASTER.tinted(1.0, 0.96, 0.88))
     for start, end in (west, north, east, south):
-        length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-        hang(b, start, end, 0.5 * length, 0.0, (length, 0.09), Look("wood", 1.3), 0.02, Look("wood", 1.3))
+        skirting(b, start, end, 0.09, 0.02, Look("wood", 1.3))
     b.rectangle((1.6, 1.3, 0.008), (2.4, 0, 0), (0, 1.7, 0), Look("rug", 2.4, detail=0.2), edges=True)
 
     hang(b, *west, 1.25, 1.25, (0.9, 1.15), Look("painting:1", None))

@@ -21,7 +21,7 @@ UP = np.array([0.0, 0.0, 1.0])
 class Look:
     """What a surface looks like.
 
-    texture: name for `textures.paint_texture`. tile: metres of one repetition, None = stretched over the surface.
+    texture: name for `decals.paint_texture`. tile: metres of one repetition, None = stretched over the surface.
     tint: colour factor (linear). detail: relative amplitude of the fine structure on top. emission: 0 = lit by the
     lamps only, 1 = as bright as white under full light.
     """
@@ -85,7 +85,7 @@ class Blockers:
 
 @dataclass
 class SceneBuilder:
-    """Collects surfaces, edges, lights and panes; `scenes.finish` makes the immutable scene of them."""
+    """Collects surfaces, edges, lights and panes; `scene.finish` makes the immutable scene of them."""
 
     seed: int
     rows: list[tuple] = field(default_factory=list)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from distorted_sequence import Bent
+from distorted_sequence import Bent, bent
 from recorded_run import ROLES, SETTINGS, recorded_run
 from reported import raises
 from vggtgeo.models.classical import NoDepth, SiftMatcher
@@ -35,30 +36,23 @@ WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error
 _solve = eqx.filter_jit(vg.solve)
 
 
-def bent(window: vg.data.SimulatedWindow, *distortion: float) -> vg.data.SimulatedWindow:
-    """Its key points and matches as a lens draws them."""
-    lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *distortion, 0.0, 0.0]))
-    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
-    bend = jax.jit(jax.vmap(lambda pixel: lens.project(straight.unproject(pixel))))
-    curve = lambda pixels: np.asarray(bend(jnp.asarray(pixels)))
-    seen = window.observations
-    return replace(window, observations=replace(seen, point_target=curve(seen.point_target), pixel=curve(seen.pixel)))
+def packed(window: vg.data.SimulatedWindow, camera: vg.cameras.Intrinsics | None = None) -> tuple[Any, Any, Any]:
+    """The problem of the window with one focal length, by default the true one."""
+    f, _, cx, cy = window.intrinsics
+    given = camera or vg.cameras.Intrinsics(np.array([f, cx, cy]), shared_focal=True)
+    return vg.pack(window.observations, window.start, given, 1.0 / window.observations.depth_mean)
 
 
 def found_in(window: vg.data.SimulatedWindow, focal: float) -> FoundLens:
     """Adjusted as a pinhole that begins `focal` times too long, as a guess does, then sought."""
     _, _, cx, cy = window.intrinsics
     guess = np.array([focal * window.intrinsics[0], cx, cy])
-    packed = vg.pack(
-        window.observations,
-        window.start,
-        vg.cameras.Intrinsics(guess, shared_focal=True, prior_sigma=np.full(3, 0.3 * guess[0])),
-        1.0 / window.observations.depth_mean,
+    problem, state, _ = packed(
+        window, vg.cameras.Intrinsics(guess, shared_focal=True, prior_sigma=np.full(3, 0.3 * guess[0]))
     )
-    problem = packed[0]
     size = (round(2 * cy + 1), round(2 * cx + 1))
     solve = lambda problem, state: _solve(problem, state).state
-    found = find_lens(problem, solve(problem, packed[1]), size, solve)
+    found = find_lens(problem, solve(problem, state), size, solve)
     assert found is not None
     return found
 
@@ -90,11 +84,7 @@ def test_no_lens_is_found_where_there_is_none() -> None:
 
 def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
     # Proves that a focal length below zero, or NaN, as a solver may end with, does not end the run. Oracle: the rule.
-    window = vg.simulate_window(3, 12, 0)
-    _, _, cx, cy = window.intrinsics
-    square = vg.cameras.Intrinsics(np.array([window.intrinsics[0], cx, cy]), shared_focal=True)
-    guess = window.observations, window.start, square
-    problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean)
+    problem, state, _ = packed(vg.simulate_window(3, 12, 0))
     for focal in (-1.0, float("nan")):
         ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[0].set(f))
         assert find_lens(problem, state, (480, 640), ends_at) is None
@@ -102,15 +92,9 @@ def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
 
 def test_few_keyframes_tell_no_lens() -> None:
     # Proves that as many keyframes as the camera has parameters explain any lens, and so tell none. Oracle: the count.
-    packed = []
-    for keyframes in (5, 7):
-        window = vg.simulate_window(keyframes, 12, 0)
-        _, _, cx, cy = window.intrinsics
-        square = vg.cameras.Intrinsics(np.array([window.intrinsics[0], cx, cy]), shared_focal=True)
-        guess = window.observations, window.start, square
-        problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean)
-        packed.append(find_lens(problem, state, (480, 640), lambda _, state: state))
-    few, enough = packed
+    unmoved = lambda _, state: state
+    problems = [packed(vg.simulate_window(keyframes, 12, 0)) for keyframes in (5, 7)]
+    few, enough = (find_lens(problem, state, (480, 640), unmoved) for problem, state, _ in problems)
     assert few is not None
     assert enough is not None
     assert few.needed == float("inf")

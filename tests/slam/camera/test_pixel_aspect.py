@@ -8,10 +8,9 @@ from typing import Any
 
 import cv2
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from distorted_sequence import bent
 from recorded_run import SETTINGS, recorded_run
 
 import vggtgeo as vg
@@ -49,19 +48,6 @@ def rolling(seed: int) -> vg.data.SimulatedWindow:
     return replace(window, observations=seen, start=rigid.to_quaternion(turns @ start))
 
 
-def drawn(window: vg.data.SimulatedWindow, squeeze: float, *distortion: float) -> vg.data.SimulatedWindow:
-    """Its key points and matches as a lens draws them, in images of `squeeze` times the width."""
-    lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *(distortion or (0.0, 0.0)), 0.0, 0.0]))
-    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
-    bend = jax.jit(jax.vmap(lambda pixel: lens.project(straight.unproject(pixel))))
-    bent = lambda pixels: np.asarray(bend(jnp.asarray(pixels)))
-    resized = lambda pixels: (bent(pixels) + 0.5) * np.array([squeeze, 1.0]) - 0.5
-    seen = window.observations
-    return replace(
-        window, observations=replace(seen, point_target=resized(seen.point_target), pixel=resized(seen.pixel))
-    )
-
-
 def as_square(window: vg.data.SimulatedWindow, squeeze: float) -> tuple[Problem, State]:
     """Adjusted with one focal length, which begins as that of the images before they were squeezed."""
     f, _, cx, cy = window.intrinsics
@@ -86,7 +72,7 @@ def test_squeezed_images_have_two_focal_lengths() -> None:
     # Proves that both are found, of 16:9 shown as 4:3, and that they are seen to pay. Oracle: those that the window was
     # drawn with, resized.
     window, squeeze = rolling(1), 0.75
-    found = found_in(drawn(window, squeeze), squeeze)
+    found = found_in(bent(window, 0.0, 0.0, squeeze=squeeze), squeeze)
     assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.state.intrinsics}"
     assert found.stretch == pytest.approx(np.log(squeeze), abs=0.005)
     fx, fy, cx, _ = window.intrinsics
@@ -103,7 +89,7 @@ def test_square_pixels_stay_square() -> None:
 
 def test_a_level_path_tells_no_aspect() -> None:
     # Proves that a stretch that any stretch of the heights makes up for is not taken. Oracle: the gain of nothing.
-    squeezed = drawn(vg.simulate_window(seed=1, **WINDOW), 0.75)
+    squeezed = bent(vg.simulate_window(seed=1, **WINDOW), 0.0, 0.0, squeeze=0.75)
     assert not found_in(squeezed, 0.75).pays
 
 

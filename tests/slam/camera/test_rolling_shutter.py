@@ -19,13 +19,7 @@ from vggtgeo.simulation.small_window import SIZE
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.given_camera import keyframe_pairs
 from vggtgeo.slam.camera.rolling_shutter import (
-    _descend,
-    _Search,
-    carried,
     find_readout,
-    image_shift,
-    pair_to_global_shutter,
-    row_shifts,
     without_readout,
 )
 from vggtgeo.slam.global_map.carried_poses import carried_poses
@@ -118,28 +112,6 @@ def test_a_rolling_shutter_is_found_and_taken_out(seconds: float, columns: bool)
     assert found.readout.seconds == pytest.approx(seconds, rel=0.05)
     before, after = (np.sqrt(np.mean(WINDOW.errors(one) ** 2)) for one in (state, found.state))
     assert after < 0.5 * before, (before, after)
-
-
-class _Straight(_Search):
-    """A map whose slope is a straight line through zero at 28 ms, matches moving by 1 px in 20 ms."""
-
-    usual = 50.0
-
-    def at(self, seconds: float) -> Problem:
-        return self.problem
-
-    def slopes(self, seconds: float, state: State) -> np.ndarray:
-        return np.array([seconds - 0.028])
-
-
-def test_a_straight_slope_takes_two_adjustments() -> None:
-    """One at the first step, one at its zero, within reach of the first; oracle: the line."""
-    problem, start, _ = WINDOW.pack()
-    solved: list[State] = []
-    search = _Straight(problem, row_shifts(problem, start, some_motions(), (HEIGHT, WIDTH), False), 100.0)
-    seconds, _ = _descend(search, start, -0.028, LONGEST, lambda _, state: solved.append(state) or state)
-    assert seconds == pytest.approx(0.028)
-    assert len(solved) == 2
 
 
 def test_what_is_taken_out_is_what_the_motion_put_in() -> None:
@@ -280,28 +252,3 @@ def test_a_run_finds_the_shutter_of_its_camera() -> None:
         assert ("rolling_shutter" in result.summary) == search
     assert result.summary["rolling_shutter"]["seconds"] == pytest.approx(0.03, rel=0.1)
     assert errors[1] < 0.5 * errors[0], errors
-
-
-def test_matches_of_two_images_without_the_readout_of_either() -> None:
-    """Oracle: the pixels of a camera that reads at once, and each moved as far as its row's time says; half a metre and
-    half a radian a second shift them by 5 px.
-    """
-    rng, camera, size = np.random.default_rng(0), np.array([500.0, 500.0, 320.0, 240.0]), (480, 640)
-    still, depth, relative = rng.uniform((0, 0), (640, 480), (50, 2)), rng.uniform(2.0, 6.0, 50), np.eye(4)
-    relative[:3, 3] = 0.1, 0.02, -0.05
-    inverse, readout = 1 / depth, Readout(0.03, False, 0.0)
-    there, inverse_there = (part[0] for part in carried(still[None], inverse[None], relative[None], camera))
-    motions = rng.normal(0, 0.5, (2, 6))
-
-    def read(at: np.ndarray, depths: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        seen = at
-        for _ in range(20):  # the row in which it is seen says when
-            shift = image_shift(seen[None], depths[None], motion[None], camera, size, readout.columns)[0]
-            seen = at + readout.seconds * shift
-        return seen
-
-    before, after = read(still, inverse, motions[0]), read(there, inverse_there, motions[1])
-    found = pair_to_global_shutter(before, after, depth, relative, (motions[0], motions[1]), camera, size, readout)
-    for image, true, moved in zip(found, (still, there), (before, after), strict=True):
-        assert np.abs(moved - true).max() > 2.0
-        assert np.abs(image - true).max() < 0.1

@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +13,8 @@ import tiny_networks as tiny
 from tiny_sequences import seven_scenes
 from typer.testing import CliRunner
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
-from vggtgeo.models.onnx.registry import NETWORKS, files_of, players
+from vggtgeo.models.onnx.registry import files_of, players
 from vggtgeo.models.onnx.session import Session
-from vggtgeo.models.roles import PoseQuery
 from vggtgeo.models.window_locator import WindowLocator
 
 from vggtgeo.cli.main import make_app
@@ -30,7 +28,6 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 
 RUN_AND_WRITE = "vggtgeo.cli.run_sequence"
 """The module from which the command takes `run_and_write`."""
-EXPORTS = "VGGTGEO_EXPORTS"
 SIZE = (192, 256)
 
 
@@ -186,49 +183,6 @@ def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
     assert all(network["calls"] > 0 for network in summary["networks"].values()), summary["networks"]
     assert "this result means nothing" in summary["meaningless"]
     assert "this result means nothing" in (tmp_path / "run" / "report.html").read_text()
-
-
-def _exports() -> Path:
-    folder = os.environ.get(EXPORTS)
-    if folder is None:
-        pytest.skip(f"needs the exported files of the paper preset in a folder that {EXPORTS} names")
-    return Path(folder)
-
-
-@pytest.mark.slow
-def test_every_adapter_takes_real_exports(counted: dict[str, int]) -> None:
-    # Proves that the outputs of the published architectures, random weights or not, go through every adapter of the
-    # paper's preset: each role answers for two frames, in its own checked type. Oracle: a count of the networks.
-    found = perception("paper", Roles(), _exports())
-    first, second = (frame.image for frame in simulate("room", 2, 0, (640, 480), rate=5.0).frames())
-    roles, camera = found.roles, np.array([532.5, 532.5, 319.5, 239.5])
-    matches = roles.points.match(roles.points.describe(first), roles.points.describe(second))
-    lines = [roles.line_matches.describe(image, roles.lines.detect(image)) for image in (first, second)]
-    roles.line_matches.match(*lines)
-    depth = roles.depth.estimate(first, None, tuple(camera))
-    omega = roles.confidence.confidence(first)
-    nothing = np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0)
-    window = {"window_images": (first,), "window_poses": (np.eye(4),), "window_depths": (np.full((480, 640), 2.0),)}
-    guess = roles.geometry.locate(PoseQuery(second, camera, *nothing, **window))
-    assert set(counted) == set(NEEDED["paper"])
-    assert depth.depth.shape == omega.shape == (480, 640)
-    assert np.isfinite(matches.pixels_j).all()
-    assert np.isfinite(guess.pose).all()
-
-
-@pytest.mark.slow
-def test_real_exports_keep_their_contracts_and_run(tmp_path: Path) -> None:
-    # Proves that the files of `vggtgeo models export`, random weights or not, open, agree with PyTorch where that is
-    # recorded, give finite outputs on a rendered room, and carry a whole run. Oracle: the records of the exports.
-    folder = _exports()
-    for name in NEEDED["paper"]:
-        file = folder / NETWORKS[name].file
-        result = CliRunner().invoke(make_app(), ["models", "verify", str(file), "--runs", "1", "--json"])
-        assert result.exit_code == 0, result.output
-        assert json.loads(result.output)["network"] == NETWORKS[name].contract_name
-    summary = _whole_run(tmp_path, folder, (640, 480))
-    assert summary["frames"] == 10
-    assert all(network["calls"] > 0 for network in summary["networks"].values()), summary["networks"]
 
 
 def test_roles_are_mixed_by_name(files: Path) -> None:

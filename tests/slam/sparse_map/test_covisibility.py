@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from posed_keyframes import keyframe_of
 from vggtgeo.models.classical import NoDepth
-from vggtgeo.models.roles import Features, LineFeatures, PointMatches, Segments
+from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.covisibility import match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 
 WIDTH, HEIGHT = 480, 360
 INTRINSICS = np.array([400.0, 400.0, WIDTH / 2, HEIGHT / 2])
@@ -67,14 +67,7 @@ def _keyframe(number: int, pose: np.ndarray, pixels: np.ndarray) -> Keyframe:
     """Return a keyframe of key points at one depth, without segments."""
     ones, unknown = np.ones(len(pixels)), np.full(len(pixels), np.nan)
     points = Slots(pixels, ones / DEPTH, unknown, unknown, ones, ones, 1e-4 * ones)
-    none, blank = np.zeros(0), np.zeros((HEIGHT, WIDTH), np.float16)
-    samples = Slots(np.zeros((0, 2)), none, none, none, none, none, none)
-    images = KeyframeImages(np.zeros((HEIGHT, WIDTH, 3), np.uint8), blank, blank, blank.astype(np.uint8))
-    lines = LineFeatures(Segments(np.zeros((0, 2, 2)), none), np.zeros((0, 128), np.float32))
-    return Keyframe(
-        *(number, number, float(number), pose, images, Features(pixels, ones), lines, np.zeros((0, 2))),
-        *(points, samples, np.zeros(0, int)),
-    )
+    return keyframe_of(number, np.zeros((HEIGHT, WIDTH, 3), np.uint8), pose, points, np.zeros((HEIGHT, WIDTH)))
 
 
 class _TrueMatches:

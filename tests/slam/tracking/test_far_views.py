@@ -6,32 +6,27 @@ Exact truth: the renderer's poses.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from recorded_run import ROLES, SETTINGS
 from terrace import terrace
-from vggtgeo.models.classical import NoDepth, SiftMatcher
+from vggtgeo.models.classical import NoDepth
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.run import run
-from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
-# The window of test_pipeline.py, so that the solver is compiled once.
-ROLES = Roles(points=SiftMatcher(count=500), depth=NoDepth())
-SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48),
-    refinement=GlobalMapSettings(global_adjustment=False),
-)
+FREE_ROLES = replace(ROLES, depth=NoDepth())
 FRAMES = 24
 
 
 @pytest.fixture(scope="module")
 def walked() -> Slam:
     """The state after a walk that turns from a wall to a view."""
-    return deque(run(terrace(FRAMES), ROLES, SETTINGS), maxlen=1).pop()
+    return deque(run(terrace(FRAMES), FREE_ROLES, SETTINGS), maxlen=1).pop()
 
 
 def test_a_turn_towards_a_far_view_keeps_the_scale(walked: Slam) -> None:
