@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_layouts
-import tiny_sequences
 from recorded_run import RecordedRun, recorded_run
 
-from vggtgeo.cli.run_sequence import _reopen
-from vggtgeo.datasets import open_sequence
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.mapping.depth_map import DepthMap, PosedDepth
 from vggtgeo.mapping.frame_depth import rendered_depth
 from vggtgeo.results.reread_frames import depth_of_frames
-from vggtgeo.slam.run import default_roles
-from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
 
 CAMERA = np.array([200.0, 200.0, 79.5, 59.5])
@@ -122,12 +115,3 @@ def test_a_lost_frame_has_its_own_depth_alone(run: RecordedRun) -> None:
     )
     maps = dense_depths(slam.keyframes, slam.intrinsics)
     assert dict(depth_of_frames(slam, maps))[lost.frame] is None
-
-
-def test_the_command_reads_every_frame_reopen(tmp_path: Path) -> None:
-    # Proves that pictures of frames without depth are kept, too, and that depth which no role used is not read.
-    images = tiny_layouts.quietly_opened(tiny_sequences.images(tmp_path / "images"))
-    both = open_sequence(tiny_sequences.tum(tmp_path / "tum"))
-    assert len(list(_reopen(images, default_roles(False), SlamSettings()).frames())) == len(images)
-    assert _reopen(both, default_roles(True), SlamSettings()).has_depth
-    assert not _reopen(both, default_roles(False), SlamSettings()).has_depth

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from vggtgeo.geometry.point_cloud import UNREADABLE, bytes_of_colours, columns_of
+from vggtgeo.geometry.point_cloud import COLOUR, NORMAL, UNREADABLE, bytes_of_colours, columns_of, write_ply
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import atomic_open
 from vggtgeo.io.given import path_of, real_array
 
 
@@ -46,16 +45,11 @@ class Mesh:
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
         """Write binary little-endian PLY, atomically: float32 x y z nx ny nz, uint8 RGB, and the faces."""
-        names = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-        vertices = np.empty(len(self.vertices), names + [(name, "u1") for name in ("red", "green", "blue")])
-        columns = [*self.vertices.T, *self.normals.T, *self.colours.T]
-        for name, column in zip(vertices.dtype.names or (), columns, strict=True):
-            vertices[name] = column
         faces = np.empty(len(self.faces), [("vertex_indices", "<i4", (3,))])
         faces["vertex_indices"] = self.faces
-        elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-        with atomic_open(path, "wb") as handle:
-            PlyData(elements, byte_order="<").write(handle)
+        values = [*self.vertices.T, *self.normals.T, *self.colours.T]
+        columns = dict(zip((*"xyz", *NORMAL, *COLOUR), values, strict=True))
+        write_ply(path, columns, PlyElement.describe(faces, "face"))
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> Mesh:
@@ -65,10 +59,10 @@ class Mesh:
             # With a known length of the lists plyfile reads all faces at once, not one by one.
             data = PlyData.read(os.fspath(path), known_list_len={"face": {"vertex_indices": 3}})
             vertices = data["vertex"].data
-            places, normals = (columns_of(vertices, names) for names in ("xyz", ("nx", "ny", "nz")))
+            places, normals = (columns_of(vertices, names) for names in ("xyz", NORMAL))
             if not (np.isfinite(places).all() and np.isfinite(normals).all()):
                 raise ValueError("a vertex or its normal has a NaN or an infinity")
-            colours = bytes_of_colours(columns_of(vertices, ("red", "green", "blue")))
+            colours = bytes_of_colours(columns_of(vertices, COLOUR))
             return cls(places, data["face"].data["vertex_indices"], normals, colours)
         except UNREADABLE as error:
             raise InputError(

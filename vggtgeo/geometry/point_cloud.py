@@ -1,7 +1,7 @@
 """Coloured point clouds as binary PLY files, and the cells of a grid that points lie in."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,8 @@ from vggtgeo.io.given import path_of, real_array
 UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyParseError)
 """Errors of the parser for files that are invalid, or declare more than they contain."""
 
-_NORMAL = ("nx", "ny", "nz")
-_COLOUR = ("red", "green", "blue")
+NORMAL = ("nx", "ny", "nz")
+COLOUR = ("red", "green", "blue")
 _LARGEST = 2**62
 
 
@@ -53,23 +53,16 @@ class PointCloud:
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
         """Write binary little-endian PLY, atomically: float32 x y z, uint8 RGB, float32 confidence, nx ny nz."""
-        fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in _COLOUR]
-        columns = [*self.points.T, *self.colours.T]
-        if self.confidence is not None:
-            fields.append(("confidence", "<f4"))
-            columns.append(self.confidence)
-        if self.normals is not None:
-            fields += [(name, "<f4") for name in _NORMAL]
-            columns += [*self.normals.T]
         if np.abs(self.points).max(initial=0.0) > np.finfo(np.float32).max:
             raise InputError(
                 f"`points` has coordinates that the float32 of `{path}` cannot hold; leave such points out"
             )
-        vertices = np.empty(len(self), dtype=fields)
-        for (name, _), column in zip(fields, columns, strict=True):
-            vertices[name] = column
-        with atomic_open(path, "wb") as handle:
-            PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(handle)
+        columns = {**dict(zip("xyz", self.points.T, strict=True)), **dict(zip(COLOUR, self.colours.T, strict=True))}
+        if self.confidence is not None:
+            columns["confidence"] = self.confidence
+        if self.normals is not None:
+            columns |= zip(NORMAL, self.normals.T, strict=True)
+        write_ply(path, columns)
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> "PointCloud":
@@ -85,16 +78,26 @@ class PointCloud:
             names = vertices.dtype.names or ()
             points = columns_of(vertices, "xyz")
             colours = np.zeros((len(points), 3), np.uint8)
-            if set(_COLOUR) <= set(names):
-                colours = bytes_of_colours(columns_of(vertices, _COLOUR))
+            if set(COLOUR) <= set(names):
+                colours = bytes_of_colours(columns_of(vertices, COLOUR))
             confidence = np.array(vertices["confidence"]) if "confidence" in names else None
-            normals = columns_of(vertices, _NORMAL) if set(_NORMAL) <= set(names) else None
+            normals = columns_of(vertices, NORMAL) if set(NORMAL) <= set(names) else None
             return cls(points, colours, confidence, normals)
         except UNREADABLE as error:
             raise InputError(
                 f"`{os.fspath(path)}` cannot be read as a PLY point cloud: {error}; give a whole one whose vertices "
                 "have x, y and z"
             ) from None
+
+
+def write_ply(path: str | os.PathLike[str], columns: Mapping[str, np.ndarray], *others: PlyElement) -> None:
+    """Write vertices with these properties, colours as bytes, and other elements: binary little-endian, atomically."""
+    kinds = [(name, "u1" if name in COLOUR else "<f4") for name in columns]
+    vertices = np.empty(len(columns["x"]), dtype=kinds)
+    for name, column in columns.items():
+        vertices[name] = column
+    with atomic_open(path, "wb") as handle:
+        PlyData([PlyElement.describe(vertices, "vertex"), *others], byte_order="<").write(handle)
 
 
 def columns_of(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:

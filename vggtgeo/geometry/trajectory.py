@@ -71,13 +71,16 @@ class Trajectory:
         """Length of the path through the camera centres, metres."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
+    @property
+    def _quaternions(self) -> np.ndarray:
+        return Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
+
     def to_dict(self) -> dict[str, list]:
         """Return times, positions and quaternions (x, y, z, w) as plain lists."""
-        quaternions = Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
         return {
             "timestamps": self.timestamps.tolist(),
             "positions": self.positions.tolist(),
-            "quaternions": quaternions.tolist(),
+            "quaternions": self._quaternions.tolist(),
         }
 
     def __repr__(self) -> str:
@@ -93,8 +96,7 @@ class Trajectory:
 
     def save_tum(self, path: str | os.PathLike[str]) -> None:
         """Write the TUM format, nine decimals, atomically."""
-        quaternions = Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
-        rows = np.column_stack([self.timestamps, self.positions, quaternions])
+        rows = np.column_stack([self.timestamps, self.positions, self._quaternions])
         lines = (" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows.tolist())
         write_text(path, _HEADER + "".join(lines))
 

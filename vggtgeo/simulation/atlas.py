@@ -101,7 +101,7 @@ def build_atlas(textures: list[np.ndarray], wraps: list[bool]) -> Atlas:
 
 
 def pack_shelves(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Pack rectangles of `sizes` [P, 2] = (width, height), the tall ones first; return corners [P, 2], and the height."""
+    """Pack rectangles of `sizes` [P, 2] (width, height), the tall ones first; return corners [P, 2], and the height."""
     corner = np.zeros((len(sizes), 2), int)
     x = y = shelf = 0
     for row in np.argsort(-sizes[:, 1], kind="stable"):

@@ -19,8 +19,8 @@ from vggtgeo.simulation.textures import TILES, Painter, blend, fractal, quantise
 _LINE = cv2.LINE_AA
 
 
-def _canvas(rng: np.random.Generator, size: int, low: tuple, high: tuple, grain: float = 0.25) -> np.ndarray:
-    return quantise(blend(low, high, 0.5 + grain * fractal(rng, size, 1.5)))
+def _canvas(rng: np.random.Generator, size: int, low: tuple, high: tuple) -> np.ndarray:
+    return quantise(blend(low, high, 0.5 + 0.25 * fractal(rng, size, 1.5)))
 
 
 def _upright(image: np.ndarray) -> np.ndarray:

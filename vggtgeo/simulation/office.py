@@ -4,27 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.simulation.furniture import (
-    BRICK,
-    DARK,
-    PLASTER,
-    Place,
-    cabinet,
-    chair,
-    desk,
-    floor_and_ceiling,
-    hang,
-    lamp_panel,
-    plant,
-    shelf,
-    sides_of,
-    skirting,
-    sofa,
-    table,
-    wall,
-)
+from vggtgeo.simulation.furniture import BRICK, DARK, PLASTER, Place, RoomBuilder, sides_of
 from vggtgeo.simulation.scene import Scene, finish
-from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
+from vggtgeo.simulation.shapes import Look, Vector
 from vggtgeo.simulation.trajectories import Walk
 
 _SIZE = (16.0, 11.0)
@@ -59,12 +41,12 @@ OFFICE_WALK = Walk(
 
 def build_office(seed: int) -> Scene:
     """Build four islands of four desks, lined by shelves, boards, doors and windows."""
-    b = SceneBuilder(seed)
-    floor_and_ceiling(b, (0, 0), _SIZE, _HEIGHT, Look("carpet", 1.3), Look("ceiling", 1.2, detail=0.05))
+    b = RoomBuilder(seed)
+    b.floor_and_ceiling((0, 0), _SIZE, _HEIGHT, Look("carpet", 1.3), Look("ceiling", 1.2, detail=0.05))
     looks = (BRICK, PLASTER, PLASTER.tinted(0.86, 0.93, 1.0), PLASTER.tinted(1.0, 0.95, 0.85))
     for side, (start, end) in enumerate(sides_of(_SIZE)):
-        wall(b, start, end, _HEIGHT, looks[side])
-        _dress(b, start, end, skirting(b, start, end, 0.10, 0.015), side)
+        b.wall(start, end, _HEIGHT, looks[side])
+        _dress(b, start, end, b.skirting(start, end, 0.10, 0.015), side)
     variant = 0
     for x in (4.5, 11.5):
         for y in (3.4, 7.7):
@@ -73,55 +55,55 @@ def build_office(seed: int) -> Scene:
     _pillars_and_corners(b)
     for x in (2.7, 6.2, 9.8, 13.3):
         for y in (1.9, 5.5, 9.1):
-            lamp_panel(b, x, y, _HEIGHT, power=6.0, reach=7.0)
+            b.lamp_panel(x, y, _HEIGHT, power=6.0, reach=7.0)
     return finish(b, "office", ambient=0.34, exposure=0.70, texel=0.14)
 
 
-def _island(b: SceneBuilder, at: Vector, variant: int) -> None:
+def _island(b: RoomBuilder, at: Vector, variant: int) -> None:
     """Add four desks back to back with screens of cloth between them."""
     place = Place(at, 0.0)
     for column, x in enumerate((-0.78, 0.78)):
         for row, yaw in enumerate((0.0, np.pi)):
             y = -0.40 if row == 0 else 0.40
             number = variant + 2 * column + row
-            desk(b, place(x, y), yaw, number % 7)
+            b.desk(place(x, y), yaw, number % 7)
             turn = float(b.rng.uniform(-0.6, 0.6))
             away = 2.4 * y + float(b.rng.uniform(-0.05, 0.10)) * np.sign(y)
-            chair(b, place(x + 0.1, away), yaw + np.pi + turn, (0.08, 0.12 + 0.05 * (number % 3), 0.30))
+            b.chair(place(x + 0.1, away), yaw + np.pi + turn, (0.08, 0.12 + 0.05 * (number % 3), 0.30))
     panel = Look("fabric", 0.6, tint=((0.25, 0.42, 0.50), (0.55, 0.30, 0.22), (0.35, 0.45, 0.22))[variant // 4 % 3])
     b.box(place(0, 0, 0.55), (3.1, 0.03, 0.62), panel)
     b.box(place(0, 0, 0.75), (0.03, 1.2, 0.35), panel)
 
 
-def _dress(b: SceneBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
+def _dress(b: RoomBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
     """Add things on one wall, about one in 2 m, in an order drawn from the seed."""
     along, number = 1.1, 10 * side
     while along < length - 1.0:
         kind = str(b.rng.choice(list(_ON_THE_WALL), p=list(_ON_THE_WALL.values())))
         look = Look(f"{kind}:{number}", None, emission=0.7 if kind == "window" else 0.0)
         if kind == "door":
-            hang(b, start, end, along, 0.0, (0.95, 2.05), look, 0.05)
+            b.hang(start, end, along, 0.0, (0.95, 2.05), look, 0.05)
         else:
             width, height = b.rng.uniform([0.6, 0.6], [1.4, 1.1]) * (0.75 if kind == "poster" else 1.0)
-            hang(b, start, end, along, 1.05 + float(b.rng.uniform(0, 0.35)), (width, height), look, 0.03)
+            b.hang(start, end, along, 1.05 + float(b.rng.uniform(0, 0.35)), (width, height), look, 0.03)
         along += float(b.rng.uniform(1.5, 2.3))
         number += 1
 
 
-def _pillars_and_corners(b: SceneBuilder) -> None:
+def _pillars_and_corners(b: RoomBuilder) -> None:
     """Add low shelves along the walls, two pillars, and corners with plants and a sofa."""
     for index, x in enumerate((3.6, 6.0, 10.4, 12.6)):
-        shelf(b, (x, 0.20), np.pi, 1.3, 0.85, 3 * index % 9)
+        b.shelf((x, 0.20), np.pi, 1.3, 0.85, 3 * index % 9)
     for index, x in enumerate((4.4, 9.6, 12.2)):
-        shelf(b, (x, 10.80), 0.0, 1.3, (0.85, 1.9, 1.25)[index], 3 * index % 9)
-    cabinet(b, (15.72, 7.5), -0.5 * np.pi)
-    cabinet(b, (15.72, 3.1), -0.5 * np.pi, (1.2, 0.45, 0.8), "books:8")
-    sofa(b, (0.5, 7.4), 0.5 * np.pi, (0.24, 0.30, 0.12), 1.8)
-    cabinet(b, (0.28, 3.4), 0.5 * np.pi, (1.2, 0.45, 0.8), "books:7")
+        b.shelf((x, 10.80), 0.0, 1.3, (0.85, 1.9, 1.25)[index], 3 * index % 9)
+    b.cabinet((15.72, 7.5), -0.5 * np.pi)
+    b.cabinet((15.72, 3.1), -0.5 * np.pi, (1.2, 0.45, 0.8), "books:8")
+    b.sofa((0.5, 7.4), 0.5 * np.pi, (0.24, 0.30, 0.12), 1.8)
+    b.cabinet((0.28, 3.4), 0.5 * np.pi, (1.2, 0.45, 0.8), "books:7")
     b.box((8.0, 7.7, 0), (0.5, 0.5, _HEIGHT), Look("concrete", 1.4))
     b.box((8.0, 7.44, 1.2), (0.40, 0.02, 0.56), DARK, front=Look("poster:61", None))
     b.box((8.0, 7.96, 1.2), (0.40, 0.02, 0.56), DARK, np.pi, front=Look("poster:62", None))
-    table(b, (8.0, 6.75), 0.0)
-    table(b, (8.0, 8.5), 0.0)
+    b.table((8.0, 6.75), 0.0)
+    b.table((8.0, 8.5), 0.0)
     for at in ((0.5, 0.5), (15.5, 0.5), (15.5, 10.5), (0.5, 10.5), (8.0, 2.2), (6.6, 10.6)):
-        plant(b, at, 1.2 + 0.3 * float(b.rng.uniform()))
+        b.plant(at, 1.2 + 0.3 * float(b.rng.uniform()))

@@ -27,6 +27,7 @@ from vggtgeo.simulation.sequence import SyntheticSequence
 
 _HALF_STRENGTH = 6.0  # grey levels a pixel of gradient in the weaker direction that count as strength 0.5
 _DEPTH_TOLERANCE = 0.01  # relative; what is nearer by more hides a point
+_SHORTEST = 15.0  # pixels of a visible part of an edge
 _SAMPLE = 3.0  # pixels between samples along an edge
 _KEPT_FRAMES = 14  # about 10 MB each at 640 x 480, 3 MB at 320 x 240
 
@@ -225,16 +226,14 @@ def is_visible(pixels: np.ndarray, depths: np.ndarray, farthest: np.ndarray) -> 
     return inside & (depths <= farthest[rows, columns] * (1 + _DEPTH_TOLERANCE))
 
 
-def visible_edges(
-    scene: Scene, pose: np.ndarray, camera: Camera, picture: Picture, shortest: float = 15.0
-) -> VisibleEdges:
-    """Return the visible parts of the scene's edges that are at least `shortest` pixels long."""
+def visible_edges(scene: Scene, pose: np.ndarray, camera: Camera, picture: Picture) -> VisibleEdges:
+    """Return the visible parts of the scene's edges that are at least `_SHORTEST` pixels long."""
     maps = (farthest_depth(picture), _gradient(picture))
     parts: list[tuple[np.ndarray, np.ndarray, int, float]] = []
     for index, ends in _clipped(scene.edges, pose, camera):
         length = float(np.linalg.norm(ends[1, :2] - ends[0, :2]))
-        if length >= shortest:
-            parts += _visible_parts(index, ends, length, pose, camera, maps, shortest)
+        if length >= _SHORTEST:
+            parts += _visible_parts(index, ends, length, pose, camera, maps)
     if not parts:
         return VisibleEdges(np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros(0, int), np.zeros(0))
     pixels, points, edge, contrast = zip(*parts, strict=True)
@@ -284,7 +283,6 @@ def _visible_parts(
     pose: np.ndarray,
     camera: Camera,
     maps: tuple[np.ndarray, np.ndarray],
-    shortest: float,
 ) -> list[tuple[np.ndarray, np.ndarray, int, float]]:
     count = max(2, int(length / _SAMPLE) + 1)
     samples = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
@@ -294,7 +292,7 @@ def _visible_parts(
     parts = []
     for first, last in zip(bounds[::2], bounds[1::2] - 1, strict=True):
         run = samples[[first, last]]
-        if np.linalg.norm(run[1, :2] - run[0, :2]) < shortest:
+        if np.linalg.norm(run[1, :2] - run[0, :2]) < _SHORTEST:
             continue
         points = (pinhole.rays(run[:, :2], camera.intrinsics) / run[:, 2:] - pose[:3, 3]) @ pose[:3, :3]
         at = np.rint(samples[first : last + 1, :2]).astype(int)

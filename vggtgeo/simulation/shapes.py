@@ -148,7 +148,7 @@ class SceneBuilder:
         if shadow:
             self.boxes.append((base + 0.5 * z, yaw, 0.5 * np.asarray(size, float)))
 
-    def cylinder(self, base: Vector, radius: float, height: float, look: Look, top: Look | None = None) -> None:
+    def cylinder(self, base: Vector, radius: float, height: float, look: Look) -> None:
         """Add an upright closed cylinder standing on `base`."""
         base = np.asarray(base, float)
         low, high = base - [radius, radius, 0], base + [radius, radius, height]
@@ -156,7 +156,7 @@ class SceneBuilder:
         row = (CYLINDER, base, np.eye(3)[0], np.eye(3)[1], UP, (2 * np.pi * radius, height), corners)
         self.rows.append(row)
         self.looks.append(look)
-        self.disc(base + [0, 0, height], radius, top or look)
+        self.disc(base + [0, 0, height], radius, look)
         self.boxes.append((base + [0, 0, 0.5 * height], 0.0, np.array([0.8 * radius, 0.8 * radius, 0.5 * height])))
 
     def _add(self, kind: int, origin: np.ndarray, along: np.ndarray, up: np.ndarray, look: Look) -> None:

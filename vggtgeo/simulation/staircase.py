@@ -13,22 +13,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from vggtgeo.simulation.furniture import (
-    DARK,
-    METAL,
-    WHITE,
-    floor_and_ceiling,
-    hang,
-    lamp_panel,
-    plant,
-    railing,
-    shelf,
-    sides_of,
-    skirting,
-    wall,
-)
+from vggtgeo.simulation.furniture import DARK, METAL, WHITE, RoomBuilder, sides_of
 from vggtgeo.simulation.scene import Scene, finish
-from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
+from vggtgeo.simulation.shapes import Look, Vector
 from vggtgeo.simulation.trajectories import Walk
 
 _FLOORS = 4
@@ -68,9 +55,9 @@ def build_staircase(seed: int) -> Scene:
 
     Each floor has a door and a number, each half landing a window.
     """
-    b = SceneBuilder(seed)
+    b = RoomBuilder(seed)
     height = _FLOORS * _STOREY
-    floor_and_ceiling(b, (0, 0), (_WIDTH, _LENGTH), height, Look("tiles", 1.2), WHITE)
+    b.floor_and_ceiling((0, 0), (_WIDTH, _LENGTH), height, Look("tiles", 1.2), WHITE)
     for floor in range(_FLOORS):
         base = floor * _STOREY
         _walls(b, base, floor)
@@ -80,26 +67,26 @@ def build_staircase(seed: int) -> Scene:
             half = base + 0.5 * _STOREY
             _flights(b, base, half)
             above = half + _STOREY - 0.18 if floor < _FLOORS - 2 else height
-            lamp_panel(b, 0.5 * _WIDTH, _LENGTH - 0.7, above, (0.8, 0.3), 2.4 if floor < _FLOORS - 2 else 6.0, 7.0)
-        lamp_panel(b, 0.5 * _WIDTH, 0.7, base + _STOREY - 0.18, (0.8, 0.3), 2.4, 5.0)
+            b.lamp_panel(0.5 * _WIDTH, _LENGTH - 0.7, above, (0.8, 0.3), 2.4 if floor < _FLOORS - 2 else 6.0, 7.0)
+        b.lamp_panel(0.5 * _WIDTH, 0.7, base + _STOREY - 0.18, (0.8, 0.3), 2.4, 5.0)
     top, edge = (_FLOORS - 1) * _STOREY, _LANDING - 0.05
-    railing(b, (_FLIGHT + 0.1, edge, top), (_WIDTH - 0.1, edge, top), 1.0, METAL)
-    plant(b, (_WIDTH - 0.3, 0.35), 1.2)
+    b.railing((_FLIGHT + 0.1, edge, top), (_WIDTH - 0.1, edge, top), 1.0, METAL)
+    b.plant((_WIDTH - 0.3, 0.35), 1.2)
     return finish(b, "staircase", ambient=0.36, exposure=0.72, texel=0.12)
 
 
-def _landing(b: SceneBuilder, base: float) -> None:
+def _landing(b: RoomBuilder, base: float) -> None:
     b.box((0.5 * _WIDTH, 0.5 * _LANDING, base - 0.18), (_WIDTH, _LANDING, 0.18), _STONE, top=Look("tiles", 1.2))
 
 
-def _flights(b: SceneBuilder, base: float, half: float) -> None:
+def _flights(b: RoomBuilder, base: float, half: float) -> None:
     """Add both flights from the floor at `base` to the next one, and the landing at `half`."""
     b.box((0.5 * _WIDTH, _LENGTH - 0.5 * _LANDING, half - 0.18), (_WIDTH, _LANDING, 0.18), _STONE)
     _flight(b, _WIDTH - 0.5 * _FLIGHT, base, 1)
     _flight(b, 0.5 * _FLIGHT, half, -1)
 
 
-def _flight(b: SceneBuilder, x: float, base: float, way: int) -> None:
+def _flight(b: RoomBuilder, x: float, base: float, way: int) -> None:
     """Add ten steps up from `base` along +y (`way` 1) or -y (-1), an underside, and a railing at the well."""
     start = _LANDING if way > 0 else _LENGTH - _LANDING
     for step in range(_STEPS):
@@ -111,24 +98,24 @@ def _flight(b: SceneBuilder, x: float, base: float, way: int) -> None:
         b.box((x, nose, base + (step + 1) * _RISE), (_FLIGHT - 0.1, 0.04, 0.004), DARK, edges=False, shadow=False)
     inner = x - 0.5 * _FLIGHT + 0.04 if way > 0 else x + 0.5 * _FLIGHT - 0.04
     top = base + _STEPS * _RISE
-    railing(b, (inner, start, base), (inner, start + way * _STEPS * _RUN, top), 0.95, METAL, 0.45)
+    b.railing((inner, start, base), (inner, start + way * _STEPS * _RUN, top), 0.95, METAL, 0.45)
 
 
-def _walls(b: SceneBuilder, base: float, floor: int) -> None:
+def _walls(b: RoomBuilder, base: float, floor: int) -> None:
     """Add one storey of the four walls: coloured to 1.2 m above each floor, white above."""
     paint = Look("plaster", 2.0, tint=_PAINTS[floor % len(_PAINTS)])
     west, north, east, south = sides_of((_WIDTH, _LENGTH))
     for start, end in (west, north, east, south):
-        wall(b, start, end, 1.2, paint, base, edges=True)
-        wall(b, start, end, _STOREY - 1.2, Look("plaster", 2.3, detail=0.04), base + 1.2)
-    hang(b, *south, 0.9, base, (0.95, 2.05), Look("door:7", None), 0.05, DARK)
-    hang(b, *south, 1.8, base + 1.5, (0.35, 0.35), Look(f"sign:{floor + 10}", None), 0.02)
-    hang(b, *west, 0.6, base + 1.3, (0.5, 0.7), Look(f"poster:{70 + floor}", None))
+        b.wall(start, end, 1.2, paint, base, edges=True)
+        b.wall(start, end, _STOREY - 1.2, Look("plaster", 2.3, detail=0.04), base + 1.2)
+    b.hang(*south, 0.9, base, (0.95, 2.05), Look("door:7", None), 0.05, DARK)
+    b.hang(*south, 1.8, base + 1.5, (0.35, 0.35), Look(f"sign:{floor + 10}", None), 0.02)
+    b.hang(*west, 0.6, base + 1.3, (0.5, 0.7), Look(f"poster:{70 + floor}", None))
     if floor < _FLOORS - 1:
         half = base + 0.5 * _STOREY
         view = Look(f"window:{floor}", None, emission=0.7)
-        hang(b, *north, 0.5 * _WIDTH, half + 0.95, (1.2, 1.1), view, 0.06, METAL)
-        hang(b, *east, 0.7, half + 1.2, (0.5, 0.7), Look(f"painting:{floor + 5}", None))
+        b.hang(*north, 0.5 * _WIDTH, half + 0.95, (1.2, 1.1), view, 0.06, METAL)
+        b.hang(*east, 0.7, half + 1.2, (0.5, 0.7), Look(f"painting:{floor + 5}", None))
 
 
 _STOREYS = 3
@@ -166,15 +153,15 @@ BUILDING_WALK = Walk(way=_way(), speed=0.8, corner=0.25, turn=0.40, glance=0.15,
 
 def build_building(seed: int) -> Scene:
     """Build corridors with doors, boards and pictures, each floor in its colour, about a well of dog-leg stairs."""
-    b = SceneBuilder(seed)
+    b = RoomBuilder(seed)
     for floor in range(_STOREYS):
         _corridor(b, floor)
         _stairs(b, floor)
-    floor_and_ceiling(b, (0, 0), (_WIDTH, _LENGTH), _STOREYS * _STOREY, Look("tiles", 1.2), WHITE)
+    b.floor_and_ceiling((0, 0), (_WIDTH, _LENGTH), _STOREYS * _STOREY, Look("tiles", 1.2), WHITE)
     return finish(b, "building", ambient=0.40, exposure=0.72, texel=0.16)
 
 
-def _corridor(b: SceneBuilder, floor: int) -> None:
+def _corridor(b: RoomBuilder, floor: int) -> None:
     base, paint = floor * _STOREY, _FLOOR_PAINTS[floor % len(_FLOOR_PAINTS)]
     (west, south), (east, north) = _LOW, _HIGH
     size = (east - west, north - south)
@@ -186,72 +173,72 @@ def _corridor(b: SceneBuilder, floor: int) -> None:
     outer = [(west, north), (east, north), (east, south), (west, south), (west, north)]
     _with_opening(b, outer[0], outer[1], _HEIGHT, look, base)
     for start, end in pairwise(outer[1:]):
-        wall(b, start, end, _HEIGHT, look, base)
+        b.wall(start, end, _HEIGHT, look, base)
     low, high = (west + _AISLE, south + _AISLE), (east - _AISLE, north - _AISLE)
     inner = [(high[0], high[1]), (low[0], high[1]), low, (high[0], low[1]), (high[0], high[1])]
     for start, end in pairwise(inner):
-        wall(b, start, end, _HEIGHT, Look("wallpaper", 2.1, tint=paint, detail=0.05), base)
+        b.wall(start, end, _HEIGHT, Look("wallpaper", 2.1, tint=paint, detail=0.05), base)
     sides = [*pairwise(outer), *pairwise(inner)]
     for number, (start, end) in enumerate(sides):
         _dress_corridor(b, start, end, base, 8 * floor + number, keep_free=number == 0)
     for number, (x, y) in enumerate(((east - 0.3, south + 0.3), (west + 0.3, south + 0.3), (west + 0.3, north - 0.3))):
-        plant(b, (x, y, base), 0.9 + 0.15 * ((floor + number) % 3))
-    shelf(b, (0.5 * (low[0] + high[0]), low[1] - 0.17, base), 0.0, variant=floor)
+        b.plant((x, y, base), 0.9 + 0.15 * ((floor + number) % 3))
+    b.shelf((0.5 * (low[0] + high[0]), low[1] - 0.17, base), 0.0, variant=floor)
     for x in np.arange(west + 1.1, east, 2.45):
         for y in (north - 0.5 * _AISLE, south + 0.5 * _AISLE):
-            lamp_panel(b, float(x), y, base + _HEIGHT, (0.9, 0.3), 2.0, 5.0)
+            b.lamp_panel(float(x), y, base + _HEIGHT, (0.9, 0.3), 2.0, 5.0)
     for y in np.arange(south + 3.4, north - 2.2, 2.4):
         for x in (west + 0.5 * _AISLE, east - 0.5 * _AISLE):
-            lamp_panel(b, x, float(y), base + _HEIGHT, (0.3, 0.9), 2.0, 5.0)
+            b.lamp_panel(x, float(y), base + _HEIGHT, (0.3, 0.9), 2.0, 5.0)
 
 
-def _dress_corridor(b: SceneBuilder, start: Vector, end: Vector, base: float, number: int, keep_free: bool) -> None:
+def _dress_corridor(b: RoomBuilder, start: Vector, end: Vector, base: float, number: int, keep_free: bool) -> None:
     """Add doors and what hangs between them along one wall; nothing before the way to the stairs if `keep_free`."""
-    length = skirting(b, start, end, 0.09, 0.015, Look("wood", 1.3), base)
+    length = b.skirting(start, end, 0.09, 0.015, Look("wood", 1.3), base)
     for place, along in enumerate(np.arange(1.0, length - 0.9, 1.5)):
         if keep_free and abs(start[0] + along - _DOOR) < 1.4:
             continue
         kind, variant = (number + place) % 4, 7 * number + place
         if kind == 0:
-            hang(b, start, end, float(along), base, (0.95, 2.05), Look(f"door:{variant % 12}", None), 0.05)
-            hang(b, start, end, float(along) + 0.68, base + 1.5, (0.2, 0.14), Look(f"sign:{variant % 20}", None), 0.015)
+            b.hang(start, end, float(along), base, (0.95, 2.05), Look(f"door:{variant % 12}", None), 0.05)
+            b.hang(start, end, float(along) + 0.68, base + 1.5, (0.2, 0.14), Look(f"sign:{variant % 20}", None), 0.015)
         elif kind == 1:
-            hang(b, start, end, float(along), base + 1.2, (0.6, 0.85), Look(f"poster:{variant % 24}", None))
+            b.hang(start, end, float(along), base + 1.2, (0.6, 0.85), Look(f"poster:{variant % 24}", None))
         elif kind == 2:
-            hang(b, start, end, float(along), base + 1.15, (1.0, 0.75), Look(f"board:{variant % 8}", None))
+            b.hang(start, end, float(along), base + 1.15, (1.0, 0.75), Look(f"board:{variant % 8}", None))
         else:
-            hang(b, start, end, float(along), base + 1.25, (0.9, 0.7), Look(f"painting:{variant % 16}", None))
+            b.hang(start, end, float(along), base + 1.25, (0.9, 0.7), Look(f"painting:{variant % 16}", None))
 
 
-def _with_opening(b: SceneBuilder, start: Vector, end: Vector, height: float, look: Look, base: float) -> None:
+def _with_opening(b: RoomBuilder, start: Vector, end: Vector, height: float, look: Look, base: float) -> None:
     """Add a wall along x with the way between stairs and corridor left open."""
     width, top = _OPENING
     way = 1.0 if end[0] > start[0] else -1.0
     near, far = (_DOOR - 0.5 * way * width, start[1]), (_DOOR + 0.5 * way * width, start[1])
-    wall(b, start, near, height, look, base)
-    wall(b, far, end, height, look, base)
-    wall(b, near, far, height - top, look, base + top)
+    b.wall(start, near, height, look, base)
+    b.wall(far, end, height, look, base)
+    b.wall(near, far, height - top, look, base + top)
 
 
-def _stairs(b: SceneBuilder, floor: int) -> None:
+def _stairs(b: RoomBuilder, floor: int) -> None:
     """Add one storey of the well: walls, landing, both flights up to the next floor."""
     base, half = floor * _STOREY, (floor + 0.5) * _STOREY
     paint = Look("plaster", 2.0, tint=_FLOOR_PAINTS[(floor + 1) % len(_FLOOR_PAINTS)])
     west, north, east, south = sides_of((_WIDTH, _LENGTH))
     for start, end in (west, north, east):
-        wall(b, start, end, _STOREY, paint, base)
+        b.wall(start, end, _STOREY, paint, base)
     _with_opening(b, *south, _STOREY, paint, base)
     for side in (-0.5, 0.5):
         b.box((_DOOR + side * (_OPENING[0] + 0.08), -0.06, base), (0.08, 0.16, _OPENING[1]), METAL)
     b.box((_DOOR, -0.06, base + _OPENING[1]), (_OPENING[0] + 0.16, 0.16, 0.08), METAL)
-    hang(b, *west, 0.7, base + 1.3, (0.5, 0.7), Look(f"poster:{10 + floor}", None))
-    hang(b, *east, _LENGTH - 0.7, base + 1.3, (0.45, 0.45), Look(f"sign:{floor + 5}", None))
+    b.hang(*west, 0.7, base + 1.3, (0.5, 0.7), Look(f"poster:{10 + floor}", None))
+    b.hang(*east, _LENGTH - 0.7, base + 1.3, (0.45, 0.45), Look(f"sign:{floor + 5}", None))
     if floor:
         _landing(b, base)
-    lamp_panel(b, 0.5 * _WIDTH, 0.7, base + _STOREY - 0.19, (0.8, 0.3), 2.4, 5.0)
+    b.lamp_panel(0.5 * _WIDTH, 0.7, base + _STOREY - 0.19, (0.8, 0.3), 2.4, 5.0)
     if floor < _STOREYS - 1:
         _flights(b, base, half)
         view = Look(f"window:{floor}", None, emission=0.7)
-        hang(b, *north, 0.5 * _WIDTH, half + 0.95, (1.2, 1.1), view)
-        hang(b, *east, 0.7, half + 1.2, (0.5, 0.7), Look(f"painting:{floor + 5}", None))
-        lamp_panel(b, 0.5 * _WIDTH, _LENGTH - 0.7, half + _STOREY - 0.19, (0.8, 0.3), 2.4, 7.0)
+        b.hang(*north, 0.5 * _WIDTH, half + 0.95, (1.2, 1.1), view)
+        b.hang(*east, 0.7, half + 1.2, (0.5, 0.7), Look(f"painting:{floor + 5}", None))
+        b.lamp_panel(0.5 * _WIDTH, _LENGTH - 0.7, half + _STOREY - 0.19, (0.8, 0.3), 2.4, 7.0)

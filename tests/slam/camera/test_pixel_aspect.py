@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import cv2
 import equinox as eqx
 import numpy as np
 import pytest
@@ -15,11 +13,7 @@ from recorded_run import SETTINGS, recorded_run
 
 import vggtgeo as vg
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.datasets import Frame
-from vggtgeo.datasets.views import SequenceView
-from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.pixel_aspect import FoundAspect, find_aspect
 from vggtgeo.slam.global_map import global_adjustment
 from vggtgeo.slam.global_map.global_adjustment import adjust_all, shares_focal
@@ -135,35 +129,3 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     assert adjust_all(again, SETTINGS, uncertainty=False).map.pose_sigma is None
     assert done.map.pose_sigma is not None
     assert len(tried) == 1
-
-
-class Squeezed:
-    """A simulated sequence in images of three quarters of the width, whose camera nobody knows."""
-
-    def __init__(self, source: Any) -> None:
-        self.source, self.name, self.has_depth = source, source.name, False
-        self.size = (3 * source.camera.width // 4, source.camera.height)
-        self.camera = Camera.guess(*self.size)
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def ground_truth(self) -> Any:
-        return self.source.ground_truth()
-
-    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Any:
-        for frame in self.source.frames(start, end, stride):
-            image = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
-            yield Frame(frame.index, frame.timestamp, image, None, frame.name)
-
-
-@pytest.mark.slow  # minutes: first passes, a run, its last adjustment
-def test_a_squeezed_video_without_calibration(tmp_path: Path) -> None:
-    # Proves that images alone, resized out of shape, give both focal lengths to 3 %, a word on it, and the path.
-    # Oracle: the camera that drew them, resized.
-    frames = Squeezed(vg.simulate("office", 60, size=(320, 240), rate=10.0))
-    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), options=vg.RunOptions(dense="none"))
-    expected = frames.source.camera.resized(*frames.size).intrinsics
-    np.testing.assert_allclose(result.intrinsics[:2], expected[:2], rtol=0.03)
-    assert any("not square" in note for note in result.summary["notes"])
-    assert evaluate_trajectory(result.trajectory, frames.ground_truth()).sim3.statistics.rmse < 0.02

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_keyframes import SIZE, keyframe
+from posed_keyframes import SIZE, small_keyframe
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
@@ -31,7 +31,7 @@ def _walked(begins: tuple[int, ...]) -> Slam:
     `begins` begin a submap; the others were tracked against the one before.
     """
     tracked, adjusted = _straight(1.0), _straight(1.5)
-    like = keyframe(0, np.ones(SIZE))
+    like = small_keyframe(0, np.ones(SIZE))
     keyframes = tuple(
         replace(like, number=number, frame=frame, timestamp=float(frame), pose=adjusted[frame])
         for number, frame in enumerate(KEYFRAMES)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_keyframes import INTRINSICS, SIZE, keyframe
+from posed_keyframes import INTRINSICS, SIZE, small_keyframe
 from vggtgeo.models.roles import GeometryResult, PoseGuess
 
 from vggtgeo.geometry import pinhole, rigid
@@ -37,7 +37,9 @@ def walked(rng: np.random.Generator, points: int = POINTS) -> tuple[Slam, np.nda
     """
     pixels = rng.uniform(8, [SIZE[1] - 8, SIZE[0] - 8], (points, 2))
     inverse, none = 1 / rng.uniform(2.0, 4.0, points), np.zeros(points)
-    first = keyframe(0, np.ones(SIZE), Slots(pixels, inverse, inverse, none + 0.01, none + 1, none + 1, none + np.nan))
+    first = small_keyframe(
+        0, np.ones(SIZE), Slots(pixels, inverse, inverse, none + 0.01, none + 1, none + 1, none + np.nan)
+    )
     first = replace(first, pose=exponential(np.array([0.3, 0.1, -0.2, 0.1, 0.2, 0.3])))
     motion = exponential(MOVED)
     pose = motion @ first.pose
