@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from changed import changed
 from recorded_run import RecordedRun, recorded_run
 
 from vggtgeo.mapping.dense import dense_depths
@@ -60,7 +61,6 @@ def test_a_frame_without_depth_gets_that_of_the_keyframes(run: RecordedRun) -> N
     found = dict(depth_of_frames(slam, maps))
     assert list(found) == [record.frame for record in slam.frames]
     own = found[slam.frames[row].frame]
-    assert own is not None
     known = np.isfinite(own.depth) & np.isfinite(truth)
     assert known.mean() > 0.8
     error = np.abs(own.depth - truth)[known]
@@ -68,10 +68,7 @@ def test_a_frame_without_depth_gets_that_of_the_keyframes(run: RecordedRun) -> N
     away = slam.frames[row].relative.copy()
     away[2, 3] += 0.5
     frames = [*slam.frames[:row], replace(slam.frames[row], relative=away), *slam.frames[row + 1 :]]
-    wrong = dict(depth_of_frames(replace(slam, tracker=replace(slam.tracker, frames=tuple(frames))), maps))[
-        slam.frames[row].frame
-    ]
-    assert wrong is not None
+    wrong = dict(depth_of_frames(changed(slam, "tracker", frames=tuple(frames)), maps))[slam.frames[row].frame]
     known &= np.isfinite(wrong.depth)
     assert np.median(np.abs(wrong.depth - truth)[known]) > 0.2
 
@@ -110,8 +107,6 @@ def test_a_lost_frame_has_its_own_depth_alone(run: RecordedRun) -> None:
     """A frame whose pose is lost has nothing rendered, which would be of another place; oracle: no depth."""
     row = ordinary(run.slam)
     lost = replace(run.slam.frames[row], tracked=False)
-    slam = replace(
-        run.slam, tracker=replace(run.slam.tracker, frames=(*run.slam.frames[:row], lost, *run.slam.frames[row + 1 :]))
-    )
+    slam = changed(run.slam, "tracker", frames=(*run.slam.frames[:row], lost, *run.slam.frames[row + 1 :]))
     maps = dense_depths(slam.keyframes, slam.intrinsics)
     assert dict(depth_of_frames(slam, maps))[lost.frame] is None

@@ -44,7 +44,6 @@ def walk() -> Walk:
     """Frames 18 to 49 of a walk through an office, black while the camera turns; and the truth of frames 18 to 53."""
     sequence = simulate("office", 60, 0, SIZE, rate=5.0)
     truth = sequence.ground_truth()
-    assert truth is not None
     frames = sequence.frames(18, 18 + SHOWN)
     dark = [black(frame) if row in DARK else frame for row, frame in enumerate(frames)]
     return dark, sequence.camera, truth.select(slice(18, 54))
@@ -71,7 +70,6 @@ def _disturbed(truth: Trajectory, drift: float = 0.02, scale: float = 1.05) -> T
 def _other(truth: Trajectory) -> Trajectory:
     """A recording of another part of a long walk, at the same times."""
     other = simulate("office", 160, 0, SIZE, rate=5.0).ground_truth()
-    assert other is not None
     return Trajectory(truth.timestamps, other.poses[100 : 100 + len(truth)])
 
 
@@ -102,7 +100,6 @@ def test_a_pose_between_two_recorded_ones_is_on_the_way() -> None:
     times = np.array([0.0, 1.0, 2.0, 3.0, 9.0])
     recorded = RecordedPoses(Trajectory(times, poses))
     found = recorded.pose(1.5)
-    assert found is not None
     np.testing.assert_allclose(Rotation.from_matrix(found[:3, :3]).as_rotvec(), [0, -0.15, 0], atol=1e-12)
     assert recorded.pose(5.0) is None
     assert recorded.pose(-0.1) is None

@@ -51,7 +51,6 @@ def full(slam: Slam) -> Slam:
     waiting = UnplacedFrame(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
     compressed = (slam.keyframes[0].compressed(), *slam.keyframes[1:])
     slam = merge_pending_window(slam)
-    assert slam.window.solved is not None
     adjustment, state = slam.window.solved
     one = jnp.ones(1)
     under_way: Future[Slam] = Future()

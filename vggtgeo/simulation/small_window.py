@@ -150,11 +150,11 @@ def simulate_window(
         check_whole(name, value, least)
     check_whole("seed", seed)
     errors = {"noise": noise, "outliers": outliers, "depth_error": depth_error, "start_error": start_error}
-    for name, value in errors.items():
-        check_real(name, value)
+    for name, error in errors.items():
+        check_real(name, error)
         most = 1.0 if name == "outliers" else _MAX_ERROR
-        if not 0 <= value <= most:
-            raise InputError(f"`{name}` is {value}; it must be from 0 to {most:g}")
+        if not 0 <= error <= most:
+            raise InputError(f"`{name}` is {error}; it must be from 0 to {most:g}")
     rng = np.random.default_rng(seed)
     poses = _arc(keyframes)
     host = np.repeat(np.arange(keyframes), points)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from changed import changed
 from distorted_sequence import Bent, bent
 from recorded_run import ROLES, SETTINGS, recorded_run
 from reported import raises
@@ -95,8 +96,6 @@ def test_few_keyframes_tell_no_lens() -> None:
     unmoved = lambda _, state: state
     problems = [packed(vg.simulate_window(keyframes, 12, 0)) for keyframes in (5, 7)]
     few, enough = (find_lens(problem, state, (480, 640), unmoved) for problem, state, _ in problems)
-    assert few is not None
-    assert enough is not None
     assert few.needed == float("inf")
     assert enough.needed < float("inf")
 
@@ -104,7 +103,6 @@ def test_few_keyframes_tell_no_lens() -> None:
 def test_a_lens_that_does_not_pay_is_not_taken() -> None:
     # Proves that the state stays where matches do not ask for a lens, or it folds the image. Oracle: the state.
     slam = merge_pending_window(recorded_run().states[-1])
-    assert slam.window.solved is not None
     adjustment, state = slam.window.solved
     left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
     for found in (None, left_out, replace(left_out, warp=float("inf"))):
@@ -156,9 +154,7 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
     # old place.
     before = run_of_room()
     kept = SeenPoints(np.arange(2, dtype=np.int32), np.array([[20.0, 15.0], [140.0, 90.0]], np.float32))
-    before = replace(
-        before, tracker=replace(before.tracker, frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
-    )
+    before = changed(before, "tracker", frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
     assert can_undistort(before.keyframes)
     after = undistorted(before, LENS)
     assert after.camera.lens is LENS
@@ -181,7 +177,6 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_i), old_pair.points.pixels_i, atol=1e-3)
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_j), old_pair.points.pixels_j, atol=1e-3)
     last = after.frames[-1].seen
-    assert last is not None
     np.testing.assert_allclose(redrawn(last.pixels), kept.pixels, atol=1e-3)
 
 
@@ -192,7 +187,6 @@ def test_corners_of_the_verdict_go_through_the_lens() -> None:
     nothing = np.zeros(3, np.float32)
     noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing) for r in slam.frames]
     given = aligned(slam, Claim.of(slam), noted)
-    assert given is not None
     assert len(given) == len(slam.frames) > 1
     np.testing.assert_allclose(redrawn(given[0].pixels), seen, atol=1e-3)
 
@@ -210,7 +204,7 @@ def test_a_camera_that_was_found_goes_with_its_map() -> None:
     # the run began with; and that a run in the map holds what was found. Oracle: the rule.
     guess = np.array([160.0, 160.0, 79.5, 59.5])
     known = as_map(undistorted(run_of_room(), LENS))
-    known = replace(known, camera=replace(known.camera, given=guess, sigma=np.full(4, 48.0)))
+    known = changed(known, "camera", given=guess, sigma=np.full(4, 48.0))
     within = entered(known, replace(LENS, known=True), SiftMatcher())
     assert within.camera.self_calibrated
     assert within.camera.given.tolist() == list(LENS.intrinsics)

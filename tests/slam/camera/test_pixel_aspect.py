@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pytest
+from changed import changed
 from distorted_sequence import bent
 from recorded_run import SETTINGS, recorded_run
 
@@ -108,7 +109,6 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     def stretched(problem: Problem, state: State, solve: Any) -> FoundAspect | None:
         tried.append(problem)
         found = find_aspect(problem, state, lambda _, start: start)
-        assert found is not None
         moved = eqx.tree_at(lambda s: s.intrinsics, found.state, found.state.intrinsics.at[1].multiply(1.2))
         return replace(found, state=moved, stretch=float(-np.log(1.2)), gain=1.0, needed=0.0)
 
@@ -122,9 +122,7 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     assert fy / fx == pytest.approx(1.2, rel=0.02)
     assert any("pixels that are not square" in note for note in done.notes)
     assert len(tried) == 1
-    again = replace(
-        guess, camera=replace(guess.camera, intrinsics=done.intrinsics, given=done.intrinsics, self_calibrated=True)
-    )
+    again = changed(guess, "camera", intrinsics=done.intrinsics, given=done.intrinsics, self_calibrated=True)
     assert not shares_focal(again)
     assert adjust_all(again, SETTINGS, uncertainty=False).map.pose_sigma is None
     assert done.map.pose_sigma is not None

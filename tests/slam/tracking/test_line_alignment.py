@@ -87,7 +87,6 @@ def test_lines_bring_a_wrong_start_to_the_true_motion() -> None:
         found = align_lines(
             _keyframe(points, rng, 0.02), _seen(points, MOTION, rng), _Same(8), start, NOTHING, INTRINSICS
         )
-        assert found is not None
         assert found.agreed >= 28
         off = tangent(found.motion @ rigid.invert(MOTION))
         distances.append(off @ found.information @ off)
@@ -117,7 +116,6 @@ def test_what_parallel_lines_do_not_say_is_missing() -> None:
         points = _segments(40, rng, along)
         keyframe, seen = _keyframe(points, rng, 0.02), _seen(points, MOTION, rng)
         found = align_lines(keyframe, seen, _Same(), wrong, 1e-2 * np.eye(6), INTRINSICS)
-        assert found is not None
         sigma = worst_sigma(found.information)[0]
         assert sigma > MAX_SIGMA, f"{sigma:.2f} m claimed along the lines"
         off = tangent(found.motion @ rigid.invert(MOTION))[:3]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from changed import changed
 from recorded_run import ROLES, SETTINGS, black, room, run_over
 from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
 from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery, Segments
@@ -79,7 +80,6 @@ def test_alignment_brings_a_wrong_start_to_the_true_motion(room: Room) -> None:
     wrong[:3, :3] = cv2.Rodrigues(np.array([0.02, -0.015, 0.01]))[0] @ motion[:3, :3]
     wrong[:3, 3] += [0.03, -0.02, 0.02]
     found = RgbdAlignment().align(*views, wrong)
-    assert found is not None
     off = np.linalg.norm(found.motion[:3, 3] - motion[:3, 3])
     assert off < 0.005, f"{1000 * off:.1f} mm"
     assert rigid.angle_between(found.motion, motion) < np.deg2rad(0.3)
@@ -348,7 +348,7 @@ def test_a_place_that_drift_has_moved_is_used_again(
         replace(tie, pose=away @ tie.pose) for tie in slam.map.odometry_factors if crossing(tie) and contradicted
     )
     kept = (*(factor for factor in slam.map.factors if not crossing(factor)), *cut)
-    slam = replace(slam, map=replace(slam.map, keyframes=tuple(moved), factors=kept))
+    slam = changed(slam, "map", keyframes=tuple(moved), factors=kept)
     played = [*range(len(frames) - 1, -1, -2)]
     for index, row in enumerate(played, start=len(frames)):
         frame = replace(frames[row], index=index, timestamp=index / 10)
@@ -377,24 +377,22 @@ def torn(room: Room) -> tuple[Slam, Slam]:
     frames, camera, _ = room
     seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:16], *frames[14:4:-1]))]
     whole = run_over(seen, camera)
-    whole = replace(whole, map=replace(whole.map, metric=False))
+    whole = changed(whole, "map", metric=False)
     origin = 2 * len(whole.keyframes) // 3
     own = lambda ends: len({number < origin for number in ends}) == 1
-    torn_apart = replace(
+    torn_apart = changed(
         whole,
-        map=replace(
-            whole.map,
-            roots=(0, origin),
-            pairs=tuple(pair for pair in whole.map.pairs if own(pair.key)),
-            factors=tuple(factor for factor in whole.map.factors if own(factor.keyframes)),
-        ),
+        "map",
+        roots=(0, origin),
+        pairs=tuple(pair for pair in whole.map.pairs if own(pair.key)),
+        factors=tuple(factor for factor in whole.map.factors if own(factor.keyframes)),
     )
     apart = scale_submap(torn_apart, 1.6, lambda number: number >= origin)
     moved = np.eye(4)
     moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
     moved[:3, 3] = [0.5, -1.0, 2.0]
     keyframes = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
-    return whole, replace(apart, map=replace(apart.map, keyframes=keyframes))
+    return whole, changed(apart, "map", keyframes=keyframes)
 
 
 def test_submaps_of_free_scale_join_by_a_similarity(room: Room, torn: tuple[Slam, Slam]) -> None:

@@ -62,7 +62,6 @@ def test_a_motion_without_known_depths() -> None:
     """
     length = float(np.linalg.norm(TRUE[:3, 3]))
     found = two_view_motion(_views().matches, 2 * length, INTRINSICS, PnpGeometry(), NOISE)
-    assert found is not None
     assert np.degrees(rigid.angle_between(found.motion, TRUE)) < 0.3
     cosine = found.motion[:3, 3] @ TRUE[:3, 3] / (2 * length * length)
     assert np.degrees(np.arccos(min(cosine, 1.0))) < 2.0
@@ -74,7 +73,6 @@ def test_the_information_says_that_the_length_is_a_guess() -> None:
     """
     length = float(np.linalg.norm(TRUE[:3, 3]))
     found = two_view_motion(_views().matches, length, INTRINSICS, PnpGeometry(), NOISE)
-    assert found is not None
     along = np.append(found.motion[:3, 3] / np.linalg.norm(found.motion[:3, 3]), np.zeros(3))
     deviation = 1.0 / np.sqrt(along @ found.information @ along)
     assert deviation / length == pytest.approx(0.7, rel=0.01)
