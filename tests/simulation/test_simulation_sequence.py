@@ -13,7 +13,7 @@ from vggtgeo.datasets import open_sequence
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
 from vggtgeo.simulation.decals import paint_texture
 from vggtgeo.simulation.raster import encode
-from vggtgeo.simulation.room import build_room
+from vggtgeo.simulation.rooms import build_room
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.simulation.trajectories import HandheldMotion
 

@@ -1,30 +1,20 @@
 """The bank of simulated runs: what it holds, and that recordings with a fault are still recordings."""
 
-import importlib
-import sys
 from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from benchmark_modules import benchmark
 
 import vggtgeo as vg
 from vggtgeo.simulation import IDEAL, WORLDS
 from vggtgeo.simulation.degradations import Recording
 
 
-def _benchmark(name: str) -> ModuleType:
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
-
-
 @pytest.fixture(scope="module")
 def bank() -> ModuleType:
-    return _benchmark("verdict_bank")
+    return benchmark("verdict_bank")
 
 
 def test_half_of_the_runs_are_healthy_and_the_halves_share_no_seed(bank: ModuleType) -> None:
