@@ -185,21 +185,10 @@ def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
     assert "this result means nothing" in (tmp_path / "run" / "report.html").read_text()
 
 
-def test_roles_are_mixed_by_name(files: Path) -> None:
-    # Proves that a role is played by whom its name says, on top of a preset too, that no other network is opened, and
-    # the error of a name that is not there. Oracle: the classes, and the networks opened.
-    classical = Roles()
-    found = perception("classical", classical, files, mixed={"lines": "mlsd", "depth": "moge2-small"})
-    assert set(found.networks) == {"mlsd", "moge2-small"}
-    assert type(found.roles.lines.source).__name__ == "MlsdDetector"
-    assert type(found.roles.depth.source).__name__ == "MogeDepth"
-    assert found.roles.points is classical.points
-    less = perception("light", classical, files, mixed={"depth": "classical", "lines": "letr"})
-    assert set(less.networks) == {"dinov3-small", "letr"}
-    assert less.roles.depth is classical.depth
-    assert less.roles.line_matches.source.features is less.roles.confidence.source
+def test_a_role_takes_networks_of_its_kind_alone(files: Path) -> None:
+    # Proves the error of a name that cannot play a role. Oracle: the names of those who can.
     with pytest.raises(InputError, match="`lines` is 'moge2'; what can be mixed is points: classical, orb, mast3r,"):
-        perception("classical", classical, files, mixed={"lines": "moge2"})
+        perception("classical", Roles(), files, mixed={"lines": "moge2"})
 
 
 def test_every_mixture_of_roles_is_reached_from_the_command_line(
