@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from posed_keyframes import keyframe_of
 from vggtgeo.models.classical import NoDepth
-from vggtgeo.models.roles import Features, PointMatches
+from vggtgeo.models.roles import Features, LineFeatures, PointMatches, Segments
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
@@ -65,7 +65,9 @@ def _keyframe(number: int, pose: np.ndarray, pixels: np.ndarray) -> Keyframe:
     """Return a keyframe of key points at one depth, without segments."""
     ones, unknown = np.ones(len(pixels)), np.full(len(pixels), np.nan)
     points = Slots(pixels, ones / DEPTH, unknown, unknown, ones, ones, 1e-4 * ones)
-    return keyframe_of(number, np.zeros((HEIGHT, WIDTH, 3), np.uint8), pose, points, np.zeros((HEIGHT, WIDTH)))
+    lines = LineFeatures(Segments(np.zeros((0, 2, 2)), np.zeros(0)), np.zeros((0, 128), np.float32))
+    made = keyframe_of(number, np.zeros((HEIGHT, WIDTH, 3), np.uint8), pose, points, np.zeros((HEIGHT, WIDTH)))
+    return replace(made, lines=lines)
 
 
 class _TrueMatches:
