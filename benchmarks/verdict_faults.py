@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from camera_errors import KINECT, STEREO, auto_exposed, exposed, late_depth, late_truth, vignetted
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import IDEAL, WORLDS, SyntheticSequence
-from vggtgeo.simulation.camera_errors import auto_exposed, exposed, late_depth, late_truth, vignetted
 from vggtgeo.simulation.degradations import (
     DEGRADATIONS,
     Recording,
@@ -24,7 +24,6 @@ from vggtgeo.simulation.degradations import (
     wrong_focal,
     zooming,
 )
-from vggtgeo.simulation.depth_sensors import KINECT, STEREO
 from vggtgeo.simulation.sequence import camera_of
 from vggtgeo.simulation.trajectories import HandheldMotion
 

@@ -59,14 +59,6 @@ def test_projection_is_that_of_opencv(name: str, widest: float) -> None:
     np.testing.assert_allclose(found, by_opencv(name, seen), atol=1e-8)
 
 
-@pytest.mark.parametrize(("name", "widest"), [("pinhole", 2.0), ("radial-tangential", 0.9), ("fisheye", 3.0)])
-def test_unprojection_is_the_inverse(name: str, widest: float) -> None:
-    # Proves `unproject`, of pixels that OpenCV drew. Oracle: the direction of the points that they are of.
-    seen = points(widest)
-    rays = jax.jit(jax.vmap(camera_of(name).unproject))(jnp.asarray(by_opencv(name, seen)))
-    np.testing.assert_allclose(rays, seen / seen[:, 2:], atol=1e-9)
-
-
 def orders(function: Callable, x: jax.Array) -> tuple[jax.Array, ...]:
     """Value, first and second derivative."""
     return function(x), jax.jacfwd(function)(x), jax.jacfwd(jax.jacfwd(function))(x)

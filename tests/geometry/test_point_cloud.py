@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.geometry.cells import cell_numbers
-from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.point_cloud import PointCloud, cell_numbers
 
 
 def _cloud(count: int = 100) -> PointCloud:

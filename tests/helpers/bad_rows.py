@@ -279,7 +279,7 @@ CLOUDS = [
     Row(
         "truncated",
         "cloud that declares 10^15 points",
-        ("map.ply", "1000000000000000"),
+        ("map.ply", "vertex"),
         bad.ply(f"format binary_little_endian 1.0\nelement vertex 1000000000000000\n{XYZ}", bytes(999)),
         **CLOUD,
     ),

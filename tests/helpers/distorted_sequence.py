@@ -1,12 +1,16 @@
-"""A sequence seen through a lens that distorts."""
+"""A sequence, and a window of matches, seen through a lens that distorts."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+import vggtgeo as vg
 from vggtgeo.datasets import Frame
 from vggtgeo.geometry.camera import Camera
 
@@ -30,3 +34,13 @@ class Bent:
         for frame in self.source.frames(start, end, stride):
             image = cv2.remap(frame.image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             yield Frame(frame.index, frame.timestamp, image, None, frame.name)
+
+
+def bent(window: vg.data.SimulatedWindow, *distortion: float, squeeze: float = 1.0) -> vg.data.SimulatedWindow:
+    """Its key points and matches as a lens of these k1 and k2 draws them, in images of `squeeze` times the width."""
+    lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *distortion, 0.0, 0.0]))
+    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
+    bend = jax.jit(jax.vmap(lambda pixel: lens.project(straight.unproject(pixel))))
+    drawn = lambda pixels: (np.asarray(bend(jnp.asarray(pixels))) + 0.5) * np.array([squeeze, 1.0]) - 0.5
+    seen = window.observations
+    return replace(window, observations=replace(seen, point_target=drawn(seen.point_target), pixel=drawn(seen.pixel)))

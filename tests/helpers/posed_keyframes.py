@@ -8,6 +8,10 @@ from vggtgeo.models.roles import Features, LineFeatures, Segments
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 
+SIZE = (120, 160)
+INTRINSICS = np.array([160.0, 160.0, 79.5, 59.5])
+"""Of the small keyframes."""
+
 
 def slots_of(pixels: np.ndarray, inverse: np.ndarray) -> Slots:
     one = np.ones(len(inverse))
@@ -36,3 +40,11 @@ def keyframe_of(
         samples=slots_of(np.zeros((0, 2)), none),
         sample_segment=np.zeros(0, int),
     )
+
+
+def small_keyframe(number: int, depth: np.ndarray, slots: Slots | None = None) -> Keyframe:
+    """A camera 2 cm to the right of the one before, with a depth image and, if given, slots."""
+    pose = np.eye(4)
+    pose[0, 3] = -0.02 * number
+    empty = slots_of(np.zeros((0, 2)), np.zeros(0))
+    return keyframe_of(number, np.zeros((*SIZE, 3), np.uint8), pose, slots or empty, depth)

@@ -1,14 +1,18 @@
-"""A short simulated run for the tests of what is drawn: its last state, its map, and all that was seen on the way."""
+"""Short simulated runs: their settings, frames and states, and all that was seen on the way of one of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cache
 
+import numpy as np
 from vggtgeo.models.classical import SiftMatcher
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.simulation import SyntheticSequence, simulate
@@ -21,12 +25,29 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
 
 FRAMES = 9
-# The shape of tests/slam/test_pipeline.py, so that a process that runs both compiles the solver once.
+# One small window shape for the tests of runs, so that the solver is compiled once a process.
 SETTINGS = SlamSettings(
     window=WindowSettings(size=4, point_slots=96, line_slots=48),
     refinement=GlobalMapSettings(global_adjustment=False),
 )
 ROLES = Roles(points=SiftMatcher(count=500))
+
+
+@cache
+def room() -> tuple[list[Frame], Camera, Trajectory]:
+    """24 frames of a walk through a room, their camera and the true poses."""
+    sequence = simulate("room", 24, 0, (320, 240), rate=10.0)
+    return list(sequence.frames()), sequence.camera, sequence.ground_truth()
+
+
+def run_over(frames: Iterable[Frame], camera: Camera, roles: Roles = ROLES, settings: SlamSettings = SETTINGS) -> Slam:
+    """The state after these frames, with its last window adjusted."""
+    return merge_pending_window(list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1])
+
+
+def black(frame: Frame) -> Frame:
+    """The frame as it is in the dark: a black image without depth."""
+    return replace(frame, image=np.zeros_like(frame.image), depth=np.full(frame.image.shape[:2], np.nan, np.float32))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_layouts
-import tiny_sequences
+from changed import changed
 from recorded_run import RecordedRun, recorded_run
 
-from vggtgeo.cli.run_sequence import _reopen
-from vggtgeo.datasets import open_sequence
-from vggtgeo.mapping.consistency import PosedDepth
 from vggtgeo.mapping.dense import dense_depths
-from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.depth_map import DepthMap, PosedDepth
 from vggtgeo.mapping.frame_depth import rendered_depth
 from vggtgeo.results.reread_frames import depth_of_frames
-from vggtgeo.slam.run import default_roles
-from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
 
 CAMERA = np.array([200.0, 200.0, 79.5, 59.5])
@@ -68,7 +61,6 @@ def test_a_frame_without_depth_gets_that_of_the_keyframes(run: RecordedRun) -> N
     found = dict(depth_of_frames(slam, maps))
     assert list(found) == [record.frame for record in slam.frames]
     own = found[slam.frames[row].frame]
-    assert own is not None
     known = np.isfinite(own.depth) & np.isfinite(truth)
     assert known.mean() > 0.8
     error = np.abs(own.depth - truth)[known]
@@ -76,10 +68,7 @@ def test_a_frame_without_depth_gets_that_of_the_keyframes(run: RecordedRun) -> N
     away = slam.frames[row].relative.copy()
     away[2, 3] += 0.5
     frames = [*slam.frames[:row], replace(slam.frames[row], relative=away), *slam.frames[row + 1 :]]
-    wrong = dict(depth_of_frames(replace(slam, tracker=replace(slam.tracker, frames=tuple(frames))), maps))[
-        slam.frames[row].frame
-    ]
-    assert wrong is not None
+    wrong = dict(depth_of_frames(changed(slam, "tracker", frames=tuple(frames)), maps))[slam.frames[row].frame]
     known &= np.isfinite(wrong.depth)
     assert np.median(np.abs(wrong.depth - truth)[known]) > 0.2
 
@@ -118,17 +107,6 @@ def test_a_lost_frame_has_its_own_depth_alone(run: RecordedRun) -> None:
     """A frame whose pose is lost has nothing rendered, which would be of another place; oracle: no depth."""
     row = ordinary(run.slam)
     lost = replace(run.slam.frames[row], tracked=False)
-    slam = replace(
-        run.slam, tracker=replace(run.slam.tracker, frames=(*run.slam.frames[:row], lost, *run.slam.frames[row + 1 :]))
-    )
+    slam = changed(run.slam, "tracker", frames=(*run.slam.frames[:row], lost, *run.slam.frames[row + 1 :]))
     maps = dense_depths(slam.keyframes, slam.intrinsics)
     assert dict(depth_of_frames(slam, maps))[lost.frame] is None
-
-
-def test_the_command_reads_every_frame_reopen(tmp_path: Path) -> None:
-    # Proves that pictures of frames without depth are kept, too, and that depth which no role used is not read.
-    images = tiny_layouts.quietly_opened(tiny_sequences.images(tmp_path / "images"))
-    both = open_sequence(tiny_sequences.tum(tmp_path / "tum"))
-    assert len(list(_reopen(images, default_roles(False), SlamSettings()).frames())) == len(images)
-    assert _reopen(both, default_roles(True), SlamSettings()).has_depth
-    assert not _reopen(both, default_roles(False), SlamSettings()).has_depth

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from posed_keyframes import INTRINSICS, SIZE, small_keyframe
 from scipy.ndimage import gaussian_filter
-from small_keyframes import INTRINSICS, SIZE, keyframe
 
 from vggtgeo.mapping.keyframe_depth import fused_depths, optimised_depth
 from vggtgeo.slam.sparse_map.keyframe import Slots
@@ -25,9 +25,8 @@ def test_views_of_one_wall_are_averaged() -> None:
     depths = [WALL * np.exp(smooth_error(rng)) for _ in range(12)]
     depths[6][:10, :10] = np.nan
     depths[6][80:100, 60:100] = 1.5
-    fused = fused_depths([keyframe(number, depth) for number, depth in enumerate(depths)], INTRINSICS)
+    fused = fused_depths([small_keyframe(number, depth) for number, depth in enumerate(depths)], INTRINSICS)
     found = fused[6]
-    assert found is not None
     wall = np.abs(depths[6] - 1.5) > 0.01
     wall[72:108, 52:108] = False  # the cells at the box's rim
     error = lambda depth: np.sqrt(np.nanmean((depth[wall] - WALL) ** 2))
@@ -46,12 +45,12 @@ def test_slots_correct_what_is_around_them() -> None:
     one = np.ones(count)
     slots = Slots(pixels, np.full(count, 1 / WALL), inverse, 0.05 * inverse, one, one, np.nan * one)
     error = lambda depth: np.sqrt(np.mean((depth - WALL) ** 2))
-    assert error(optimised_depth(keyframe(0, prior, slots))) < 0.5 * error(prior)
-    assert error(optimised_depth(keyframe(0, prior, slots), np.full(SIZE, 1.02 * WALL, np.float32))) < 0.01 * WALL
+    assert error(optimised_depth(small_keyframe(0, prior, slots), prior.astype(np.float32))) < 0.5 * error(prior)
+    assert error(optimised_depth(small_keyframe(0, prior, slots), np.full(SIZE, 1.02 * WALL, np.float32))) < 0.01 * WALL
 
 
 def test_a_keyframe_without_depth_has_none() -> None:
     # Proves the mixture of keyframes with and without depth. Oracle: None and the depth given.
-    fused = fused_depths([keyframe(0, np.full(SIZE, np.nan)), keyframe(1, np.full(SIZE, WALL))], INTRINSICS)
+    fused = fused_depths([small_keyframe(0, np.full(SIZE, np.nan)), small_keyframe(1, np.full(SIZE, WALL))], INTRINSICS)
     assert fused[0] is None
     assert fused[1] == pytest.approx(WALL, rel=1e-3)

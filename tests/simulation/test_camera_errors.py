@@ -1,23 +1,18 @@
-"""Errors of real cameras on simulated recordings, against renderings of the same moments."""
+"""Errors of real cameras on simulated recordings, against renderings of the same moments, and formulas."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from benchmark_modules import benchmark
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation import IDEAL, SyntheticSequence
-from vggtgeo.simulation.camera_errors import (
-    auto_exposed,
-    exposed,
-    late_depth,
-    late_truth,
-    motion_field,
-    vignetted,
-)
 from vggtgeo.simulation.degradations import Recording, camera_velocities
 
+errors_of = benchmark("camera_errors")
 RATE = 25.0
 INNER = (slice(8, -8), slice(8, -8))
 """Without the border, where pixels come from outside the image."""
@@ -42,7 +37,7 @@ def test_the_motion_field_is_the_derivative_of_the_projection() -> None:
     rng = np.random.default_rng(0)
     intrinsics, velocity, step = (90.0, 80.0, 30.0, 20.0), rng.normal(0, 0.3, 6), 1e-5
     depth = rng.uniform(1, 4, (40, 60))
-    field, nearing = motion_field(depth, velocity, intrinsics)
+    field, nearing = errors_of.motion_field(depth, velocity, intrinsics)
     v, u = np.mgrid[:40, :60].astype(float)
     points = np.stack([(u - 30) / 90 * depth, (v - 20) / 80 * depth, depth], -1)
     moved = points + step * (np.cross(velocity[3:], points) + velocity[:3])
@@ -66,7 +61,7 @@ def test_the_velocity_is_the_motion_of_points_of_the_camera(recording: Recording
 def test_shutters_draw_what_the_renderer_draws(recording: Recording, errors: dict[str, float]) -> None:
     # Proves rolling shutter and motion blur. Oracle: renderings of each row's, and each instant's, own pose.
     true = _walk(**errors).frame(2).image
-    drawn = exposed(recording, errors.get("readout_time", 0.0), errors.get("exposure_time", 0.0)).frames[2]
+    drawn = errors_of.exposed(recording, errors.get("readout_time", 0.0), errors.get("exposure_time", 0.0)).frames[2]
     sharp = _difference(recording.frames[2].image, true)
     assert _difference(drawn.image, true) < 0.5 * sharp, (_difference(drawn.image, true), sharp)
     np.testing.assert_array_equal(drawn.depth, recording.frames[2].depth)
@@ -78,13 +73,13 @@ def test_late_depth_is_that_of_the_moment_before(recording: Recording) -> None:
     # Medians: at the edges of surfaces depth jumps.
     off = lambda depth: float(np.median(np.abs(depth - true)[INNER]))
     here = off(recording.frames[2].depth)
-    late, early = (off(late_depth(recording, seconds).frames[2].depth) for seconds in (0.01, -0.01))
+    late, early = (off(errors_of.late_depth(recording, seconds).frames[2].depth) for seconds in (0.01, -0.01))
     assert late < 0.4 * here < 0.3 * early, (late, here, early)
 
 
 def test_late_truth_keeps_the_poses(recording: Recording) -> None:
     # Proves that the truth's clock alone moves. Oracle: the times before.
-    late = late_truth(recording, 0.005).truth
+    late = errors_of.late_truth(recording, 0.005).truth
     np.testing.assert_allclose(late.timestamps - recording.truth.timestamps, 0.005)
     np.testing.assert_array_equal(late.poses, recording.truth.poses)
 
@@ -93,7 +88,7 @@ def test_corners_are_dark_and_the_middle_is_not() -> None:
     # Proves the share of light that is missing. Oracle: a white image.
     sequence = _walk()
     white = replace(sequence.frame(0), image=np.full((91, 121, 3), 200, np.uint8), depth=None)
-    image = vignetted(Recording([white], sequence.camera, sequence.ground_truth()), 0.3).frames[0].image
+    image = errors_of.vignetted(Recording([white], sequence.camera, sequence.ground_truth()), 0.3).frames[0].image
     assert image[45, 60, 0] == 200
     assert (image[0, 0, 0], image[-1, -1, 0]) == (140, 140)
 
@@ -104,7 +99,66 @@ def test_exposure_follows_the_brightness_with_a_lag() -> None:
     first = replace(sequence.frame(0), depth=None)
     levels = [60] * 10 + [120] * 40
     frames = [replace(first, index=k, image=np.full((9, 12, 3), v, np.uint8)) for k, v in enumerate(levels)]
-    adapted = auto_exposed(Recording(frames, sequence.camera, sequence.ground_truth()), 1.0, 4.0).frames
+    adapted = errors_of.auto_exposed(Recording(frames, sequence.camera, sequence.ground_truth()), 1.0, 4.0).frames
     means = np.array([frame.image.mean() for frame in adapted])
     assert means[10] > 1.5 * means[9], means
     assert abs(means[-1] - means[9]) < 0.02 * means[9], means
+
+
+CLEAN = errors_of.DisparitySensor(focal_baseline=40.0, noise=0.0, grain=0.0, step=0.0, window=0.0, far=100.0)
+
+
+def _measured(sensor: Any, depth: np.ndarray) -> np.ndarray:
+    return sensor.measured(depth, np.random.default_rng(0))
+
+
+def test_a_sensor_without_errors_measures_exact_depth() -> None:
+    # Proves that depth survives the way through disparity, and that nothing stays nothing. Oracle: the depth given.
+    depth = np.full((30, 40), 2.0)
+    depth[3, 4] = np.nan
+    np.testing.assert_allclose(_measured(CLEAN, depth), depth, rtol=1e-6)
+
+
+@pytest.mark.parametrize("grain", [0.0, 4.0])
+def test_noise_grows_with_the_square_of_depth(grain: float) -> None:
+    # Proves `dz = z^2 / (f b) dd`. Oracle: the formula, at two depths.
+    sensor = replace(CLEAN, noise=0.05, grain=grain)
+    for z in (1.0, 3.0):
+        spread = np.std(_measured(sensor, np.full((200, errors_of.NATIVE_WIDTH), z)))
+        assert abs(spread / (z**2 / 40.0 * 0.05) - 1) < 0.1, (z, spread)
+
+
+def test_depth_is_quantised_in_disparity() -> None:
+    # Proves the steps of depth. Oracle: whole multiples of the step, no farther than half of it.
+    depth = np.tile(np.linspace(1, 4, errors_of.NATIVE_WIDTH), (4, 1))
+    disparity = 40.0 / _measured(replace(CLEAN, step=0.125), depth)
+    seen = np.isfinite(disparity)
+    np.testing.assert_allclose(disparity[seen] / 0.125, np.rint(disparity[seen] / 0.125), atol=1e-3)
+    assert np.abs(disparity - 40.0 / depth)[seen].max() <= 0.0626
+
+
+def test_a_nearer_surface_casts_a_shadow_as_wide_as_the_difference_of_disparity() -> None:
+    # Proves the holes beside edges: on one side alone, of `f b (1 / near - 1 / far)` pixels. Oracle: the formula.
+    depth = np.full((10, errors_of.NATIVE_WIDTH), 4.0)
+    depth[:, 300:400] = 1.0
+    hole = np.isnan(_measured(CLEAN, depth))
+    assert not hole[:, 300:].any()
+    assert abs(hole[5].sum() - 30) <= 1, hole[5].sum()
+    assert hole[5, 299]
+
+
+def test_a_window_makes_nearer_surfaces_larger() -> None:
+    # Proves the bleeding of edges: by half a window on both sides, of the nearer surface's depth. Oracle: the window.
+    depth = np.full((60, errors_of.NATIVE_WIDTH), 4.0)
+    depth[:, 300:400] = 1.0
+    measured = _measured(replace(CLEAN, window=8.0), depth)
+    assert np.flatnonzero(np.isclose(measured[30], 1.0))[[0, -1]].tolist() == [296, 403]
+
+
+@pytest.mark.parametrize("sensor", [errors_of.KINECT, errors_of.STEREO])
+def test_nothing_is_measured_too_far_away(sensor: Any) -> None:
+    # Proves the reach of the sensors. Oracle: a wall beyond it, and one before.
+    assert np.isnan(_measured(sensor, np.full((20, 30), 1.5 * sensor.far))).all()
+    near = _measured(sensor, np.full((20, 30), 2.0))
+    assert np.isfinite(near).all()
+    assert 0 < np.abs(near - 2.0).max() < 0.08

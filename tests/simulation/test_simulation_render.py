@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from vggtgeo.simulation import IDEAL, Scene, SyntheticSequence, render, simulate
-from vggtgeo.simulation.furniture import lamp_panel
+from vggtgeo.simulation.furniture import RoomBuilder
 from vggtgeo.simulation.raster import encode, inverse_depth_at, surface_coordinates, view_from
 from vggtgeo.simulation.scene import finish
 from vggtgeo.simulation.shapes import Look, SceneBuilder
@@ -39,11 +39,11 @@ def walk() -> SyntheticSequence:
 
 @pytest.fixture(scope="module")
 def shapes() -> Scene:
-    b = SceneBuilder(1)
+    b = RoomBuilder(1)
     b.rectangle((-5, -5, 0), (10, 0, 0), (0, 10, 0), PLAIN)
     b.box((0.5, 2.0, 0.0), (1.0, 0.8, 1.2), PLAIN, yaw=0.4)
     b.cylinder((-1.0, 2.5, 0.0), 0.4, 0.9, PLAIN)
-    lamp_panel(b, 0, 0, 3.0)
+    b.lamp_panel(0, 0, 3.0)
     return finish(b, "shapes", ambient=0.0, texel=0.2)
 
 

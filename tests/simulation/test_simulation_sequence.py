@@ -11,10 +11,10 @@ from vggtgeo.cli.simulate import parse_size
 from vggtgeo.cli.simulate import simulate as simulate_command
 from vggtgeo.datasets import open_sequence
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
+from vggtgeo.simulation.decals import paint_texture
 from vggtgeo.simulation.raster import encode
-from vggtgeo.simulation.room import build_room
+from vggtgeo.simulation.rooms import build_room
 from vggtgeo.simulation.sequence import write_tum_folder
-from vggtgeo.simulation.textures import paint_texture
 from vggtgeo.simulation.trajectories import HandheldMotion
 
 SIZE = (96, 72)

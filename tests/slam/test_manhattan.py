@@ -63,7 +63,6 @@ def test_a_prediction_names_the_axes() -> None:
     segments, truth = view_of_a_box(rng)
     predicted = Rotation.from_rotvec([0.03, -0.02, 0.03]).as_matrix() @ truth
     view = ManhattanEstimator().estimate(segments, INTRINSICS, predicted)
-    assert view is not None
     assert np.abs(view.rotation - truth).max() < np.deg2rad(0.5)
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from changed import changed
 
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.pending_window import LAG, begin_window, is_due, merge_pending_window
@@ -34,7 +35,7 @@ def _tie(first: int, second: int) -> MeasuredRelativePose:
 def test_what_was_noted_meanwhile_is_kept() -> None:
     """Window, camera and notes of the adjustment, and the frames, factors and notes of tracking; oracle: by hand."""
     early, found, late = _tie(0, 1), _tie(1, 2), _tie(0, 2)
-    begun = replace(STATE, map=replace(STATE.map, factors=(early,)))
+    begun = changed(STATE, "map", factors=(early,))
     slam = begin_window(
         begun,
         lambda: replace(
@@ -65,12 +66,13 @@ def test_what_was_noted_meanwhile_is_kept() -> None:
 def test_it_is_due_by_the_number_of_frames() -> None:
     """Not before `LAG` frames after the keyframe's own, however soon it is done; oracle: the count."""
     slam = begin_window(STATE, lambda: STATE)
-    assert slam.pending is not None
     slam.pending.result.result()
     frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
-    assert [
-        is_due(replace(slam, tracker=replace(slam.tracker, frames=(frame,) * count))) for count in (1, LAG, LAG + 1)
-    ] == [False, False, True]
+    assert [is_due(changed(slam, "tracker", frames=(frame,) * count)) for count in (1, LAG, LAG + 1)] == [
+        False,
+        False,
+        True,
+    ]
     assert not is_due(merge_pending_window(slam))
 
 
@@ -84,8 +86,6 @@ def test_a_state_that_waits_for_a_window_pickles_and_copies(again: Callable[[Sla
         ),
     )
     found = again(slam)
-    assert found.pending is not None
-    assert slam.pending is not None
     assert found.pending.due == slam.pending.due
     after = merge_pending_window(found)
     assert after.window.members == (1, 2)

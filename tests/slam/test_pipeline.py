@@ -10,8 +10,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from changed import changed
+from recorded_run import ROLES, SETTINGS, black, room, run_over
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.classical import ConstantVelocity, NoDepth, SiftMatcher
+from vggtgeo.models.classical import NoDepth, SiftMatcher
 from vggtgeo.models.roles import Features, PointMatches
 
 from vggtgeo.bundle.terms.relative_pose import RelativePose
@@ -23,16 +25,13 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.summary import list_submaps
 from vggtgeo.simulation import simulate
-from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import compile_global, expected_keyframes
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
-from vggtgeo.slam.global_map.global_shape import padded_count, padded_edges, shape_for
+from vggtgeo.slam.global_map.global_shape import shape_for
 from vggtgeo.slam.global_map.loops import close_loops
-from vggtgeo.slam.pending_window import merge_pending_window
-from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.run import finish, frame_trajectory
+from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.factors import FREE_LENGTH
 from vggtgeo.slam.state import Slam
@@ -40,31 +39,20 @@ from vggtgeo.slam.window.sliding_window import solve_jit, window_problem
 from vggtgeo.slam.window_steps import adjust_window, camera_prior
 
 SIZE = (320, 240)
-# One small window shape for all tests of this file, so that the solver is compiled once.
-SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48),
-    refinement=GlobalMapSettings(global_adjustment=False),
-)
-ROLES = Roles(points=SiftMatcher(count=500))
+Room = tuple[list[Frame], Camera, Trajectory]
+
+
+@pytest.fixture(scope="module", name="room")
+def _room() -> Room:
+    return room()
 
 
 @pytest.fixture(scope="module")
-def room() -> tuple[list[Frame], Camera, object]:
-    sequence = simulate("room", 24, 0, SIZE, rate=10.0)
-    return list(sequence.frames()), sequence.camera, sequence.ground_truth()
+def tracked(room: Room) -> Slam:
+    return run_over(*room[:2])
 
 
-def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES, settings: SlamSettings = SETTINGS) -> Slam:
-    return merge_pending_window(list(run_frames(iter(frames), camera, roles, settings, Clock()))[-1])
-
-
-@pytest.fixture(scope="module")
-def tracked(room) -> Slam:
-    frames, camera, _ = room
-    return _run(frames, camera)
-
-
-def test_rgbd_recovers_the_truth(room, tracked: Slam) -> None:
+def test_rgbd_recovers_the_truth(room: Room, tracked: Slam) -> None:
     """ATE below 1.5 cm on a synthetic room with sensor noise, every frame tracked; oracle: the renderer's poses."""
     report = evaluate_trajectory(frame_trajectory(tracked), room[2])
     error = report.se3.statistics.rmse
@@ -73,15 +61,15 @@ def test_rgbd_recovers_the_truth(room, tracked: Slam) -> None:
     assert error < 0.015, f"ATE {error:.4f} m"
 
 
-def test_single_precision_of_the_caller_changes_nothing(room, tracked: Slam) -> None:
+def test_single_precision_of_the_caller_changes_nothing(room: Room, tracked: Slam) -> None:
     """A caller who has not switched 64-bit types on gets the same path; oracle: the run with them, bit for bit."""
     frames, camera, _ = room
     with jax.enable_x64(False):
-        again = _run(frames, camera)
+        again = run_over(frames, camera)
     np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
 
 
-def test_how_long_a_window_takes_changes_nothing(room, tracked: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_how_long_a_window_takes_changes_nothing(room: Room, tracked: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows are adjusted beside tracking, and taken up at a frame, not at a time; oracle: the run in which they come
     early, bit for bit.
     """
@@ -92,21 +80,20 @@ def test_how_long_a_window_takes_changes_nothing(room, tracked: Slam, monkeypatc
         return adjust_window(slam, settings)
 
     monkeypatch.setattr("vggtgeo.slam.pipeline.adjust_window", late)
-    again = _run(frames, camera)
+    again = run_over(frames, camera)
     np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
 
 
 @pytest.mark.slow
-def test_two_ends_lines_recover_the_truth(room) -> None:
+def test_two_ends_lines_recover_the_truth(room: Room) -> None:
     """ATE below 1.5 cm where each segment has two unknowns; oracle: the renderer's poses."""
     frames, camera, truth = room
-    slam = _run(frames, camera, settings=updated(SETTINGS, {"line": {"two_ends_lines": True}}))
-    assert slam.window.solved is not None
+    slam = run_over(frames, camera, settings=updated(SETTINGS, {"line": {"two_ends_lines": True}}))
     assert slam.window.solved[0].problem.fraction is not None
     assert evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse < 0.015
 
 
-def test_no_recompilation_after_the_first_window(room, tracked: Slam) -> None:
+def test_no_recompilation_after_the_first_window(room: Room, tracked: Slam) -> None:
     """A second pass compiles nothing; oracle: JAX's own events of compilation."""
     frames, camera, _ = room
     compiled: list[str] = []
@@ -120,7 +107,7 @@ def test_no_recompilation_after_the_first_window(room, tracked: Slam) -> None:
         jax.jit(lambda x: x + len(frames))(np.ones(3))
         assert compiled, "the event that is counted is not sent any more"
         compiled.clear()
-        slam = _run(frames, camera)
+        slam = run_over(frames, camera)
     finally:
         jax.monitoring.clear_event_listeners()
     assert len(slam.keyframes) > SETTINGS.window.size
@@ -146,13 +133,13 @@ def _shaken(slam: Slam, metres: float, degrees: float, from_keyframe: int = 1, t
         centre = np.zeros(3) if together else rigid.centre(keyframes[number].pose)
         motion[:3, 3] = centre + metres * shift - motion[:3, :3] @ centre
         keyframes[number] = replace(keyframes[number], pose=keyframes[number].pose @ rigid.invert(motion))
-    return replace(slam, map=replace(slam.map, keyframes=tuple(keyframes)))
+    return changed(slam, "map", keyframes=tuple(keyframes))
 
 
 @pytest.mark.parametrize(
     "surfaces", [pytest.param(300.0, id="with surfaces"), pytest.param(0.0, id="matches alone", marks=pytest.mark.slow)]
 )
-def test_global_adjustment_brings_a_map_back(room, tracked: Slam, surfaces: float) -> None:
+def test_global_adjustment_brings_a_map_back(room: Room, tracked: Slam, surfaces: float) -> None:
     """Keyframes moved by 5 cm and 2 degrees each come back to below 1 cm; oracle: the renderer's poses."""
     settings = updated(
         SETTINGS,
@@ -189,13 +176,10 @@ def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
     assert expected_keyframes(6, 30, 100) == 20
     assert expected_keyframes(6, 31, 100) is None
     assert [expected_keyframes(count, 31, None) for count in (7, 8, 70)] == [None, 8, 70]
-    assert [padded_edges(edges, 64) for edges in (0, 512, 513, 768, 769, 1024)] == [512, 512, 768, 768, 1024, 1024]
-    assert padded_edges(10, 16) == 256
-    assert [padded_count(count) for count in (1, 16, 17, 64, 65, 96, 97, 129)] == [16, 16, 64, 64, 96, 96, 128, 192]
 
 
 @pytest.mark.long
-def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
+def test_a_loop_joins_what_has_come_apart(room: Room, tracked: Slam) -> None:
     """A map cut in two, its later part moved by 5 cm and 2 degrees: only matches of places seen before join it again.
 
     Oracle: the renderer's poses; and the same adjustment without the loops, which leaves the parts where they are.
@@ -207,7 +191,7 @@ def test_a_loop_joins_what_has_come_apart(room, tracked: Slam) -> None:
     apart = _shaken(tracked, 0.05, 2.0, from_keyframe=middle, together=True)
     within = [pair for pair in apart.map.pairs if (pair.first < middle) == (pair.second < middle)]
     tied = [f for f in apart.map.factors if len({number < middle for number in f.keyframes}) == 1]
-    apart = replace(apart, map=replace(apart.map, pairs=tuple(within), factors=tuple(tied)))
+    apart = changed(apart, "map", pairs=tuple(within), factors=tuple(tied))
     assert len(within) < len(tracked.map.pairs)
     closed = close_loops(apart, ROLES, settings)
     assert any(pair.first < middle <= pair.second for pair in closed.map.pairs[len(within) :])
@@ -254,11 +238,11 @@ def test_a_second_visit_far_off_is_brought_back(tracked: Slam) -> None:
 
 
 @pytest.mark.long
-def test_rgb_recovers_the_shape(room) -> None:
+def test_rgb_recovers_the_shape(room: Room) -> None:
     """Without depth the trajectory is right up to scale, and the state says that lengths are not metres."""
     frames, camera, truth = room
     colour = [replace(frame, depth=None) for frame in frames]
-    slam = _run(colour, camera, replace(ROLES, depth=NoDepth()))
+    slam = run_over(colour, camera, replace(ROLES, depth=NoDepth()))
     error = evaluate_trajectory(frame_trajectory(slam), truth).sim3.statistics.rmse
     assert not slam.metric
     assert len(slam.frames) == len(frames)
@@ -300,10 +284,10 @@ def _blind(frames: list[Frame], numbers: Iterable[int]) -> list[Frame]:
     return [replace(frame, depth=nothing) if frame.index in numbers else frame for frame in frames]
 
 
-def test_a_map_begins_where_depth_does(room) -> None:
+def test_a_map_begins_where_depth_does(room: Room) -> None:
     """Depth that fails on the first three frames costs neither the scale nor their poses; oracle: the true poses."""
     frames, camera, truth = room
-    slam = _run(_blind(frames, range(3)), camera)
+    slam = run_over(_blind(frames, range(3)), camera)
     error = evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
     assert slam.metric
     assert all(record.tracked for record in slam.frames)
@@ -313,14 +297,14 @@ def test_a_map_begins_where_depth_does(room) -> None:
 
 
 @pytest.mark.long
-def test_depth_that_fails_on_keyframes_leaves_map_and_scale(room, tracked: Slam) -> None:
+def test_depth_that_fails_on_keyframes_leaves_map_and_scale(room: Room, tracked: Slam) -> None:
     """Keyframes without depth, where matches end at no key point, neither start a new map nor change the scale.
 
     Oracle: the renderer's poses.
     """
     frames, camera, truth = room
     blind = [keyframe.frame for keyframe in tracked.keyframes[1:]][::3]
-    slam = _run(_blind(frames, blind), camera, replace(ROLES, points=_Dense()))
+    slam = run_over(_blind(frames, blind), camera, replace(ROLES, points=_Dense()))
     assert len(blind) >= 2
     assert any(keyframe.frame in blind for keyframe in slam.keyframes), "no keyframe was without depth"
     error = evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse
@@ -329,34 +313,20 @@ def test_depth_that_fails_on_keyframes_leaves_map_and_scale(room, tracked: Slam)
     assert error < 0.02, f"ATE {error:.4f} m"
 
 
-def test_constant_velocity_start_stays_rigid(room) -> None:
-    """A start by prediction alone gives finite, rigid poses over the whole sequence; oracle: orthonormality."""
-    frames, camera, _ = room
-    slam = _run(frames, camera, replace(ROLES, geometry=ConstantVelocity()))
-    rotations = frame_trajectory(slam).rotations
-    error = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max()
-    assert len(slam.frames) == len(frames)
-    assert error < 1e-9, f"rotations are off by {error:.1e}"
-
-
-def _black(frame: Frame) -> Frame:
-    return replace(frame, image=np.zeros_like(frame.image), depth=np.full_like(frame.depth, np.nan))
-
-
 def _bad_sequences(frames: list[Frame]) -> Iterator[tuple[str, list[Frame]]]:
     yield "one frame", frames[:1]
     yield "two identical frames", [frames[0], replace(frames[0], index=1, timestamp=0.1)]
     yield "still camera", [replace(frames[0], index=i, timestamp=i / 10) for i in range(5)]
-    yield "black frames in between", [*frames[:4], _black(frames[4]), _black(frames[5]), *frames[6:9]]
-    yield "black from the start", [_black(frame) for frame in frames[:3]]
+    yield "black frames in between", [*frames[:4], black(frames[4]), black(frames[5]), *frames[6:9]]
+    yield "black from the start", [black(frame) for frame in frames[:3]]
     yield "no valid depth", [replace(frame, depth=np.full_like(frame.depth, np.nan)) for frame in frames[:4]]
 
 
 @pytest.mark.parametrize("case", range(6))
-def test_bad_sequences_end_with_finite_poses(room, case: int) -> None:
+def test_bad_sequences_end_with_finite_poses(room: Room, case: int) -> None:
     """Whatever the frames show, nothing raises, and each frame has a finite pose or is said to have none."""
     name, frames = list(_bad_sequences(room[0]))[case]
-    slam = _run(frames, room[1])
+    slam = run_over(frames, room[1])
     poses = frame_trajectory(slam).poses
     assert len(slam.frames) == len(frames), name
     assert len(poses) == sum(record.tracked for record in slam.frames) > 0, name
@@ -364,14 +334,14 @@ def test_bad_sequences_end_with_finite_poses(room, case: int) -> None:
 
 
 @pytest.mark.long
-def test_a_jump_is_said_and_survived(room, tmp_path: Path) -> None:
+def test_a_jump_is_said_and_survived(room: Room, tmp_path: Path) -> None:
     """After a jump to a place never seen, tracking is reported lost, the map goes on from a new origin, and each submap
     is written to a file of its own, the one of more frames first. Oracle: which frames are of which place.
     """
     frames, camera, _ = room
     other = simulate("room", 2000, 0, SIZE, rate=10.0)
     elsewhere = [replace(other.frame(60 + i), index=8 + i, timestamp=(8 + i) / 10) for i in range(14)]
-    slam = _run([*frames[:8], *elsewhere], camera)
+    slam = run_over([*frames[:8], *elsewhere], camera)
     assert any("tracking was lost at frame 8" in note for note in slam.notes), slam.notes
     assert len(slam.map.roots) == 2
     assert len(slam.frames) == 22

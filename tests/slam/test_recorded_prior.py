@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.posed_keyframes import keyframe_of, slots_of
+from recorded_run import ROLES, black, run_over
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.classical import NoDepth, SiftMatcher
+from vggtgeo.models.classical import NoDepth
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
@@ -17,14 +18,11 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.recorded_prior import prior_summary
-from vggtgeo.slam.run import frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.run import frame_trajectory
+from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
@@ -34,12 +32,6 @@ from vggtgeo.slam.tracking.recorded_motion import SIGNIFICANT, compare
 from vggtgeo.slam.tracking.tracker import FramePose, Tracker
 
 SIZE = (320, 240)
-# The window of test_pipeline.py, so that the solver is compiled once.
-SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48),
-    refinement=GlobalMapSettings(global_adjustment=False),
-)
-ROLES = Roles(points=SiftMatcher(count=500))
 DARK = range(16, 26)
 """Frames of the walk in which the camera turns by 97 degrees: what is seen before is not seen after."""
 SHOWN = 32
@@ -52,21 +44,16 @@ def walk() -> Walk:
     """Frames 18 to 49 of a walk through an office, black while the camera turns; and the truth of frames 18 to 53."""
     sequence = simulate("office", 60, 0, SIZE, rate=5.0)
     truth = sequence.ground_truth()
-    assert truth is not None
     frames = sequence.frames(18, 18 + SHOWN)
-    dark = [_black(frame) if row in DARK else frame for row, frame in enumerate(frames)]
+    dark = [black(frame) if row in DARK else frame for row, frame in enumerate(frames)]
     return dark, sequence.camera, truth.select(slice(18, 54))
-
-
-def _black(frame: Frame) -> Frame:
-    return replace(frame, image=np.zeros_like(frame.image), depth=np.full(frame.image.shape[:2], np.nan, np.float32))
 
 
 def _run(walk: Walk, roles: Roles) -> Slam:
     frames, camera, _ = walk
     if not roles.metric:
         frames = [replace(frame, depth=None) for frame in frames]
-    return merge_pending_window(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
+    return run_over(frames, camera, roles)
 
 
 def _disturbed(truth: Trajectory, drift: float = 0.02, scale: float = 1.05) -> Trajectory:
@@ -83,7 +70,6 @@ def _disturbed(truth: Trajectory, drift: float = 0.02, scale: float = 1.05) -> T
 def _other(truth: Trajectory) -> Trajectory:
     """A recording of another part of a long walk, at the same times."""
     other = simulate("office", 160, 0, SIZE, rate=5.0).ground_truth()
-    assert other is not None
     return Trajectory(truth.timestamps, other.poses[100 : 100 + len(truth)])
 
 
@@ -114,7 +100,6 @@ def test_a_pose_between_two_recorded_ones_is_on_the_way() -> None:
     times = np.array([0.0, 1.0, 2.0, 3.0, 9.0])
     recorded = RecordedPoses(Trajectory(times, poses))
     found = recorded.pose(1.5)
-    assert found is not None
     np.testing.assert_allclose(Rotation.from_matrix(found[:3, :3]).as_rotvec(), [0, -0.15, 0], atol=1e-12)
     assert recorded.pose(5.0) is None
     assert recorded.pose(-0.1) is None

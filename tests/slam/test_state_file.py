@@ -19,7 +19,6 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.clock import Clock
@@ -52,7 +51,6 @@ def full(slam: Slam) -> Slam:
     waiting = UnplacedFrame(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
     compressed = (slam.keyframes[0].compressed(), *slam.keyframes[1:])
     slam = merge_pending_window(slam)
-    assert slam.window.solved is not None
     adjustment, state = slam.window.solved
     one = jnp.ones(1)
     under_way: Future[Slam] = Future()
@@ -96,28 +94,6 @@ def test_every_field_comes_back_to_the_bit(saved: Path) -> None:
 
 def _is_empty(value: Any) -> bool:
     return value is None or (isinstance(value, tuple) and not value)
-
-
-def test_the_walk_sees_a_difference() -> None:
-    """The oracle of the test above finds one bit, an order in memory, a kind and a length; so a lost field would be
-    seen.
-    """
-    slam = merge_pending_window(recorded_run().states[MIDDLE])
-    pose = slam.keyframes[0].pose
-    off = pose.copy()
-    off[0, 3] = np.nextafter(off[0, 3], 1)
-    changed = lambda **values: replace(
-        slam, map=replace(slam.map, keyframes=(replace(slam.keyframes[0], **values), *slam.keyframes[1:]))
-    )
-    for other in (
-        changed(pose=off),
-        changed(pose=np.asfortranarray(pose)),
-        changed(place=None),
-        replace(slam, tracker=replace(slam.tracker, lost=1)),
-        replace(slam, tracker=replace(slam.tracker, frames=slam.frames[:-1])),
-        replace(slam, window=replace(slam.window, solved=None)),
-    ):
-        assert list(differences(slam, other)), other
 
 
 def test_the_run_goes_on_to_the_same_bits(tmp_path: Path) -> None:
@@ -176,25 +152,6 @@ def test_what_is_not_listed_is_not_written(value: Any, tmp_path: Path) -> None:
     with raises("content[1]", error=TypeError):
         BOX.write(tmp_path / "box", Box((1, value)))
     assert not list(tmp_path.iterdir())
-
-
-def box(tmp_path: Path, value: Any = 1.5) -> Path:
-    BOX.write(tmp_path / "box", Box((np.arange(3.0), value)))
-    return tmp_path / "box"
-
-
-def test_every_flipped_bit_of_the_content_is_noticed(tmp_path: Path) -> None:
-    """A bit changed in header or data is an InputError, never another value; oracle: zip's checksums."""
-    path = box(tmp_path)
-    whole = path.read_bytes()
-    inside = range(whole.index(b"\x93NUMPY"), whole.rindex(b"PK\x01\x02") - 200)
-    for place in inside[::11]:
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
-        try:
-            read, _ = BOX.read(path)
-        except InputError:
-            continue
-        assert list(differences(Box((np.arange(3.0), 1.5)), read)) == [], place
 
 
 def test_reading_keeps_the_callers_precision(saved: Path) -> None:

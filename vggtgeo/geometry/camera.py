@@ -12,7 +12,6 @@ with pixel (0, 0) at the centre of the top-left pixel. The geometry of the libra
 """
 
 import math
-import numbers
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -22,6 +21,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from vggtgeo.geometry import pinhole
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.given import check_whole, real_array
 
 GUESSED_FIELD_OF_VIEW = math.radians(60.0)
 """Field of view of the longer image side: between phones (about 70 deg) and narrower depth and headset cameras (57
@@ -170,14 +170,8 @@ class Undistorter:
         if not camera.distorts:
             return cls(camera.pinhole)
         maps_of = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
-        x, y = maps_of(
-            camera.matrix,
-            np.array(camera.distortion),
-            np.eye(3),
-            camera.matrix,
-            (camera.width, camera.height),
-            cv2.CV_32FC1,
-        )
+        size, coefficients = (camera.width, camera.height), np.array(camera.distortion)
+        x, y = maps_of(camera.matrix, coefficients, np.eye(3), camera.matrix, size, cv2.CV_32FC1)
         inside = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
         maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
         limits = np.iinfo(np.int16)
@@ -197,15 +191,8 @@ class Undistorter:
         if self.nearest is None:
             return depth
         self._check_size(depth)
-        nothing = np.empty(0, np.uint16)
-        return cv2.remap(
-            depth,
-            self.nearest,
-            nothing,
-            cv2.INTER_NEAREST,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=(math.nan,) * 4,
-        )
+        outside = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (math.nan,) * 4}
+        return cv2.remap(depth, self.nearest, np.empty(0, np.uint16), cv2.INTER_NEAREST, **outside)
 
     def _check_size(self, image: np.ndarray) -> None:
         height, width = image.shape[:2]
@@ -218,9 +205,8 @@ class Undistorter:
 
 def check_sides(width: Any, height: Any) -> None:
     """Raise InputError unless both are whole numbers of pixels."""
-    whole = isinstance(width, numbers.Integral) and isinstance(height, numbers.Integral)
-    if not whole or width < 1 or height < 1:
-        raise InputError(f"image size is {width} x {height}; both must be at least 1 pixel, whole numbers")
+    check_whole("width", width, 1)
+    check_whole("height", height, 1)
 
 
 def check_intrinsics(values: object) -> tuple[float, float, float, float]:
@@ -246,10 +232,7 @@ def check_distortion(values: object) -> tuple[float, ...]:
 
 
 def _finite_numbers(name: str, values: object) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(value) for value in values)  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
-        raise InputError(f"`{name}` is {values!r}; it must be a sequence of numbers") from None
+    numbers = tuple(real_array(name, values, (None,)).astype(np.float64).tolist())
     if not all(math.isfinite(number) for number in numbers):
         raise InputError(f"`{name}` is {numbers}; every number must be finite")
     return numbers

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from vggtgeo.geometry.point_cloud import (
-    UNREADABLE,
-    bytes_of_colours,
-    check_end,
-    check_head,
-    check_places,
-    columns_of,
-)
+from vggtgeo.geometry.point_cloud import COLOUR, NORMAL, UNREADABLE, bytes_of_colours, columns_of, write_ply
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import atomic_open
-from vggtgeo.io.given import path_of, real_numbers
+from vggtgeo.io.given import path_of, real_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +28,10 @@ class Mesh:
     colours: np.ndarray
 
     def __post_init__(self) -> None:
-        for name in ("vertices", "faces", "normals", "colours"):
-            object.__setattr__(self, name, real_numbers(name, getattr(self, name)))
-        count = len(self.vertices) if self.vertices.ndim else 0
-        for name, shape in (("vertices", (count, 3)), ("normals", (count, 3)), ("colours", (count, 3))):
-            if getattr(self, name).shape != shape:
-                raise InputError(f"`{name}` has shape {getattr(self, name).shape}; it must be {list(shape)}")
-        if self.faces.ndim != 2 or self.faces.shape[1] != 3:
-            raise InputError(f"`faces` has shape {self.faces.shape}; it must be [m, 3]")
+        count = len(real_array("vertices", self.vertices, (None, 3)))
+        shapes = {"vertices": (count, 3), "faces": (None, 3), "normals": (count, 3), "colours": (count, 3)}
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, real_array(name, getattr(self, name), shape))
         if self.faces.dtype.kind not in "iu":
             raise InputError(f"`faces` holds {self.faces.dtype}; expected whole numbers, the rows of their corners")
         if self.colours.dtype != np.uint8:
@@ -57,46 +45,27 @@ class Mesh:
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
         """Write binary little-endian PLY, atomically: float32 x y z nx ny nz, uint8 RGB, and the faces."""
-        names = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-        vertices = np.empty(len(self.vertices), names + [(name, "u1") for name in ("red", "green", "blue")])
-        columns = [*self.vertices.T, *self.normals.T, *self.colours.T]
-        for name, column in zip(vertices.dtype.names or (), columns, strict=True):
-            vertices[name] = column
         faces = np.empty(len(self.faces), [("vertex_indices", "<i4", (3,))])
         faces["vertex_indices"] = self.faces
-        elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-        with atomic_open(path, "wb") as handle:
-            PlyData(elements, byte_order="<").write(handle)
+        values = [*self.vertices.T, *self.normals.T, *self.colours.T]
+        columns = dict(zip((*"xyz", *NORMAL, *COLOUR), values, strict=True))
+        write_ply(path, columns, PlyElement.describe(faces, "face"))
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> Mesh:
         """Read a file of `save_ply`."""
         path = path_of("path", path)
         try:
-            head = check_head(path)
             # With a known length of the lists plyfile reads all faces at once, not one by one.
             data = PlyData.read(os.fspath(path), known_list_len={"face": {"vertex_indices": 3}})
-            check_end(path, head, data)
-            vertices, faces = data["vertex"].data, _triangles(data["face"].data["vertex_indices"])
-            places, normals = (check_places(columns_of(vertices, names)) for names in ("xyz", ("nx", "ny", "nz")))
+            vertices = data["vertex"].data
+            places, normals = (columns_of(vertices, names) for names in ("xyz", NORMAL))
             if not (np.isfinite(places).all() and np.isfinite(normals).all()):
                 raise ValueError("a vertex or its normal has a NaN or an infinity")
-            colours = bytes_of_colours(columns_of(vertices, ("red", "green", "blue")))
-            return replace(cls(places, faces, normals, colours), faces=faces.astype(np.int32))
+            colours = bytes_of_colours(columns_of(vertices, COLOUR))
+            return cls(places, data["face"].data["vertex_indices"], normals, colours)
         except UNREADABLE as error:
             raise InputError(
                 f"`{os.fspath(path)}` cannot be read as a PLY mesh: {error}; give one that `vggtgeo run` wrote, of "
                 "triangles, with normals and colours"
             ) from None
-
-
-def _triangles(listed: np.ndarray) -> np.ndarray:
-    """Return the faces of a file, int64 [m, 3]; raise ValueError for faces that are not triangles."""
-    if listed.dtype == object:
-        corners = sorted({len(one) for one in listed} - {3})
-        if corners:
-            raise ValueError(f"it has faces of {corners[0]} corners; expected triangles")
-        listed = np.stack(list(listed)) if len(listed) else np.zeros((0, 3), np.int64)
-    if listed.dtype.kind not in "iu":
-        raise ValueError(f"its faces name their vertices by {listed.dtype}; expected whole numbers")
-    return listed.astype(np.int64)

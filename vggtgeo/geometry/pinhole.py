@@ -59,14 +59,14 @@ def epipolar_distance(
 
 
 def visible(
-    points: np.ndarray, intrinsics: IntrinsicsLike, shape: tuple[int, int], nearest: float = 0.1
+    points: np.ndarray, intrinsics: IntrinsicsLike, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which points [n, 3] in the camera's frame are inside an image of `shape` (height, width), bool [n].
 
-    Also returns row and column of those points, int. nearest: minimum depth, metres; that of depth sensors.
+    Also returns row and column of those points, int. Nothing is visible nearer than 0.1 m, as to depth sensors.
     """
     with np.errstate(invalid="ignore"):
-        x, y = np.ascontiguousarray(np.rint(project(points, intrinsics, nearest)).T)
+        x, y = np.ascontiguousarray(np.rint(project(points, intrinsics, 0.1)).T)
         inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
     return inside, y[inside].astype(int), x[inside].astype(int)
 

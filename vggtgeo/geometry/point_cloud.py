@@ -1,29 +1,23 @@
-"""Coloured point clouds as binary PLY files."""
+"""Coloured point clouds as binary PLY files, and the cells of a grid that points lie in."""
 
 import os
-import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElement, PlyParseError
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
-from vggtgeo.io.given import path_of, real_numbers
+from vggtgeo.io.given import path_of, real_array
 
-MAX_HEADER = 65_536
-UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyHeaderParseError, PlyParseError)
+UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyParseError)
 """Errors of the parser for files that are invalid, or declare more than they contain."""
 
-_NORMAL = ("nx", "ny", "nz")
-_COLOUR = ("red", "green", "blue")
-_MIN_SIZE, _MAX_SIZE = 1e-30, 1e10
-"""Range of valid coordinates, metres (or millimetres of the largest coordinates in surveying). Bytes in the wrong order
-often give smaller numbers."""
-_LINE_END = 2
-"""Bytes that some programs write after the last element."""
+NORMAL = ("nx", "ny", "nz")
+COLOUR = ("red", "green", "blue")
+_LARGEST = 2**62
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,19 +35,13 @@ class PointCloud:
     normals: Float[np.ndarray, "n 3"] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("points", "colours", "confidence", "normals"):
+        count = len(real_array("points", self.points, (None, 3)))
+        shapes = {"points": (count, 3), "colours": (count, 3), "confidence": (count,), "normals": (count, 3)}
+        for name, shape in shapes.items():
             if getattr(self, name) is not None or name in ("points", "colours"):
-                object.__setattr__(self, name, real_numbers(name, getattr(self, name)))
-        count = len(self.points) if self.points.ndim else 0
-        if self.points.shape != (count, 3) or self.colours.shape != (count, 3) or self.colours.dtype != np.uint8:
-            raise InputError(
-                f"`points` has shape {self.points.shape}, `colours` {self.colours.dtype} "
-                f"{self.colours.shape}; they must be [n, 3] and uint8 [n, 3]"
-            )
-        if self.confidence is not None and self.confidence.shape != (count,):
-            raise InputError(f"`confidence` has shape {self.confidence.shape}; it must be [{count}]")
-        if self.normals is not None and self.normals.shape != (count, 3):
-            raise InputError(f"`normals` has shape {self.normals.shape}; it must be [{count}, 3]")
+                object.__setattr__(self, name, real_array(name, getattr(self, name), shape))
+        if self.colours.dtype != np.uint8:
+            raise InputError(f"`colours` holds {self.colours.dtype}; expected uint8, from 0 to 255")
         if not np.isfinite(self.points).all():
             raise InputError("`points` has a NaN or an infinity; leave such points out")
 
@@ -65,23 +53,16 @@ class PointCloud:
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
         """Write binary little-endian PLY, atomically: float32 x y z, uint8 RGB, float32 confidence, nx ny nz."""
-        fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-        columns = [*self.points.T, *self.colours.T]
-        if self.confidence is not None:
-            fields.append(("confidence", "<f4"))
-            columns.append(self.confidence)
-        if self.normals is not None:
-            fields += [(name, "<f4") for name in _NORMAL]
-            columns += [*self.normals.T]
         if np.abs(self.points).max(initial=0.0) > np.finfo(np.float32).max:
             raise InputError(
                 f"`points` has coordinates that the float32 of `{path}` cannot hold; leave such points out"
             )
-        vertices = np.empty(len(self), dtype=fields)
-        for (name, _), column in zip(fields, columns, strict=True):
-            vertices[name] = column
-        with atomic_open(path, "wb") as handle:
-            PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(handle)
+        columns = {**dict(zip("xyz", self.points.T, strict=True)), **dict(zip(COLOUR, self.colours.T, strict=True))}
+        if self.confidence is not None:
+            columns["confidence"] = self.confidence
+        if self.normals is not None:
+            columns |= zip(NORMAL, self.normals.T, strict=True)
+        write_ply(path, columns)
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> "PointCloud":
@@ -93,23 +74,30 @@ class PointCloud:
         """
         path = path_of("path", path)
         try:
-            head = check_head(path)
-            data = PlyData.read(os.fspath(path))
-            check_end(path, head, data)
-            vertices = data["vertex"].data
+            vertices = PlyData.read(os.fspath(path))["vertex"].data
             names = vertices.dtype.names or ()
-            points = check_places(columns_of(vertices, "xyz"))
+            points = columns_of(vertices, "xyz")
             colours = np.zeros((len(points), 3), np.uint8)
-            if set(_COLOUR) <= set(names):
-                colours = bytes_of_colours(columns_of(vertices, _COLOUR))
+            if set(COLOUR) <= set(names):
+                colours = bytes_of_colours(columns_of(vertices, COLOUR))
             confidence = np.array(vertices["confidence"]) if "confidence" in names else None
-            normals = np.column_stack([vertices[name] for name in _NORMAL]) if set(_NORMAL) <= set(names) else None
+            normals = columns_of(vertices, NORMAL) if set(NORMAL) <= set(names) else None
             return cls(points, colours, confidence, normals)
         except UNREADABLE as error:
             raise InputError(
                 f"`{os.fspath(path)}` cannot be read as a PLY point cloud: {error}; give a whole one whose vertices "
                 "have x, y and z"
             ) from None
+
+
+def write_ply(path: str | os.PathLike[str], columns: Mapping[str, np.ndarray], *others: PlyElement) -> None:
+    """Write vertices with these properties, colours as bytes, and other elements: binary little-endian, atomically."""
+    kinds = [(name, "u1" if name in COLOUR else "<f4") for name in columns]
+    vertices = np.empty(len(columns["x"]), dtype=kinds)
+    for name, column in columns.items():
+        vertices[name] = column
+    with atomic_open(path, "wb") as handle:
+        PlyData([PlyElement.describe(vertices, "vertex"), *others], byte_order="<").write(handle)
 
 
 def columns_of(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:
@@ -121,20 +109,6 @@ def columns_of(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:
     return np.column_stack([vertices[name] for name in names])
 
 
-def check_places(points: np.ndarray) -> np.ndarray:
-    """Return the same points; raise ValueError for implausible coordinates.
-
-    Bytes in the wrong order give such numbers.
-    """
-    sizes = np.abs(points[np.isfinite(points)])
-    if ((sizes > _MAX_SIZE) | ((sizes > 0) & (sizes < _MIN_SIZE))).any():
-        raise ValueError(
-            f"its coordinates, from {sizes.min():.3g} to {sizes.max():.3g} m, are implausible; the byte order in its "
-            "header may be wrong"
-        )
-    return points
-
-
 def bytes_of_colours(values: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
     """Return colours as bytes, from bytes, 16 bits, or floats up to 1 or 255; black for NaN."""
     if values.dtype == np.uint8:
@@ -144,50 +118,26 @@ def bytes_of_colours(values: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
     return np.rint(255.0 / most * known.clip(0.0, most)).astype(np.uint8)
 
 
-def check_end(path: str | os.PathLike[str], head: bytes, data: PlyData) -> None:
-    """Raise ValueError for a file that contains more than its header declares: a truncated or concatenated copy."""
-    with open(path, "rb") as handle:
-        handle.seek(len(head))
-        handle.readline()
-        if data.text:
-            more = sum(1 for line in handle if line.strip()) - sum(len(element) for element in data.elements)
-            rest = f"{more} lines"
-        else:
-            more = os.path.getsize(path) - handle.tell() - sum(map(_size_of, data.elements)) - _LINE_END
-            rest = f"{more + _LINE_END} bytes"
-    if more > 0:
-        raise ValueError(f"it has {rest} more than its header declares")
+def cell_numbers(cells: np.ndarray) -> np.ndarray:
+    """Return one number int64 [n] for each cell int [n, 3], in the order of x, then y, then z.
 
-
-def _size_of(element: PlyElement) -> int:
-    """Return the bytes of an element in a binary file."""
-    lists = [entry for entry in element.properties if isinstance(entry, PlyListProperty)]
-    own = {entry.name for entry in lists}
-    plain = sum(element.data.dtype[name].itemsize for name in element.data.dtype.names or () if name not in own)
-    size = len(element) * plain
-    for entry in lists:
-        count, item = (np.dtype(kind).itemsize for kind in entry.list_dtype())
-        values = element.data[entry.name]
-        size += len(element) * count + item * (values.size if values.dtype != object else sum(map(len, values)))
-    return size
-
-
-def check_head(path: str | os.PathLike[str]) -> bytes:
-    """Return the header of a PLY file.
-
-    ValueError for a long file without a header, which would be read to its end as one line, and for a header that
-    declares more elements than the file has bytes: memory for lists is allocated before they are read.
+    `np.unique` of rows takes ten times as long. If the box around the cells has too many cells for int64 (a mesh of 50
+    m at a thousandth of 2 cm), ranks replace coordinates.
     """
-    if os.path.exists(path) and not os.path.isfile(path):  # a pipe has no end
-        raise ValueError("it is not a regular file")
-    with open(path, "rb") as handle:
-        start = handle.read(MAX_HEADER)
-    end = re.search(rb"^end_header\s", start, re.MULTILINE)
-    if end is None and os.path.getsize(path) > MAX_HEADER:
-        raise ValueError(f"its first {MAX_HEADER} bytes have no `end_header`")
-    head = start if end is None else start[: end.start()]
-    declared = sum(int(count) for count in re.findall(rb"^element\s+\S+\s+(\d+)\s*$", head, re.MULTILINE))
-    size = os.path.getsize(path)
-    if declared > size:
-        raise ValueError(f"it declares {declared} elements, and has {size} bytes")
-    return head
+    if not len(cells):
+        return np.zeros(0, np.int64)
+    low = cells.min(axis=0)
+    # As Python's integers: differences and products of int64 may overflow.
+    width, depth, height = (int(size) + 1 for size in cells.max(axis=0).astype(object) - low.astype(object))
+    if width * depth * height > _LARGEST:
+        x, y, z = (_ranks(column) for column in cells.T)
+        return _ranks(x * (int(y.max()) + 1) + y) * (int(z.max()) + 1) + z
+    x, y, z = (cells - low).astype(np.int64).T
+    numbers: np.ndarray = (x * depth + y) * height + z
+    return numbers
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    """Return the rank of each value among the distinct ones, int64 [n]."""
+    places: np.ndarray = np.unique(values, return_inverse=True)[1].astype(np.int64)
+    return places

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
-from vggtgeo.io.given import path_of, real_numbers
+from vggtgeo.io.given import path_of, real_array
 from vggtgeo.io.text_files import whole_text
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
@@ -48,8 +48,9 @@ class Trajectory:
     poses: Float[np.ndarray, "n 4 4"]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "timestamps", np.asarray(real_numbers("timestamps", self.timestamps), np.float64))
-        object.__setattr__(self, "poses", np.asarray(real_numbers("poses", self.poses), np.float64))
+        times = np.asarray(real_array("timestamps", self.timestamps, (None,)), np.float64)
+        object.__setattr__(self, "timestamps", times)
+        object.__setattr__(self, "poses", np.asarray(real_array("poses", self.poses, (len(times), 4, 4)), np.float64))
         _check(self.timestamps, self.poses)
 
     def __len__(self) -> int:
@@ -70,13 +71,16 @@ class Trajectory:
         """Length of the path through the camera centres, metres."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
+    @property
+    def _quaternions(self) -> np.ndarray:
+        return Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
+
     def to_dict(self) -> dict[str, list]:
         """Return times, positions and quaternions (x, y, z, w) as plain lists."""
-        quaternions = Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
         return {
             "timestamps": self.timestamps.tolist(),
             "positions": self.positions.tolist(),
-            "quaternions": quaternions.tolist(),
+            "quaternions": self._quaternions.tolist(),
         }
 
     def __repr__(self) -> str:
@@ -92,8 +96,7 @@ class Trajectory:
 
     def save_tum(self, path: str | os.PathLike[str]) -> None:
         """Write the TUM format, nine decimals, atomically."""
-        quaternions = Rotation.from_matrix(self.rotations).as_quat(canonical=True) if len(self) else np.zeros((0, 4))
-        rows = np.column_stack([self.timestamps, self.positions, quaternions])
+        rows = np.column_stack([self.timestamps, self.positions, self._quaternions])
         lines = (" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows.tolist())
         write_text(path, _HEADER + "".join(lines))
 
@@ -115,11 +118,7 @@ class Trajectory:
 
 
 def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
-    count = timestamps.size
-    if timestamps.ndim != 1 or poses.shape != (count, 4, 4):
-        raise InputError(
-            f"`timestamps` has shape {timestamps.shape}, `poses` {poses.shape}; expected [n] and [n, 4, 4]"
-        )
+    count = len(timestamps)
     finite = np.isfinite(timestamps) & np.isfinite(poses).all(axis=(1, 2))
     if not finite.all():
         raise InputError(f"pose {int(np.argmin(finite))} of {count} has a NaN or an infinity; leave such poses out")
@@ -136,13 +135,10 @@ def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
     bad = (off > _ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0)
     if bad.any():
         raise InputError(f"pose {int(np.argmax(bad))} of {count} must have a rotation in its upper left 3 x 3 block")
-    bad = np.abs(poses[:, 3] - np.eye(4)[3]).max(axis=1, initial=0.0) > _ROTATION_TOLERANCE
 
 
 def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:
     file = path_of("path", path)
-    if not file.is_file():
-        raise InputError(f"`{file}` does not exist or is not a file; give a trajectory in the TUM format")
     rows = []
     for number, line in enumerate(whole_text(file).splitlines(), start=1):
         text = line.split("#", 1)[0].replace(",", " ").strip()
@@ -154,20 +150,15 @@ def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _parse_row(where: str, text: str) -> list[float]:
-    words = text.split()
-    if len(words) != 8:
-        raise InputError(f"{where}: found {len(words)} columns; expected 8: `timestamp tx ty tz qx qy qz qw`")
+    expected = "expected 8 finite numbers: `timestamp tx ty tz qx qy qz qw`"
     try:
-        row = [float(word) for word in words]
+        row = [float(word) for word in text.split()]
     except ValueError:
-        raise InputError(f"{where}: found {text!r}; expected 8 numbers: `timestamp tx ty tz qx qy qz qw`") from None
-    if not np.isfinite(row).all():
-        raise InputError(f"{where}: found a NaN or an infinity in {text!r}; leave such poses out of the file")
+        raise InputError(f"{where}: found {text!r}; {expected}") from None
+    if len(row) != 8 or not np.isfinite(row).all():
+        raise InputError(f"{where}: found {len(row)} columns, {text!r}; {expected}")
     if not MIN_QUATERNION <= np.linalg.norm(row[4:]) <= MAX_QUATERNION:
-        raise InputError(
-            f"{where}: the quaternion has length {np.linalg.norm(row[4:]):.3g}; expected about 1: are the columns "
-            "`timestamp tx ty tz qx qy qz qw`?"
-        )
+        raise InputError(f"{where}: the quaternion has length {np.linalg.norm(row[4:]):.3g}; {expected}")
     return row
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
-from vggtgeo.geometry.cells import cell_numbers
-from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.point_cloud import PointCloud, cell_numbers
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
 from vggtgeo.slam.threads import map_in_threads

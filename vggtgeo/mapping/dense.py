@@ -120,9 +120,8 @@ def _voxel(depth_maps: Sequence[DepthMap | None], intrinsics: np.ndarray) -> flo
 
 
 def dense_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, mode: str = "auto") -> list[DepthMap | None]:
-    """Return dense depth of each keyframe, None if unknown; arguments and errors as of `dense_map`."""
+    """Return dense depth of each keyframe, None if unknown; arguments as of `dense_map`."""
     measured = any(keyframe.images.has_depth for keyframe in keyframes)
-    check_dense(mode, measured)
     if mode == "none":
         return [None] * len(keyframes)
     fused = fused_depths(keyframes, intrinsics)

@@ -1,7 +1,7 @@
 """Dense depth of any frame: its own measurement, with holes filled from nearby keyframes.
 
 The keyframes' depth is projected into the frame at a coarse resolution with a z-buffer, which resolves occlusion. Then
-each pixel's depth is read from the keyframes at that point, and kept if one confirms it (`consistency.py`).
+each pixel's depth is read from the keyframes at that point, and kept if one confirms it (`depth_map.py`).
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
-from vggtgeo.mapping.consistency import DIFFERENCE_RANGE, PosedDepth, confirm
 from vggtgeo.mapping.dense import fill_holes
-from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.depth_map import DIFFERENCE_RANGE, DepthMap, PosedDepth, confirm
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.state import Slam

@@ -44,12 +44,8 @@ PRIOR_WEIGHT = 0.02
 """Of a zero correction in each grid cell: far from all key points the depth stays."""
 
 
-def optimised_depth(keyframe: Keyframe, depth: np.ndarray | None = None) -> np.ndarray:
-    """Return the dense depth corrected by the adjusted key points; float32 `[H, W]` metres, NaN = unknown.
-
-    depth: to be corrected, float32 `[H, W]`; by default the prior.
-    """
-    depth = keyframe.depth.astype(np.float32) if depth is None else depth
+def optimised_depth(keyframe: Keyframe, depth: np.ndarray) -> np.ndarray:
+    """Return `depth` corrected by the adjusted key points; both float32 `[H, W]`, metres, NaN = unknown."""
     log_depth = np.log(depth)
     pixels, correction, weight = _corrections(keyframe, log_depth)
     if not len(pixels):

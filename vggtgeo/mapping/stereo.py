@@ -1,22 +1,19 @@
 """Multi-view stereo: dense depth of each keyframe from images and adjusted poses.
 
 Steps: view selection, plane sweep (`plane_sweep.py`), semi-global matching (`semi_global.py`),
-standard deviations (`uncertainty.py`), and the check that neighbours confirm the depth (`consistency.py`).
+standard deviations (`uncertainty.py`), and the check that neighbours confirm the depth (`depth_map.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import jax.numpy as jnp
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
-from vggtgeo.io.errors import InputError
-from vggtgeo.mapping.consistency import PosedDepth, confirm
-from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.depth_map import DepthMap, PosedDepth, confirm
 from vggtgeo.mapping.plane_sweep import Photo, matching_cost
 from vggtgeo.mapping.semi_global import semi_global
 from vggtgeo.mapping.uncertainty import stereo_depth_sigma
@@ -31,51 +28,37 @@ MAX_BLEND = 0.03
 """Relative difference of neighbouring depths up to which upsampling interpolates between them."""
 
 
-@dataclass(frozen=True)
-class StereoSettings:
-    """Settings of the stereo.
-
-    Fields: views, maximum number of neighbours. planes, number of depths. size, longer side of the images in the
-    search, pixels. window, width of the correlation window there, odd. smooth and jump, penalties of the semi-global
-    matching, in units of 1 - correlation. margin, minimum margin of a pixel's plane, same unit. min_views, number of
-    neighbours that must confirm a depth.
-    """
-
-    views: int = 6
-    planes: int = 96
-    size: int = 320
-    window: int = 7
-    smooth: float = 0.04
-    jump: float = 0.5
-    margin: float = 0.02
-    min_views: int = 2
-
-    def __post_init__(self) -> None:
-        minima = {"views": 1, "planes": 8, "size": 32, "window": 3, "min_views": 1}
-        for name, minimum in minima.items():
-            if getattr(self, name) < minimum:
-                raise InputError(f"`{name}` must be at least {minimum}, got {getattr(self, name)}")
+VIEWS = 6
+"""Largest number of neighbours."""
+PLANES = 96
+"""Number of depths of the search."""
+SEARCH_SIZE = 320
+"""Longer side of the images in the search, pixels."""
+WINDOW = 7
+"""Width of the correlation window there, pixels, odd."""
+SMOOTH, JUMP = 0.04, 0.5
+"""Penalties of the semi-global matching, in units of 1 - correlation."""
+MIN_MARGIN = 0.02
+"""Of a pixel's plane, same unit."""
+MIN_VIEWS = 2
+"""Neighbours that must confirm a depth."""
 
 
-def stereo_depths(
-    keyframes: Sequence[Keyframe], intrinsics: np.ndarray, settings: StereoSettings | None = None
-) -> list[DepthMap | None]:
+def stereo_depths(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[DepthMap | None]:
     """Return the depth of each keyframe from its neighbours' images; None if no neighbour overlaps.
 
     Args:
         keyframes: adjusted; poses world -> camera.
         intrinsics: float64 [4], pixels.
-        settings: of the stereo.
 
     """
-    settings = settings or StereoSettings()
-    views = choose_views(keyframes, intrinsics, settings.views)
-    photos = [_photo(keyframe, intrinsics, settings.size) for keyframe in keyframes]
+    views = choose_views(keyframes, intrinsics)
+    photos = [_photo(keyframe, intrinsics) for keyframe in keyframes]
     points = [known_points(keyframe, intrinsics) for keyframe in keyframes]
 
     def search(i: int) -> PosedDepth | None:
         around = np.concatenate([points[j] for j in (i, *views[i])])
-        depth_map = _search(around, photos[i], [photos[j] for j in views[i]], settings)
+        depth_map = _search(around, photos[i], [photos[j] for j in views[i]])
         if depth_map is None:
             return None
         return PosedDepth(depth_map.compressed_for(len(photos)), photos[i].pose, photos[i].intrinsics)
@@ -84,7 +67,7 @@ def stereo_depths(
     result: list[DepthMap | None] = []
     for i, own in enumerate(found):
         others = [other for j in views[i] if (other := found[j]) is not None]
-        confirmed = None if own is None else confirm(own, others, settings.min_views)
+        confirmed = None if own is None else confirm(own, others, MIN_VIEWS)
         if confirmed is None or confirmed.empty:
             result.append(None)
         else:
@@ -92,11 +75,11 @@ def stereo_depths(
     return result
 
 
-def _photo(keyframe: Keyframe, intrinsics: np.ndarray, size: int) -> Photo:
-    """Return the keyframe's image, reduced to a longer side of at most `size` pixels."""
+def _photo(keyframe: Keyframe, intrinsics: np.ndarray) -> Photo:
+    """Return the keyframe's image, reduced to a longer side of at most `SEARCH_SIZE` pixels."""
     grey = cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     height, width = grey.shape
-    scale = min(1.0, size / max(height, width))
+    scale = min(1.0, SEARCH_SIZE / max(height, width))
     small = (round(width * scale), round(height * scale))
     ratio = np.array([small[0] / width, small[1] / height] * 2)
     half = np.array([0.0, 0.0, 0.5, 0.5])  # pixel centres are integers, so that the image begins at -0.5
@@ -104,22 +87,20 @@ def _photo(keyframe: Keyframe, intrinsics: np.ndarray, size: int) -> Photo:
     return Photo(cv2.resize(grey, small, interpolation=cv2.INTER_AREA), keyframe.pose, scaled)
 
 
-def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo], settings: StereoSettings) -> DepthMap | None:
+def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo]) -> DepthMap | None:
     """Return the depth of one image, before it is confirmed by others. points: float64 [n, 3], world, sets the range of
     depths.
     """
-    planes = _planes(points, photo, settings.planes)
+    planes = _planes(points, photo)
     if planes is None or not others:
         return None
-    cost = matching_cost(photo, others, planes, settings.window)
-    position, margin = (
-        np.asarray(value)
-        for value in semi_global(jnp.asarray(cost), jnp.asarray(photo.grey), smooth=settings.smooth, jump=settings.jump)
-    )
+    cost = matching_cost(photo, others, planes, WINDOW)
+    matched = semi_global(jnp.asarray(cost), jnp.asarray(photo.grey), smooth=SMOOTH, jump=JUMP)
+    position, margin = (np.asarray(value) for value in matched)
     step = float(planes[1] - planes[0])
     inverse = (planes[0] + step * position).astype(np.float32)
-    seen = stereo_depth_sigma(photo, others, inverse, step, settings.window)
-    good = (seen.views >= 1) & (margin > settings.margin) & (seen.sigma < MAX_SIGMA * inverse)
+    seen = stereo_depth_sigma(photo, others, inverse, step, WINDOW)
+    good = (seen.views >= 1) & (margin > MIN_MARGIN) & (seen.sigma < MAX_SIGMA * inverse)
     nan = np.float32(np.nan)
     return DepthMap(
         np.where(good, 1.0 / inverse, nan).astype(np.float32),
@@ -128,7 +109,7 @@ def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo], settings:
     )
 
 
-def _planes(points: np.ndarray, photo: Photo, count: int) -> np.ndarray | None:
+def _planes(points: np.ndarray, photo: Photo) -> np.ndarray | None:
     """Return inverse depths of the planes, 0.6 of the smallest to 1.5 of the largest of the points in view."""
     local = points @ photo.pose[:3, :3].T + photo.pose[:3, 3]
     inside, _, _ = pinhole.visible(local, photo.intrinsics, (photo.grey.shape[0], photo.grey.shape[1]))
@@ -137,7 +118,7 @@ def _planes(points: np.ndarray, photo: Photo, count: int) -> np.ndarray | None:
     # Quantiles, since a few points are outliers; the margins leave room for surfaces without key points.
     low, high = np.quantile(1.0 / local[inside, 2], [0.02, 0.98])
     # Equal steps in inverse depth are about equal steps in the image.
-    return np.linspace(0.6 * low, 1.5 * high, count)
+    return np.linspace(0.6 * low, 1.5 * high, PLANES)
 
 
 def upsample(depth_map: DepthMap, shape: Sequence[int]) -> DepthMap:
@@ -173,8 +154,8 @@ def known_points(keyframe: Keyframe, intrinsics: np.ndarray) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def choose_views(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, max_views: int) -> list[tuple[int, ...]]:
-    """Return for each keyframe the indices in `keyframes` of its best neighbours, at most `max_views`, best first.
+def choose_views(keyframes: Sequence[Keyframe], intrinsics: np.ndarray) -> list[tuple[int, ...]]:
+    """Return for each keyframe the indices in `keyframes` of its best neighbours, at most `VIEWS`, best first.
 
     The score of a neighbour is the mean weight of the keyframe's known points: 0 where the point is not visible, else
     rising with the triangulation angle to `GOOD_ANGLE` and falling beyond `WIDE_ANGLE`, as in COLMAP's view selection
@@ -193,7 +174,7 @@ def choose_views(keyframes: Sequence[Keyframe], intrinsics: np.ndarray, max_view
         near = np.nonzero(np.linalg.norm(centres - centres[i], axis=1) < depth)[0]
         scores = {j: _score(points, centres[i], keyframes[j], intrinsics) for j in near.tolist() if j != i}
         ranked = sorted(scores, key=lambda j: -scores[j])
-        chosen.append(tuple(j for j in ranked[:max_views] if scores[j] > MIN_SCORE))
+        chosen.append(tuple(j for j in ranked[:VIEWS] if scores[j] > MIN_SCORE))
     return chosen
 
 

@@ -24,8 +24,8 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from vggtgeo.geometry import pinhole
-from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.geometry.point_cloud import cell_numbers
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 

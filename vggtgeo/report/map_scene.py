@@ -19,9 +19,8 @@ from scipy.spatial import cKDTree
 
 from vggtgeo.evaluation import align, associate
 from vggtgeo.figures.plots import view_axes
-from vggtgeo.geometry.cells import cell_numbers
 from vggtgeo.geometry.mesh import Mesh
-from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.point_cloud import PointCloud, cell_numbers
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty

@@ -86,18 +86,12 @@ def build_atlas(textures: list[np.ndarray], wraps: list[bool]) -> Atlas:
 
     Raises InputError if they do not fit into one image.
     """
-    shapes = [_block_shape(len(texture)) for texture in textures]
-    width = max(_WIDTH, *(shape[1] for shape in shapes))
-    places = np.zeros((len(textures), 2), int)
-    x = y = row = 0
-    for index in sorted(range(len(textures)), key=lambda k: -shapes[k][0]):
-        if x + shapes[index][1] > width:
-            x, y, row = 0, y + row, 0
-        places[index] = x, y
-        x, row = x + shapes[index][1], max(row, shapes[index][0])
-    if y + row > _MAX_SIDE:
-        raise InputError(f"`textures` need {y + row} rows, more than {_MAX_SIDE}; use fewer or smaller textures")
-    image = np.zeros((y + row, width, *textures[0].shape[2:]), textures[0].dtype)
+    shapes = np.array([_block_shape(len(texture)) for texture in textures])
+    width = max(_WIDTH, int(shapes[:, 0].max()))
+    places, height = pack_shelves(shapes, width)
+    if height > _MAX_SIDE:
+        raise InputError(f"`textures` need {height} rows, more than {_MAX_SIDE}; use fewer or smaller textures")
+    image = np.zeros((height, width, *textures[0].shape[2:]), textures[0].dtype)
     corners = [
         place + _draw_levels(image[place[1] :, place[0] :], texture, wrap)
         for texture, wrap, place in zip(textures, wraps, places, strict=True)
@@ -106,9 +100,23 @@ def build_atlas(textures: list[np.ndarray], wraps: list[bool]) -> Atlas:
     return Atlas(image, np.stack(corners).astype(np.float32), sizes, np.array(wraps))
 
 
+def pack_shelves(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
+    """Pack rectangles of `sizes` [P, 2] (width, height), the tall ones first; return corners [P, 2], and the height."""
+    corner = np.zeros((len(sizes), 2), int)
+    x = y = shelf = 0
+    for row in np.argsort(-sizes[:, 1], kind="stable"):
+        across, high = sizes[row]
+        if x + across > width:
+            x, y, shelf = 0, y + shelf, 0
+        corner[row] = x, y
+        x, shelf = x + across, max(shelf, high)
+    return corner, int(y + shelf)
+
+
 def _block_shape(size: int) -> tuple[int, int]:
+    """Return width and height of a texture with its levels."""
     right = sum((size >> level) + 2 * _BORDER for level in range(1, _LEVELS))
-    return max(size + 2 * _BORDER, right), size + (size >> 1) + 4 * _BORDER
+    return size + (size >> 1) + 4 * _BORDER, max(size + 2 * _BORDER, right)
 
 
 def _draw_levels(block: np.ndarray, texture: np.ndarray, wrap: bool) -> np.ndarray:

@@ -2,23 +2,25 @@
 
 Each painter is a pure function `(rng, size) -> uint8 [size, size, 3]`, gamma-encoded RGB; the picture is stretched
 over its surface, x along the surface's first axis and y along its second (upwards for walls, so pictures are
-painted upside up and flipped at the end).
+painted upside up and flipped at the end). `paint_texture` gives each texture its own random stream, so that it depends
+on its name and the seed alone, never on the order in which textures are made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import zlib
 
 import cv2
 import numpy as np
 
-from vggtgeo.simulation.texture_fields import blend, fractal, quantise, random_colour, scribble
+from vggtgeo.io.errors import InputError
+from vggtgeo.simulation.textures import TILES, Painter, blend, fractal, quantise, random_colour, scribble
 
 _LINE = cv2.LINE_AA
 
 
-def _canvas(rng: np.random.Generator, size: int, low: tuple, high: tuple, grain: float = 0.25) -> np.ndarray:
-    return quantise(blend(low, high, 0.5 + grain * fractal(rng, size, 1.5)))
+def _canvas(rng: np.random.Generator, size: int, low: tuple, high: tuple) -> np.ndarray:
+    return quantise(blend(low, high, 0.5 + 0.25 * fractal(rng, size, 1.5)))
 
 
 def _upright(image: np.ndarray) -> np.ndarray:
@@ -210,7 +212,22 @@ def sign(rng: np.random.Generator, size: int) -> np.ndarray:
     return _upright(image)
 
 
-DECALS: dict[str, Callable[[np.random.Generator, int], np.ndarray]] = {
+DECALS: dict[str, Painter] = {
     painter.__name__: painter
     for painter in (poster, painting, screen, door, books, window, board, whiteboard, lamp, sign)
 }
+
+
+def paint_texture(name: str, seed: int, size: int) -> np.ndarray:
+    """Return the texture `name` as uint8 [size, size, 3], gamma-encoded RGB.
+
+    name: a key of `TILES` (`textures.py`) or `DECALS`, optionally with a variant, as in "poster:3".
+    Raises InputError if there is no such texture.
+    """
+    kind = name.split(":", maxsplit=1)[0]
+    painter = TILES.get(kind) or DECALS.get(kind)
+    if painter is None:
+        known = ", ".join(sorted([*TILES, *DECALS]))
+        raise InputError(f"`name` must be one of {known}, got {name!r}")
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+    return painter(rng, size)

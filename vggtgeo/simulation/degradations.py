@@ -27,11 +27,12 @@ class Recording:
 
 
 Degradation = Callable[[Recording, np.random.Generator], Recording]
+_UNKNOWN = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
+"""Depth from outside an image."""
 
 
 def as_it_is(recording: Recording, rng: np.random.Generator) -> Recording:
     """Return the recording undisturbed."""
-    del rng
     return recording
 
 
@@ -48,7 +49,6 @@ def dirty_lens(recording: Recording, rng: np.random.Generator) -> Recording:
 
 def bars(recording: Recording, rng: np.random.Generator) -> Recording:
     """Draw black bars above and below, 13 % of the height each."""
-    del rng
     height = round(0.13 * recording.frames[0].image.shape[0])
 
     def paint(image: np.ndarray, row: int) -> np.ndarray:
@@ -61,7 +61,6 @@ def bars(recording: Recording, rng: np.random.Generator) -> Recording:
 
 def text(recording: Recording, rng: np.random.Generator) -> Recording:
     """Draw a time code, the name of the camera and an address, white, in three lines."""
-    del rng
     height, width = recording.frames[0].image.shape[:2]
     size = width / 770
 
@@ -117,34 +116,29 @@ def dark(recording: Recording, rng: np.random.Generator) -> Recording:
 
 def centimetres(recording: Recording, rng: np.random.Generator) -> Recording:
     """Scale the depth by 0.1, as a wrong unit does."""
-    del rng
     return with_depths(recording, lambda depth, row: 0.1 * depth)
 
 
 def growing_depth(recording: Recording, rng: np.random.Generator, share: float = 0.4) -> Recording:
     """Let the scale of the depth grow over the recording, by 40 % or another share, as a sensor that warms up."""
-    del rng
     count = len(recording.frames)
     return with_depths(recording, lambda depth, row: depth * (1 + share * row / count))
 
 
 def jumping_depth(recording: Recording, rng: np.random.Generator, factor: float = 1.2) -> Recording:
     """Scale the depth by `factor` from the middle on, as a depth camera that restarts in another mode."""
-    del rng
     middle = len(recording.frames) // 2
     return with_depths(recording, lambda depth, row: depth * (factor if row >= middle else 1.0))
 
 
 def other_depth(recording: Recording, rng: np.random.Generator) -> Recording:
     """Return the depth images in reverse order."""
-    del rng
     frames = recording.frames
     return replace(recording, frames=[replace(a, depth=b.depth) for a, b in zip(frames, frames[::-1], strict=True)])
 
 
 def shuffled(recording: Recording, rng: np.random.Generator) -> Recording:
     """Reorder the frames as file names sort: 1, 10, 11, ..., 2, 20, ..."""
-    del rng
     frames, poses, times = recording.frames, recording.truth.poses, recording.truth.timestamps
     order = sorted(range(len(frames)), key=str)
     moved = [replace(frames[source], index=row, timestamp=times[row]) for row, source in enumerate(order)]
@@ -153,34 +147,29 @@ def shuffled(recording: Recording, rng: np.random.Generator) -> Recording:
 
 def barrel(recording: Recording, rng: np.random.Generator, k1: float = -0.3) -> Recording:
     """Apply a wide lens, k1 = -0.3 or another value, that the calibration omits."""
-    del rng
     camera = recording.camera
     y, x = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     grid = np.stack([x, y], -1).reshape(-1, 1, 2)
     source = cv2.undistortPoints(grid, camera.matrix, np.array([k1, 0, 0, 0.0]), P=camera.matrix)
     u, v = np.asarray(source, np.float32).reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
     bent = with_images(recording, lambda image, row: cv2.remap(image, u, v, cv2.INTER_LINEAR))
-    nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
-    return with_depths(bent, lambda depth, row: cv2.remap(depth, u, v, cv2.INTER_NEAREST, **nothing))
+    return with_depths(bent, lambda depth, row: cv2.remap(depth, u, v, cv2.INTER_NEAREST, **_UNKNOWN))
 
 
 def zooming(recording: Recording, rng: np.random.Generator, share: float = 0.3) -> Recording:
     """Zoom steadily, by 1.3 at the end, or 1 + share."""
-    del rng
     last = max(len(recording.frames) - 1, 1)
     return _through_lens(recording, lambda row: 1.0 + share * row / last)
 
 
 def changed_lens(recording: Recording, rng: np.random.Generator, factor: float = 1.7) -> Recording:
     """Change the lens in the middle, to `factor` times the focal length."""
-    del rng
     middle = len(recording.frames) // 2
     return _through_lens(recording, lambda row: factor if row >= middle else 1.0)
 
 
 def rolling_shutter(recording: Recording, rng: np.random.Generator, seconds: float = 0.02) -> Recording:
     """Apply a rolling shutter of 20 ms, by depth and ground truth."""
-    del rng
     frames, camera = recording.frames, recording.camera
     moving = camera_velocities(np.array([frame.timestamp for frame in frames]), recording.truth)
     drawn = [rolled(frame, motion, camera.intrinsics, seconds) for frame, motion in zip(frames, moving, strict=True)]
@@ -194,7 +183,6 @@ def wrong_focal(
     aside: tuple[float, float] = (0.0, 0.0),
 ) -> Recording:
     """Change the calibration: `factor` times the focal length, and a centre moved by `aside`, pixels."""
-    del rng
     fx, fy, cx, cy = recording.camera.intrinsics
     given = (factor * fx, factor * fy, cx + aside[0], cy + aside[1])
     return replace(recording, camera=replace(recording.camera, intrinsics=given))
@@ -211,7 +199,6 @@ def covered(recording: Recording, rng: np.random.Generator) -> Recording:
 
 def without_depth(recording: Recording, rng: np.random.Generator) -> Recording:
     """Remove the depth."""
-    del rng
     return replace(recording, frames=[replace(frame, depth=None) for frame in recording.frames])
 
 
@@ -227,14 +214,13 @@ DEGRADATIONS: dict[str, Degradation] = {
 def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recording:
     """Return image and depth with so many times the focal length."""
     cx, cy = recording.camera.intrinsics[2:]
-    nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
 
     def grown(row: int) -> np.ndarray:
         times = factor(row)
         return np.array([[times, 0.0, (1.0 - times) * cx], [0.0, times, (1.0 - times) * cy]])
 
     def depth_through(depth: np.ndarray, row: int) -> np.ndarray:
-        return cv2.warpAffine(depth, grown(row), depth.shape[::-1], flags=cv2.INTER_NEAREST, **nothing)
+        return cv2.warpAffine(depth, grown(row), depth.shape[::-1], flags=cv2.INTER_NEAREST, **_UNKNOWN)
 
     seen = with_images(recording, lambda image, row: cv2.warpAffine(image, grown(row), image.shape[1::-1]))
     return with_depths(seen, depth_through)
@@ -316,10 +302,9 @@ def rolled(frame: Frame, velocity: np.ndarray, intrinsics: tuple[float, ...], se
         there = cv2.remap(full, *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         depth = np.maximum(depth + there - far, 0.05)
     _, at = seen(depth)
-    nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
     measured = np.where(known, frame.depth, np.nan).astype(np.float32)
     return replace(
         frame,
         image=cv2.remap(frame.image, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-        depth=cv2.remap(measured, *at, cv2.INTER_NEAREST, **nothing),
+        depth=cv2.remap(measured, *at, cv2.INTER_NEAREST, **_UNKNOWN),
     )

@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
-from vggtgeo.simulation.furniture import (
-    DARK,
-    METAL,
-    WOOD,
-    beam,
-    bench,
-    hang,
-    kiosk,
-    lamp_panel,
-    plant,
-    railing,
-    sofa,
-    wall,
-)
-from vggtgeo.simulation.room import BRICK, floor_and_ceiling
+from vggtgeo.simulation.furniture import BRICK, DARK, METAL, WOOD, RoomBuilder, sides_of
 from vggtgeo.simulation.scene import Scene, finish
-from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
+from vggtgeo.simulation.shapes import Look, Vector
 from vggtgeo.simulation.trajectories import Walk
 
 _SIZE = (36.0, 22.0)
@@ -55,66 +39,62 @@ HALL_WALK = Walk(
 
 def build_hall(seed: int) -> Scene:
     """Build two rows of columns, a gallery on the north side, windows high up, and islands of seats and kiosks."""
-    b = SceneBuilder(seed)
-    sx, sy = _SIZE
-    floor_and_ceiling(b, (0, 0), _SIZE, _HEIGHT, Look("terrazzo", 2.4, detail=0.07), Look("metal", 2.5, detail=0.06))
-    corners = [(0.0, 0.0), (0.0, sy), (sx, sy), (sx, 0.0), (0.0, 0.0)]
-    for side, (start, end) in enumerate(pairwise(corners)):
-        wall(b, start, end, _HEIGHT, BRICK if side == 2 else _CONCRETE)
-        length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-        hang(b, start, end, 0.5 * length, 0.0, (length, 0.15), DARK, 0.02)
-        _dress(b, start, end, length, side)
+    b = RoomBuilder(seed)
+    b.floor_and_ceiling((0, 0), _SIZE, _HEIGHT, Look("terrazzo", 2.4, detail=0.07), Look("metal", 2.5, detail=0.06))
+    for side, (start, end) in enumerate(sides_of(_SIZE)):
+        b.wall(start, end, _HEIGHT, BRICK if side == 2 else _CONCRETE)
+        _dress(b, start, end, b.skirting(start, end, 0.15, 0.02), side)
     for x in np.arange(6.0, 31.0, 6.0):
         for y in (7.6, 16.6):
             b.cylinder((x, y, 0), 0.38, _HEIGHT, _CONCRETE)
             b.cylinder((x, y, 0), 0.50, 0.35, Look("terrazzo", 1.2))
-        beam(b, (x, 0, 7.5), (x, sy, 7.5), (0.35, 0.6), METAL)
+        b.beam((x, 0, 7.5), (x, _SIZE[1], 7.5), (0.35, 0.6), METAL)
     _gallery(b)
     _islands(b)
     for x in np.arange(3.0, 36.0, 6.0):
         for y in (4.0, 11.0, 18.0):
-            lamp_panel(b, float(x), y, _HEIGHT, (1.8, 1.8), power=34.0, reach=14.0)
+            b.lamp_panel(float(x), y, _HEIGHT, (1.8, 1.8), power=34.0, reach=14.0)
     return finish(b, "hall", ambient=0.36, exposure=0.62, texel=0.30)
 
 
-def _dress(b: SceneBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
+def _dress(b: RoomBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
     """Add high windows, banners, and doors and posters at eye level."""
     number = 20 * side
     for along in np.arange(3.0, length - 1.5, 6.0):
         look = Look(f"window:{number % 4}", None, emission=0.9)
-        hang(b, start, end, float(along), 4.6, (2.6, 2.8), look, 0.06, METAL)
+        b.hang(start, end, float(along), 4.6, (2.6, 2.8), look, 0.06, METAL)
         banner = Look(f"poster:{40 + number % 6}", None)
         if side != 1:
-            hang(b, start, end, float(along) + 3.0, 3.6, (1.3, 3.2), banner, 0.03)
+            b.hang(start, end, float(along) + 3.0, 3.6, (1.3, 3.2), banner, 0.03)
         number += 1
     along = 1.8
     while along < length - 1.2:
         kind = b.rng.choice(["door", "poster", "painting", "board", "sign"])
         look = Look(f"{kind}:{int(b.rng.integers(0, 5))}", None)
         if kind == "door":
-            hang(b, start, end, along, 0.0, (1.0, 2.1), look, 0.06, WOOD)
+            b.hang(start, end, along, 0.0, (1.0, 2.1), look, 0.06, WOOD)
         else:
             size = (0.5, 0.35) if kind == "sign" else (1.2, 1.5)
-            hang(b, start, end, along, 1.1 if kind != "sign" else 1.7, size, look, 0.03)
+            b.hang(start, end, along, 1.1 if kind != "sign" else 1.7, size, look, 0.03)
         along += float(b.rng.uniform(2.0, 3.4))
 
 
-def _gallery(b: SceneBuilder) -> None:
+def _gallery(b: RoomBuilder) -> None:
     """Add a slab at 3.6 m along the north side with its railing."""
     sx, sy = _SIZE
     b.box((0.5 * sx, sy - 2.0, 3.5), (sx, 4.0, 0.35), _CONCRETE, top=Look("terrazzo", 2.4))
-    railing(b, (0.1, sy - 3.9, 3.85), (sx - 0.1, sy - 3.9, 3.85), 1.1, METAL, 1.5)
+    b.railing((0.1, sy - 3.9, 3.85), (sx - 0.1, sy - 3.9, 3.85), 1.1, METAL, 1.5)
 
 
-def _islands(b: SceneBuilder) -> None:
+def _islands(b: RoomBuilder) -> None:
     for index, (x, y) in enumerate(((10.0, 9.6), (25.5, 9.2), (17.8, 6.9), (24.0, 17.6), (9.0, 18.5), (33.5, 17.5))):
-        kiosk(b, (x, y), 0.3 * index, 50 + 2 * index % 8)
+        b.kiosk((x, y), 0.3 * index, 50 + 2 * index % 8)
     for index, x in enumerate((9.0, 15.0, 21.0, 27.0)):
-        bench(b, (x, 1.2), np.pi)
-        bench(b, (x + 1.0, 17.0), 0.0)
-        plant(b, (x + 2.0, 1.0), 1.6 + 0.1 * index)
+        b.bench((x, 1.2), np.pi)
+        b.bench((x + 1.0, 17.0), 0.0)
+        b.plant((x + 2.0, 1.0), 1.6 + 0.1 * index)
     for x, y, yaw in ((12.4, 11.4, 0.5), (22.6, 11.2, -0.7), (26.5, 11.8, 2.4)):
-        sofa(b, (x, y), yaw, (0.35, 0.12, 0.10), 2.2)
-        plant(b, (x + 1.6, y + 0.6), 1.5)
+        b.sofa((x, y), yaw, (0.35, 0.12, 0.10), 2.2)
+        b.plant((x + 1.6, y + 0.6), 1.5)
     b.box((1.8, 16.0, 0), (0.9, 4.0, 1.1), WOOD, top=Look("terrazzo", 1.5))
     b.box((2.28, 16.0, 0.2), (3.2, 0.02, 0.7), DARK, 0.5 * np.pi, front=Look("painting:9", None))

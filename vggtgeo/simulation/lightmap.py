@@ -16,7 +16,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from vggtgeo.simulation.atlas import look_up
+from vggtgeo.simulation.atlas import look_up, pack_shelves
 from vggtgeo.simulation.shapes import Blockers, Surfaces
 
 _WIDTH = 2048
@@ -47,7 +47,7 @@ def bake(
     """Return the lightmap of a scene with about one sample each `texel` metres."""
     rng = np.random.default_rng([seed, 11])
     counts = np.clip(np.ceil(surfaces.extent / texel).astype(int) + 1, 2, _WIDTH)
-    corner, height = _pack(counts)
+    corner, height = pack_shelves(counts, _WIDTH)
     image = np.zeros((height, _WIDTH), np.float32)
     which, s, t, sizes = _texels(surfaces, counts)
     points, normals = surfaces.points(which, s, t)
@@ -63,19 +63,6 @@ def bake(
         image[y : y + rows, x : x + width] = smooth
     density = (counts - 1) / surfaces.extent
     return Lightmap(image, corner.astype(np.float32), density.astype(np.float32))
-
-
-def _pack(counts: np.ndarray) -> tuple[np.ndarray, int]:
-    """Pack [P, 2] (width, height) rectangles on shelves; return corners [P, 2] and the height used."""
-    corner = np.zeros((len(counts), 2), int)
-    x = y = shelf = 0
-    for row in np.argsort(-counts[:, 1], kind="stable"):
-        width, height = counts[row]
-        if x + width > _WIDTH:
-            x, y, shelf = 0, y + shelf, 0
-        corner[row] = x, y
-        x, shelf = x + width, max(shelf, height)
-    return corner, int(y + shelf)
 
 
 def _texels(surfaces: Surfaces, counts: np.ndarray) -> tuple[np.ndarray, ...]:

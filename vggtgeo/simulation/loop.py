@@ -24,6 +24,10 @@ _WALL, _FLOOR = 3.0, 1.2
 """Metres to the wall ahead, and to the floor below."""
 _SURFACE_POINTS, _SURFACE_SIGMA = 60, 0.01
 """Points of an alignment of surfaces, and the standard deviation of one, metres."""
+_NOISE, _START_ERROR = 0.5, 0.01
+"""Standard deviations of matches, pixels, and of each starting position, metres."""
+_DEPTH_ERROR = 0.03
+"""Relative standard deviation of the depth prior, which counts with the paper's `alpha = 2`."""
 _MARGIN = 4.0
 """Pixels from the border within which nothing is matched."""
 
@@ -33,11 +37,7 @@ def simulate_loop(
     points: int = 40,
     reach: int = 4,
     *,
-    noise: float = 0.5,
-    depth_error: float = 0.03,
-    start_error: float = 0.01,
     drift: float = 0.03,
-    seed: int = 0,
 ) -> tuple[SimulatedWindow, SurfaceAlignment]:
     """Return a loop of `keyframes` cameras, and the alignment of the surfaces that neighbours see.
 
@@ -45,11 +45,7 @@ def simulate_loop(
         keyframes: more than `2 reach`.
         points: hosted in each keyframe.
         reach: how many keyframes before and after see a keyframe's points, around the loop; half as many its surfaces.
-        noise: standard deviation of matches, pixels.
-        depth_error: relative standard deviation of the depth prior, which counts with the paper's `alpha = 2`.
-        start_error: standard deviation of each starting position, metres.
         drift: turn of the guess over the whole loop, radians.
-        seed: of everything random.
 
     Example:
         >>> from vggtgeo.simulation.loop import simulate_loop
@@ -59,7 +55,7 @@ def simulate_loop(
         (120, 30)
 
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     poses = _circle(keyframes)
     hosts, steps = np.arange(keyframes), [step for step in range(-reach, reach + 1) if step]
     edges = np.stack([np.repeat(hosts, len(steps)), np.tile(steps, keyframes)], 1)
@@ -72,26 +68,26 @@ def simulate_loop(
     target = project_between(poses, edges[edge], pixel[landmark], depth[landmark])
     inside = np.all((target > _MARGIN) & (target < np.array(SIZE) - _MARGIN), 1)
     edge, landmark, target = edge[inside], landmark[inside], target[inside]
-    mean = np.exp(depth_error * rng.normal(size=len(depth))) / depth
+    mean = np.exp(_DEPTH_ERROR * rng.normal(size=len(depth))) / depth
     observations = Observations(
         edges=edges,
         host=host,
         pixel=pixel,
         point_edge=edge,
         point_landmark=landmark,
-        point_target=target + rng.normal(0, noise, target.shape),
+        point_target=target + rng.normal(0, _NOISE, target.shape),
         point_weight=np.ones(len(target)),
         line_edge=np.zeros(0, int),
         line_landmark=np.zeros(0, int),
         line_coefficients=np.zeros((0, 3)),
         line_weight=np.zeros(0),
         depth_mean=mean,
-        depth_sigma=depth_error * mean,
+        depth_sigma=_DEPTH_ERROR * mean,
         alpha=2.0,
     )
-    start = _drifted(poses, drift, start_error, rng)
+    start = _drifted(poses, drift, rng)
     window = SimulatedWindow(
-        observations, poses, 1 / depth, start, np.zeros(len(target), bool), noise, observations.pixel
+        observations, poses, 1 / depth, start, np.zeros(len(target), bool), _NOISE, observations.pixel
     )
     return window, _surfaces(poses, max(reach // 2, 1), rng)
 
@@ -105,9 +101,7 @@ def _circle(keyframes: int) -> Float[np.ndarray, "n 7"]:
     return _as_poses(outward.inv(), -outward.inv().apply(centres))
 
 
-def _drifted(
-    poses: Float[np.ndarray, "n 7"], drift: float, error: float, rng: np.random.Generator
-) -> Float[np.ndarray, "n 7"]:
+def _drifted(poses: Float[np.ndarray, "n 7"], drift: float, rng: np.random.Generator) -> Float[np.ndarray, "n 7"]:
     """Return the motions from keyframe to keyframe, each turned by a share of the drift, put together again."""
     turns, shifts = Rotation.from_quat(poses[:, :4], scalar_first=True), poses[:, 4:]
     steps = turns[1:] * turns[:-1].inv()
@@ -118,7 +112,7 @@ def _drifted(
         turn, shift = found[-1]
         found.append((bias * step * turn, bias.apply(step.apply(shift) + move)))
     shifted = np.array([shift for _, shift in found])
-    shifted[1:] += rng.normal(0, error, (len(poses) - 1, 3))
+    shifted[1:] += rng.normal(0, _START_ERROR, (len(poses) - 1, 3))
     return _as_poses(Rotation.concatenate([turn for turn, _ in found]), shifted)
 
 

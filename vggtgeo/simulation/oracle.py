@@ -1,4 +1,5 @@
-"""Ground truth of a synthetic sequence by image, for the stubs of the five roles.
+"""Exact knowledge about the images of a synthetic sequence, for the stubs of the five roles: points, matches, edges,
+strength of texture.
 
 Roles receive images, not frame numbers. So the oracle is itself a `Sequence`, and remembers a fingerprint of each
 image.
@@ -11,26 +12,39 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame, check_selection
+from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.simulation.raster import View, view_from
+from vggtgeo.simulation.raster import EMPTY, NEAR, View, encode, inverse_depth_at, view_from
 from vggtgeo.simulation.render import Picture
+from vggtgeo.simulation.scene import Scene
 from vggtgeo.simulation.sequence import SyntheticSequence
-from vggtgeo.simulation.truth import (
-    VisibleEdges,
-    farthest_depth,
-    is_visible,
-    locate,
-    project,
-    texture_strength,
-    visible_edges,
-)
 
+_HALF_STRENGTH = 6.0  # grey levels a pixel of gradient in the weaker direction that count as strength 0.5
+_DEPTH_TOLERANCE = 0.01  # relative; what is nearer by more hides a point
+_SHORTEST = 15.0  # pixels of a visible part of an edge
+_SAMPLE = 3.0  # pixels between samples along an edge
 _KEPT_FRAMES = 14  # about 10 MB each at 640 x 480, 3 MB at 320 x 240
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleEdges:
+    """Visible parts of straight 3D edges in one frame.
+
+    pixels: float64 [L, 2, 2] (segment, end, xy). points: float64 [L, 2, 3], world, metres. edge: int [L], row of the
+    scene's `edges`; an edge hidden in its middle gives two parts. contrast: float64 [L], mean size of the image
+    gradient along the part, grey levels a pixel.
+    """
+
+    pixels: np.ndarray
+    points: np.ndarray
+    edge: np.ndarray
+    contrast: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,3 +164,137 @@ class SimulatedOracle:
 def _fingerprint(image: np.ndarray) -> tuple[int, int]:
     data = np.ascontiguousarray(image).tobytes()
     return zlib.crc32(data), zlib.adler32(data)
+
+
+def texture_strength(picture: Picture) -> np.ndarray:
+    """Return how well each pixel can be localised from texture alone: float32 [H, W] in [0, 1).
+
+    g / (g + 6), g the root of the smaller eigenvalue of the structure tensor (Gaussian, 2 px) of the noise-free
+    image in grey levels: straight edges do not count, corners and texture do.
+    """
+    grey = cv2.cvtColor(encode(picture.light), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    dx, dy = cv2.Scharr(grey, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(grey, cv2.CV_32F, 0, 1) / 32
+    xx, yy, xy = (cv2.GaussianBlur(product, (0, 0), 2.0) for product in (dx * dx, dy * dy, dx * dy))
+    smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    gradient = np.sqrt(np.maximum(smaller, 0.0))
+    return np.asarray(gradient / (gradient + _HALF_STRENGTH), np.float32)
+
+
+def locate(
+    view: View, pose: np.ndarray, camera: Camera, picture: Picture, pixels: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return world points float64 [n, 3] that `pixels` [n, 2] show, and whether there is a surface, bool [n].
+
+    view, picture: of the camera at `pose`. Exact at sub-pixel places: the ray meets the surface that the nearest
+    pixel's centre sees.
+    """
+    height, width = picture.surface.shape
+    columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
+    rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
+    surface = picture.surface[rows, columns]
+    there = surface != EMPTY
+    rays = pinhole.rays(np.asarray(pixels, np.float64), camera.intrinsics)
+    with np.errstate(divide="ignore"):
+        depth = 1.0 / inverse_depth_at(view, np.where(there, surface, 0), rays[:, 0], rays[:, 1])
+    points = depth[:, None] * rays
+    return (points - pose[:3, 3]) @ pose[:3, :3], there & np.isfinite(depth) & (depth > 0)
+
+
+def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels float64 [n, 2] and depths [n] of world points [n, 3]; NaN pixels behind the camera."""
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    return pinhole.project(local, camera.intrinsics, NEAR), local[:, 2]
+
+
+def farthest_depth(picture: Picture) -> np.ndarray:
+    """Return the largest depth within a pixel of each pixel, float32 [H, W], metres: what hides nothing nearer."""
+    depth = np.nan_to_num(picture.depth, nan=np.inf).astype(np.float32)
+    return np.asarray(cv2.dilate(depth, np.ones((3, 3), np.uint8)))
+
+
+def is_visible(pixels: np.ndarray, depths: np.ndarray, farthest: np.ndarray) -> np.ndarray:
+    """Return whether points at `pixels` [n, 2] with depths [n] are inside the picture and not hidden: bool [n].
+
+    farthest: of `farthest_depth`. A point is hidden if all surfaces within a pixel of it are nearer by over 1 %.
+    """
+    height, width = farthest.shape
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5), axis=1) & (depths > NEAR)
+    at = np.where(inside[:, None], pixels, 0.0)
+    columns = np.clip(np.rint(at[:, 0]).astype(int), 0, width - 1)
+    rows = np.clip(np.rint(at[:, 1]).astype(int), 0, height - 1)
+    return inside & (depths <= farthest[rows, columns] * (1 + _DEPTH_TOLERANCE))
+
+
+def visible_edges(scene: Scene, pose: np.ndarray, camera: Camera, picture: Picture) -> VisibleEdges:
+    """Return the visible parts of the scene's edges that are at least `_SHORTEST` pixels long."""
+    maps = (farthest_depth(picture), _gradient(picture))
+    parts: list[tuple[np.ndarray, np.ndarray, int, float]] = []
+    for index, ends in _clipped(scene.edges, pose, camera):
+        length = float(np.linalg.norm(ends[1, :2] - ends[0, :2]))
+        if length >= _SHORTEST:
+            parts += _visible_parts(index, ends, length, pose, camera, maps)
+    if not parts:
+        return VisibleEdges(np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros(0, int), np.zeros(0))
+    pixels, points, edge, contrast = zip(*parts, strict=True)
+    return VisibleEdges(np.array(pixels), np.array(points), np.array(edge), np.array(contrast))
+
+
+def _gradient(picture: Picture) -> np.ndarray:
+    grey = cv2.cvtColor(encode(picture.light), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    size = np.hypot(cv2.Scharr(grey, cv2.CV_32F, 1, 0), cv2.Scharr(grey, cv2.CV_32F, 0, 1)) / 32
+    return cv2.dilate(size, np.ones((3, 3), np.uint8))
+
+
+def _clipped(edges: np.ndarray, pose: np.ndarray, camera: Camera) -> list[tuple[int, np.ndarray]]:
+    """Return edges cut to the picture: (row, [2, 3] = (u, v, inverse depth) of both ends); affine along the segment."""
+    local = edges @ pose[:3, :3].T + pose[:3, 3]
+    found = []
+    for index in np.nonzero((local[..., 2] > NEAR).any(axis=1))[0]:
+        a, b = local[index]
+        if min(a[2], b[2]) < NEAR:
+            cut = a + (NEAR - a[2]) / (b[2] - a[2]) * (b - a)
+            a, b = (cut, b) if a[2] < NEAR else (a, cut)
+        points = np.stack([a, b])
+        ends = np.column_stack([pinhole.project(points, camera.intrinsics), 1.0 / points[:, 2]])
+        inside = _cut_to_picture(ends, camera)
+        if inside is not None:
+            found.append((int(index), inside))
+    return found
+
+
+def _cut_to_picture(ends: np.ndarray, camera: Camera) -> np.ndarray | None:
+    start, way = ends[0], ends[1] - ends[0]
+    enter, leave = 0.0, 1.0
+    for axis, high in ((0, camera.width - 1.0), (1, camera.height - 1.0)):
+        if abs(way[axis]) < 1e-9:
+            if not 0.0 <= start[axis] <= high:
+                return None
+            continue
+        first, last = sorted(((0.0 - start[axis]) / way[axis], (high - start[axis]) / way[axis]))
+        enter, leave = max(enter, first), min(leave, last)
+    return np.stack([start + enter * way, start + leave * way]) if enter < leave else None
+
+
+def _visible_parts(
+    index: int,
+    ends: np.ndarray,
+    length: float,
+    pose: np.ndarray,
+    camera: Camera,
+    maps: tuple[np.ndarray, np.ndarray],
+) -> list[tuple[np.ndarray, np.ndarray, int, float]]:
+    count = max(2, int(length / _SAMPLE) + 1)
+    samples = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
+    seen = is_visible(samples[:, :2], 1.0 / samples[:, 2], maps[0])
+    seen[1:-1] |= seen[:-2] & seen[2:]  # one hidden sample is no gap
+    bounds = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
+    parts = []
+    for first, last in zip(bounds[::2], bounds[1::2] - 1, strict=True):
+        run = samples[[first, last]]
+        if np.linalg.norm(run[1, :2] - run[0, :2]) < _SHORTEST:
+            continue
+        points = (pinhole.rays(run[:, :2], camera.intrinsics) / run[:, 2:] - pose[:3, 3]) @ pose[:3, :3]
+        at = np.rint(samples[first : last + 1, :2]).astype(int)
+        parts.append((run[:, :2], points, index, float(maps[1][at[:, 1], at[:, 0]].mean())))
+    return parts

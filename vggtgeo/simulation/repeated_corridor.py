@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.simulation.furniture import hang, lamp_panel, wall
-from vggtgeo.simulation.room import floor_and_ceiling
+from vggtgeo.simulation.furniture import RoomBuilder
 from vggtgeo.simulation.scene import Scene, finish
 from vggtgeo.simulation.sensor import Sensor
 from vggtgeo.simulation.sequence import SyntheticSequence, camera_of
-from vggtgeo.simulation.shapes import Look, SceneBuilder, Vector
+from vggtgeo.simulation.shapes import Look, Vector
 from vggtgeo.simulation.trajectories import HandheldMotion, Walk
 
 SECTION, _WIDTH, _HEIGHT = 2.0, 2.4, 2.5
@@ -65,24 +64,24 @@ def _walk(sections: int) -> tuple[Walk, float]:
 
 
 def _build(seed: int, sections: int) -> Scene:
-    b = SceneBuilder(seed)
+    b = RoomBuilder(seed)
     length = sections * SECTION
     for number in range(sections):
         low, high = (number * SECTION, 0.0), ((number + 1) * SECTION, _WIDTH)
-        floor_and_ceiling(b, low, high, _HEIGHT, Look("carpet", None, detail=0.0), Look("ceiling", None, detail=0.0))
+        b.floor_and_ceiling(low, high, _HEIGHT, Look("carpet", None, detail=0.0), Look("ceiling", None, detail=0.0))
         # Walls are listed clockwise seen from above, so that they face inwards.
         _section(b, (low[0], _WIDTH), (high[0], _WIDTH), "a")
         _section(b, (high[0], 0.0), (low[0], 0.0), "b")
-        lamp_panel(b, low[0] + 0.5 * SECTION, 0.5 * _WIDTH, _HEIGHT, (0.9, 0.3), power=2.6, reach=6.0)
+        b.lamp_panel(low[0] + 0.5 * SECTION, 0.5 * _WIDTH, _HEIGHT, (0.9, 0.3), power=2.6, reach=6.0)
     for start, end, which in (((0.0, 0.0), (0.0, _WIDTH), 1), ((length, _WIDTH), (length, 0.0), 2)):
-        wall(b, start, end, _HEIGHT, _PLAIN)
-        hang(b, start, end, 0.5 * _WIDTH, 0.7, (1.4, 1.2), Look(f"painting:{which}", None))
+        b.wall(start, end, _HEIGHT, _PLAIN)
+        b.hang(start, end, 0.5 * _WIDTH, 0.7, (1.4, 1.2), Look(f"painting:{which}", None))
     return finish(b, "repeated corridor", ambient=0.42, exposure=0.72, texel=0.16)
 
 
-def _section(b: SceneBuilder, start: Vector, end: Vector, side: str) -> None:
+def _section(b: RoomBuilder, start: Vector, end: Vector, side: str) -> None:
     """Add one section of a long wall, with its posters, the same in all sections."""
-    wall(b, start, end, _HEIGHT, Look("plaster", None, detail=0.0), edges=False)
+    b.wall(start, end, _HEIGHT, Look("plaster", None, detail=0.0), edges=False)
     for number, along in enumerate(_POSTERS):
         variant = number + (10 if side == "b" else 0)
-        hang(b, start, end, along, 1.0 + 0.12 * number, (0.45, 0.62), Look(f"poster:{variant}", None, detail=0.0))
+        b.hang(start, end, along, 1.0 + 0.12 * number, (0.45, 0.62), Look(f"poster:{variant}", None, detail=0.0))

@@ -9,10 +9,10 @@ from itertools import repeat
 import numpy as np
 
 from vggtgeo.simulation.atlas import Atlas, build_atlas
+from vggtgeo.simulation.decals import paint_texture
 from vggtgeo.simulation.lightmap import Lightmap, bake
 from vggtgeo.simulation.shapes import SceneBuilder, Surfaces, stack_blockers, stack_surfaces
-from vggtgeo.simulation.texture_fields import fractal
-from vggtgeo.simulation.textures import TILES, paint_texture
+from vggtgeo.simulation.textures import TILES, fractal
 
 _TILE_SIZE = 1024
 _DECAL_SIZE = 512

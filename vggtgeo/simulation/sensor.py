@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real, check_whole, real_numbers
+from vggtgeo.io.given import check_real, check_whole, real_array
 from vggtgeo.simulation.raster import encode
 
 MAX_SAMPLES = 1000
@@ -41,8 +41,8 @@ class Sensor:
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be zero or a positive number")
         check_whole("blur_samples", self.blur_samples, 1, MAX_SAMPLES)
-        given = real_numbers("depth_range", self.depth_range)
-        if given.shape != (2,) or not 0 <= given[0] < given[1]:
+        near, far = real_array("depth_range", self.depth_range, (2,))
+        if not 0 <= near < far:
             raise InputError(f"`depth_range` is {self.depth_range}; it must be (near, far) with 0 <= near < far")
 
     def gain(self, time: float) -> float:

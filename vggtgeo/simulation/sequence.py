@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,16 +15,14 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_picture, write_text
-from vggtgeo.io.given import check_kind, check_real, check_whole
-from vggtgeo.simulation.building import BUILDING_WALK, build_building
+from vggtgeo.io.given import check_kind, check_real, check_whole, real_array
 from vggtgeo.simulation.corridor import CORRIDOR_WALK, build_corridor
 from vggtgeo.simulation.hall import HALL_WALK, build_hall
-from vggtgeo.simulation.office import OFFICE_WALK, build_office
 from vggtgeo.simulation.render import Picture, render
-from vggtgeo.simulation.room import ROOM_WALK, build_room
+from vggtgeo.simulation.rooms import OFFICE_WALK, ROOM_WALK, build_office, build_room
 from vggtgeo.simulation.scene import Scene
 from vggtgeo.simulation.sensor import Sensor
-from vggtgeo.simulation.staircase import STAIRCASE_WALK, build_staircase
+from vggtgeo.simulation.staircase import BUILDING_WALK, STAIRCASE_WALK, build_building, build_staircase
 from vggtgeo.simulation.trajectories import HandheldMotion, Walk
 
 WORLDS: dict[str, tuple[Callable[[int], Scene], Walk]] = {
@@ -58,7 +55,7 @@ class SyntheticSequence:
     count: int
     rate: float
     seed: int
-    has_depth: bool = field(default=True)
+    has_depth: bool = True
 
     @property
     def name(self) -> str:
@@ -169,18 +166,11 @@ def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, spee
     """Raise InputError for what `simulate` cannot take."""
     if scene not in tuple(WORLDS):
         raise InputError(f"`scene` is {scene!r}; it must be one of {', '.join(WORLDS)}")
-    check_kind("size", size, tuple | list | np.ndarray, "(width, height), in pixels")
-    if len(size) != 2:
-        raise InputError(f"`size` has {len(size)} numbers; expected (width, height), in pixels")
-    for name, count in (("frames", frames), ("size", min(size)), ("size", max(size))):
-        check_whole(name, count, 1)
-    for name, count, most in (("frames", frames, MAX_FRAMES), ("size", max(size), MAX_SIDE)):
-        if count > most:
-            raise InputError(f"`{name}` is {count}; it must be at most {most}")
+    check_whole("frames", frames, 1, MAX_FRAMES)
+    for side in real_array("size", size, (2,)):
+        check_whole("size", side, 1, MAX_SIDE)
     for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
         check_real(name, value)
-        if not 0 < value < math.inf:
-            raise InputError(f"`{name}` is {value}; it must be positive")
         if not _LEAST <= value <= _MOST:  # times or places that are the same, or none
             raise InputError(f"`{name}` is {value}; it must be from {_LEAST:g} to {_MOST:g}")
 

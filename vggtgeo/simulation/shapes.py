@@ -21,7 +21,7 @@ UP = np.array([0.0, 0.0, 1.0])
 class Look:
     """What a surface looks like.
 
-    texture: name for `textures.paint_texture`. tile: metres of one repetition, None = stretched over the surface.
+    texture: name for `decals.paint_texture`. tile: metres of one repetition, None = stretched over the surface.
     tint: colour factor (linear). detail: relative amplitude of the fine structure on top. emission: 0 = lit by the
     lamps only, 1 = as bright as white under full light.
     """
@@ -85,7 +85,7 @@ class Blockers:
 
 @dataclass
 class SceneBuilder:
-    """Collects surfaces, edges, lights and panes; `scenes.finish` makes the immutable scene of them."""
+    """Collects surfaces, edges, lights and panes; `scene.finish` makes the immutable scene of them."""
 
     seed: int
     rows: list[tuple] = field(default_factory=list)
@@ -148,7 +148,7 @@ class SceneBuilder:
         if shadow:
             self.boxes.append((base + 0.5 * z, yaw, 0.5 * np.asarray(size, float)))
 
-    def cylinder(self, base: Vector, radius: float, height: float, look: Look, top: Look | None = None) -> None:
+    def cylinder(self, base: Vector, radius: float, height: float, look: Look) -> None:
         """Add an upright closed cylinder standing on `base`."""
         base = np.asarray(base, float)
         low, high = base - [radius, radius, 0], base + [radius, radius, height]
@@ -156,7 +156,7 @@ class SceneBuilder:
         row = (CYLINDER, base, np.eye(3)[0], np.eye(3)[1], UP, (2 * np.pi * radius, height), corners)
         self.rows.append(row)
         self.looks.append(look)
-        self.disc(base + [0, 0, height], radius, top or look)
+        self.disc(base + [0, 0, height], radius, look)
         self.boxes.append((base + [0, 0, 0.5 * height], 0.0, np.array([0.8 * radius, 0.8 * radius, 0.5 * height])))
 
     def _add(self, kind: int, origin: np.ndarray, along: np.ndarray, up: np.ndarray, look: Look) -> None:

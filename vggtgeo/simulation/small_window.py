@@ -5,7 +5,6 @@ For examples, notebooks and tests: it is made in milliseconds, and every number 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Any
@@ -32,6 +31,8 @@ _SAMPLES = 4
 """Slots a segment."""
 _DEPTHS = 1.5, 4.5
 """Metres."""
+_MAX_ERROR = 1e9
+"""Of any kind; larger ones leave nothing to estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,13 +150,11 @@ def simulate_window(
         check_whole(name, value, least)
     check_whole("seed", seed)
     errors = {"noise": noise, "outliers": outliers, "depth_error": depth_error, "start_error": start_error}
-    for name, share in errors.items():
-        most = 1.0 if name == "outliers" else math.inf
-        check_real(name, share)
-        if not (0 <= share <= most and math.isfinite(share)):
-            raise InputError(
-                f"`{name}` is {share}; it must be at least 0, and {'at most 1' if most == 1 else 'finite'}"
-            )
+    for name, error in errors.items():
+        check_real(name, error)
+        most = 1.0 if name == "outliers" else _MAX_ERROR
+        if not 0 <= error <= most:
+            raise InputError(f"`{name}` is {error}; it must be from 0 to {most:g}")
     rng = np.random.default_rng(seed)
     poses = _arc(keyframes)
     host = np.repeat(np.arange(keyframes), points)

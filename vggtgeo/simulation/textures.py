@@ -1,24 +1,89 @@
 """Procedural surface textures: periodic tiles with detail at many scales.
 
 Each painter is a pure function `(rng, size) -> uint8 [size, size, 3]` in display (gamma-encoded) RGB that tiles
-without a seam. `paint_texture` finds a painter by name and gives it its own random stream, so that a texture depends
-on its name and the seed alone, never on the order in which textures are made.
+without a seam. Their raw material are periodic random fields.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 
 import cv2
 import numpy as np
+import scipy.fft
 from scipy.ndimage import gaussian_filter
 
-from vggtgeo.io.errors import InputError
-from vggtgeo.simulation.decals import DECALS
-from vggtgeo.simulation.texture_fields import blend, fractal, quantise, random_colour, tile_cells
-
 Painter = Callable[[np.random.Generator, int], np.ndarray]
+
+
+def fractal(
+    rng: np.random.Generator, size: int, slope: float = 1.0, stretch: float = 1.0, lowest: float = 1.0
+) -> np.ndarray:
+    """Return a periodic Gaussian field with amplitude spectrum |k|^-slope: detail at every scale.
+
+    Returns float32 [size, size], mean 0, standard deviation 1. `stretch` > 1 lengthens the grain along x; waves with
+    fewer than `lowest` periods in the tile are removed.
+    """
+    half = size // 2 + 1
+    parts = rng.standard_normal((2, size, half), dtype=np.float32)
+    wave_y = np.fft.fftfreq(size, 1.0 / size).astype(np.float32)[:, None]
+    wave_x = np.arange(half, dtype=np.float32)[None, :] * np.float32(stretch)
+    squared = wave_x**2 + wave_y**2
+    # A smooth end of the spectrum keeps bilinear sampling close to the band-limited field.
+    gain = np.maximum(squared, 1e-6) ** np.float32(-0.5 * slope) * np.exp(
+        squared * np.float32(-0.5 / (0.30 * size) ** 2)
+    )
+    gain[squared < lowest**2] = 0.0
+    spectrum = np.empty((size, half), np.complex64)
+    spectrum.real, spectrum.imag = parts[0] * gain, parts[1] * gain
+    noise = scipy.fft.irfft2(spectrum, s=(size, size), overwrite_x=True)
+    return (noise - noise.mean()) / noise.std()
+
+
+def blend(low: tuple[float, ...], high: tuple[float, ...], amount: np.ndarray) -> np.ndarray:
+    """Return colours between `low` and `high`; `amount` [...] is clipped to [0, 1]. Returns float32 [..., 3]."""
+    share = np.clip(amount, 0.0, 1.0)[..., None].astype(np.float32)
+    return np.asarray(low, np.float32) * (1.0 - share) + np.asarray(high, np.float32) * share
+
+
+def quantise(colour: np.ndarray) -> np.ndarray:
+    """Return colours in [0, 255] as uint8 [..., 3]."""
+    return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
+
+
+def random_colour(rng: np.random.Generator, low: int = 20, high: int = 235) -> tuple[int, int, int]:
+    """Return red, green, blue, each uniform in [low, high)."""
+    red, green, blue = rng.integers(low, high, 3)
+    return int(red), int(green), int(blue)
+
+
+def tile_cells(size: int, rows: int, columns: int, offset: float) -> tuple[np.ndarray, ...]:
+    """Return a running bond: `rows` courses of `columns` cells, each odd course shifted by `offset` of a cell.
+
+    Returns (cell index, distance to the nearest joint along x, the same along y) with distances in pixels,
+    each [size, size]; the pattern is periodic if `rows` is even.
+    """
+    y, x = np.mgrid[0:size, 0:size].astype(np.float32) + 0.5
+    row = np.floor(y * rows / size).astype(np.int32)
+    along = x * columns / size + offset * (row % 2)
+    column = np.floor(along).astype(np.int32)
+    width, height = size / columns, size / rows
+    gap_x = np.minimum(along - column, 1.0 - (along - column)) * width
+    gap_y = np.minimum(y - row * height, (row + 1) * height - y)
+    return (row * columns + column % columns), gap_x, gap_y
+
+
+def scribble(image: np.ndarray, rng: np.random.Generator, box: tuple[int, int, int, int], colour: tuple) -> None:
+    """Draw word-like dashes into `box` = (x0, y0, x1, y1), in lines, as small print is seen from afar."""
+    x0, y0, x1, y1 = box
+    height = max(3, int((y1 - y0) / 14))
+    for y in range(y0 + height, y1 - height // 2, int(1.8 * height)):
+        x = x0
+        end = x1 - int(rng.uniform(0, 0.35) * (x1 - x0))
+        while x < end:
+            width = int(rng.integers(2, 9) * height * 0.45) + 1
+            cv2.rectangle(image, (x, y - height // 2), (min(x + width, end), y + height // 3), colour, -1)
+            x += width + max(2, height // 2)
 
 
 def plaster(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -164,18 +229,3 @@ TILES: dict[str, Painter] = {
         plaster, white, brick, parquet, wood, carpet, fabric, ceiling, metal, concrete, terrazzo, tiles, rug, wallpaper
     )
 }  # fmt: skip
-
-
-def paint_texture(name: str, seed: int, size: int) -> np.ndarray:
-    """Return the texture `name` as uint8 [size, size, 3], gamma-encoded RGB.
-
-    name: a key of `TILES` or of `decals.DECALS`, optionally with a variant, as in "poster:3".
-    Raises InputError if there is no such texture.
-    """
-    kind = name.split(":", maxsplit=1)[0]
-    painter = TILES.get(kind) or DECALS.get(kind)
-    if painter is None:
-        known = ", ".join(sorted([*TILES, *DECALS]))
-        raise InputError(f"`name` must be one of {known}, got {name!r}")
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    return painter(rng, size)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from distorted_sequence import Bent
+from changed import changed
+from distorted_sequence import Bent, bent
 from recorded_run import ROLES, SETTINGS, recorded_run
 from reported import raises
 from vggtgeo.models.classical import NoDepth, SiftMatcher
@@ -35,30 +37,23 @@ WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error
 _solve = eqx.filter_jit(vg.solve)
 
 
-def bent(window: vg.data.SimulatedWindow, *distortion: float) -> vg.data.SimulatedWindow:
-    """Its key points and matches as a lens draws them."""
-    lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *distortion, 0.0, 0.0]))
-    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
-    bend = jax.jit(jax.vmap(lambda pixel: lens.project(straight.unproject(pixel))))
-    curve = lambda pixels: np.asarray(bend(jnp.asarray(pixels)))
-    seen = window.observations
-    return replace(window, observations=replace(seen, point_target=curve(seen.point_target), pixel=curve(seen.pixel)))
+def packed(window: vg.data.SimulatedWindow, camera: vg.cameras.Intrinsics | None = None) -> tuple[Any, Any, Any]:
+    """The problem of the window with one focal length, by default the true one."""
+    f, _, cx, cy = window.intrinsics
+    given = camera or vg.cameras.Intrinsics(np.array([f, cx, cy]), shared_focal=True)
+    return vg.pack(window.observations, window.start, given, 1.0 / window.observations.depth_mean)
 
 
 def found_in(window: vg.data.SimulatedWindow, focal: float) -> FoundLens:
     """Adjusted as a pinhole that begins `focal` times too long, as a guess does, then sought."""
     _, _, cx, cy = window.intrinsics
     guess = np.array([focal * window.intrinsics[0], cx, cy])
-    packed = vg.pack(
-        window.observations,
-        window.start,
-        vg.cameras.Intrinsics(guess, shared_focal=True, prior_sigma=np.full(3, 0.3 * guess[0])),
-        1.0 / window.observations.depth_mean,
+    problem, state, _ = packed(
+        window, vg.cameras.Intrinsics(guess, shared_focal=True, prior_sigma=np.full(3, 0.3 * guess[0]))
     )
-    problem = packed[0]
     size = (round(2 * cy + 1), round(2 * cx + 1))
     solve = lambda problem, state: _solve(problem, state).state
-    found = find_lens(problem, solve(problem, packed[1]), size, solve)
+    found = find_lens(problem, solve(problem, state), size, solve)
     assert found is not None
     return found
 
@@ -90,11 +85,7 @@ def test_no_lens_is_found_where_there_is_none() -> None:
 
 def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
     # Proves that a focal length below zero, or NaN, as a solver may end with, does not end the run. Oracle: the rule.
-    window = vg.simulate_window(3, 12, 0)
-    _, _, cx, cy = window.intrinsics
-    square = vg.cameras.Intrinsics(np.array([window.intrinsics[0], cx, cy]), shared_focal=True)
-    guess = window.observations, window.start, square
-    problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean)
+    problem, state, _ = packed(vg.simulate_window(3, 12, 0))
     for focal in (-1.0, float("nan")):
         ends_at = lambda _, state, f=focal: eqx.tree_at(lambda s: s.intrinsics, state, state.intrinsics.at[0].set(f))
         assert find_lens(problem, state, (480, 640), ends_at) is None
@@ -102,17 +93,9 @@ def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:
 
 def test_few_keyframes_tell_no_lens() -> None:
     # Proves that as many keyframes as the camera has parameters explain any lens, and so tell none. Oracle: the count.
-    packed = []
-    for keyframes in (5, 7):
-        window = vg.simulate_window(keyframes, 12, 0)
-        _, _, cx, cy = window.intrinsics
-        square = vg.cameras.Intrinsics(np.array([window.intrinsics[0], cx, cy]), shared_focal=True)
-        guess = window.observations, window.start, square
-        problem, state, _ = vg.pack(*guess, 1.0 / window.observations.depth_mean)
-        packed.append(find_lens(problem, state, (480, 640), lambda _, state: state))
-    few, enough = packed
-    assert few is not None
-    assert enough is not None
+    unmoved = lambda _, state: state
+    problems = [packed(vg.simulate_window(keyframes, 12, 0)) for keyframes in (5, 7)]
+    few, enough = (find_lens(problem, state, (480, 640), unmoved) for problem, state, _ in problems)
     assert few.needed == float("inf")
     assert enough.needed < float("inf")
 
@@ -120,7 +103,6 @@ def test_few_keyframes_tell_no_lens() -> None:
 def test_a_lens_that_does_not_pay_is_not_taken() -> None:
     # Proves that the state stays where matches do not ask for a lens, or it folds the image. Oracle: the state.
     slam = merge_pending_window(recorded_run().states[-1])
-    assert slam.window.solved is not None
     adjustment, state = slam.window.solved
     left_out = FoundLens(LENS, state, gain=0.0, needed=float("inf"), warp=40.0)
     for found in (None, left_out, replace(left_out, warp=float("inf"))):
@@ -172,9 +154,7 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
     # old place.
     before = run_of_room()
     kept = SeenPoints(np.arange(2, dtype=np.int32), np.array([[20.0, 15.0], [140.0, 90.0]], np.float32))
-    before = replace(
-        before, tracker=replace(before.tracker, frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
-    )
+    before = changed(before, "tracker", frames=(*before.frames[:-1], replace(before.frames[-1], seen=kept)))
     assert can_undistort(before.keyframes)
     after = undistorted(before, LENS)
     assert after.camera.lens is LENS
@@ -197,7 +177,6 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_i), old_pair.points.pixels_i, atol=1e-3)
         np.testing.assert_allclose(redrawn(new_pair.points.pixels_j), old_pair.points.pixels_j, atol=1e-3)
     last = after.frames[-1].seen
-    assert last is not None
     np.testing.assert_allclose(redrawn(last.pixels), kept.pixels, atol=1e-3)
 
 
@@ -208,7 +187,6 @@ def test_corners_of_the_verdict_go_through_the_lens() -> None:
     nothing = np.zeros(3, np.float32)
     noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing) for r in slam.frames]
     given = aligned(slam, Claim.of(slam), noted)
-    assert given is not None
     assert len(given) == len(slam.frames) > 1
     np.testing.assert_allclose(redrawn(given[0].pixels), seen, atol=1e-3)
 
@@ -226,7 +204,7 @@ def test_a_camera_that_was_found_goes_with_its_map() -> None:
     # the run began with; and that a run in the map holds what was found. Oracle: the rule.
     guess = np.array([160.0, 160.0, 79.5, 59.5])
     known = as_map(undistorted(run_of_room(), LENS))
-    known = replace(known, camera=replace(known.camera, given=guess, sigma=np.full(4, 48.0)))
+    known = changed(known, "camera", given=guess, sigma=np.full(4, 48.0))
     within = entered(known, replace(LENS, known=True), SiftMatcher())
     assert within.camera.self_calibrated
     assert within.camera.given.tolist() == list(LENS.intrinsics)

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import cv2
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from changed import changed
+from distorted_sequence import bent
 from recorded_run import SETTINGS, recorded_run
 
 import vggtgeo as vg
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.datasets import Frame
-from vggtgeo.datasets.views import SequenceView
-from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.pixel_aspect import FoundAspect, find_aspect
 from vggtgeo.slam.global_map import global_adjustment
 from vggtgeo.slam.global_map.global_adjustment import adjust_all, shares_focal
@@ -49,19 +43,6 @@ def rolling(seed: int) -> vg.data.SimulatedWindow:
     return replace(window, observations=seen, start=rigid.to_quaternion(turns @ start))
 
 
-def drawn(window: vg.data.SimulatedWindow, squeeze: float, *distortion: float) -> vg.data.SimulatedWindow:
-    """Its key points and matches as a lens draws them, in images of `squeeze` times the width."""
-    lens = vg.cameras.RadialTangential(jnp.asarray([*window.intrinsics, *(distortion or (0.0, 0.0)), 0.0, 0.0]))
-    straight = vg.cameras.Pinhole(jnp.asarray(window.intrinsics))
-    bend = jax.jit(jax.vmap(lambda pixel: lens.project(straight.unproject(pixel))))
-    bent = lambda pixels: np.asarray(bend(jnp.asarray(pixels)))
-    resized = lambda pixels: (bent(pixels) + 0.5) * np.array([squeeze, 1.0]) - 0.5
-    seen = window.observations
-    return replace(
-        window, observations=replace(seen, point_target=resized(seen.point_target), pixel=resized(seen.pixel))
-    )
-
-
 def as_square(window: vg.data.SimulatedWindow, squeeze: float) -> tuple[Problem, State]:
     """Adjusted with one focal length, which begins as that of the images before they were squeezed."""
     f, _, cx, cy = window.intrinsics
@@ -86,7 +67,7 @@ def test_squeezed_images_have_two_focal_lengths() -> None:
     # Proves that both are found, of 16:9 shown as 4:3, and that they are seen to pay. Oracle: those that the window was
     # drawn with, resized.
     window, squeeze = rolling(1), 0.75
-    found = found_in(drawn(window, squeeze), squeeze)
+    found = found_in(bent(window, 0.0, 0.0, squeeze=squeeze), squeeze)
     assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.state.intrinsics}"
     assert found.stretch == pytest.approx(np.log(squeeze), abs=0.005)
     fx, fy, cx, _ = window.intrinsics
@@ -103,7 +84,7 @@ def test_square_pixels_stay_square() -> None:
 
 def test_a_level_path_tells_no_aspect() -> None:
     # Proves that a stretch that any stretch of the heights makes up for is not taken. Oracle: the gain of nothing.
-    squeezed = drawn(vg.simulate_window(seed=1, **WINDOW), 0.75)
+    squeezed = bent(vg.simulate_window(seed=1, **WINDOW), 0.0, 0.0, squeeze=0.75)
     assert not found_in(squeezed, 0.75).pays
 
 
@@ -128,7 +109,6 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     def stretched(problem: Problem, state: State, solve: Any) -> FoundAspect | None:
         tried.append(problem)
         found = find_aspect(problem, state, lambda _, start: start)
-        assert found is not None
         moved = eqx.tree_at(lambda s: s.intrinsics, found.state, found.state.intrinsics.at[1].multiply(1.2))
         return replace(found, state=moved, stretch=float(-np.log(1.2)), gain=1.0, needed=0.0)
 
@@ -142,42 +122,8 @@ def test_the_last_adjustment_goes_on_with_both(monkeypatch: pytest.MonkeyPatch) 
     assert fy / fx == pytest.approx(1.2, rel=0.02)
     assert any("pixels that are not square" in note for note in done.notes)
     assert len(tried) == 1
-    again = replace(
-        guess, camera=replace(guess.camera, intrinsics=done.intrinsics, given=done.intrinsics, self_calibrated=True)
-    )
+    again = changed(guess, "camera", intrinsics=done.intrinsics, given=done.intrinsics, self_calibrated=True)
     assert not shares_focal(again)
     assert adjust_all(again, SETTINGS, uncertainty=False).map.pose_sigma is None
     assert done.map.pose_sigma is not None
     assert len(tried) == 1
-
-
-class Squeezed:
-    """A simulated sequence in images of three quarters of the width, whose camera nobody knows."""
-
-    def __init__(self, source: Any) -> None:
-        self.source, self.name, self.has_depth = source, source.name, False
-        self.size = (3 * source.camera.width // 4, source.camera.height)
-        self.camera = Camera.guess(*self.size)
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def ground_truth(self) -> Any:
-        return self.source.ground_truth()
-
-    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Any:
-        for frame in self.source.frames(start, end, stride):
-            image = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
-            yield Frame(frame.index, frame.timestamp, image, None, frame.name)
-
-
-@pytest.mark.slow  # minutes: first passes, a run, its last adjustment
-def test_a_squeezed_video_without_calibration(tmp_path: Path) -> None:
-    # Proves that images alone, resized out of shape, give both focal lengths to 3 %, a word on it, and the path.
-    # Oracle: the camera that drew them, resized.
-    frames = Squeezed(vg.simulate("office", 60, size=(320, 240), rate=10.0))
-    result = vg.reconstruct(SequenceView(frames, frames.camera, has_depth=False), options=vg.RunOptions(dense="none"))
-    expected = frames.source.camera.resized(*frames.size).intrinsics
-    np.testing.assert_allclose(result.intrinsics[:2], expected[:2], rtol=0.03)
-    assert any("not square" in note for note in result.summary["notes"])
-    assert evaluate_trajectory(result.trajectory, frames.ground_truth()).sim3.statistics.rmse < 0.02

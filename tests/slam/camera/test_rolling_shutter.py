@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from changed import changed
 from recorded_run import recorded_run
 
 import vggtgeo as vg
@@ -18,14 +19,8 @@ from vggtgeo.simulation.degradations import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.given_camera import keyframe_pairs
-from vggtgeo.slam.camera.pixel_shifts import carried
 from vggtgeo.slam.camera.rolling_shutter import (
-    _descend,
-    _Search,
     find_readout,
-    image_shift,
-    pair_to_global_shutter,
-    row_shifts,
     without_readout,
 )
 from vggtgeo.slam.global_map.carried_poses import carried_poses
@@ -112,34 +107,11 @@ def test_a_rolling_shutter_is_found_and_taken_out(seconds: float, columns: bool)
     problem, start, _ = with_readout(motions, seconds, columns).pack()
     state = adjusted(problem, start)
     found = find_readout(problem, state, motions, (HEIGHT, WIDTH), LONGEST, adjusted)
-    assert found is not None
     assert found.pays, (found.gain, found.needed)
     assert found.readout.columns == columns
     assert found.readout.seconds == pytest.approx(seconds, rel=0.05)
     before, after = (np.sqrt(np.mean(WINDOW.errors(one) ** 2)) for one in (state, found.state))
     assert after < 0.5 * before, (before, after)
-
-
-class _Straight(_Search):
-    """A map whose slope is a straight line through zero at 28 ms, matches moving by 1 px in 20 ms."""
-
-    usual = 50.0
-
-    def at(self, seconds: float) -> Problem:
-        return self.problem
-
-    def slopes(self, seconds: float, state: State) -> np.ndarray:
-        return np.array([seconds - 0.028])
-
-
-def test_a_straight_slope_takes_two_adjustments() -> None:
-    """One at the first step, one at its zero, within reach of the first; oracle: the line."""
-    problem, start, _ = WINDOW.pack()
-    solved: list[State] = []
-    search = _Straight(problem, row_shifts(problem, start, some_motions(), (HEIGHT, WIDTH), False), 100.0)
-    seconds, _ = _descend(search, start, -0.028, LONGEST, lambda _, state: solved.append(state) or state)
-    assert seconds == pytest.approx(0.028)
-    assert len(solved) == 2
 
 
 def test_what_is_taken_out_is_what_the_motion_put_in() -> None:
@@ -187,7 +159,7 @@ def test_pairs_that_say_what_the_camera_is_are_read_at_once() -> None:
         replace(k, points=replace(k.points, pixels=rolled_pixels(k.points.pixels, k.points.prior_mean, k.number)))
         for k in slam.keyframes
     )
-    seen = replace(slam, map=replace(slam.map, keyframes=keyframes))
+    seen = changed(slam, "map", keyframes=keyframes)
     disturbed_edges = [moved(edge) for edge in edges]
     wrong = keyframe_pairs(seen.map, seen.camera, disturbed_edges)
     rolling = replace(seen.camera, readout=Readout(seconds, False, 0.0))
@@ -232,14 +204,14 @@ def test_frames_far_apart_say_nothing_of_the_motion() -> None:
     paused = tuple(replace(f, timestamp=f.timestamp + 5.0 * (f.frame > second)) for f in slam.frames)
     whole, short = (
         camera_motions(slam, len(slam.keyframes)),
-        camera_motions(replace(slam, tracker=replace(slam.tracker, frames=paused)), 3),
+        camera_motions(changed(slam, "tracker", frames=paused), 3),
     )
     times, poses = carried_poses(slam)
     there = lie.exp(jnp.asarray(short[1] * (times[second] - times[second - 1]))).as_matrix() @ poses[second - 1]
     assert np.allclose(there, poses[second], atol=1e-6)
     assert not np.allclose(short[1], whole[1], atol=1e-6)
     lost = tuple(replace(f, tracked=f.frame in (0, second)) for f in slam.frames)
-    assert np.all(camera_motions(replace(slam, tracker=replace(slam.tracker, frames=lost)), 3)[1] == 0)
+    assert np.all(camera_motions(changed(slam, "tracker", frames=lost), 3)[1] == 0)
 
 
 @pytest.mark.slow
@@ -280,28 +252,3 @@ def test_a_run_finds_the_shutter_of_its_camera() -> None:
         assert ("rolling_shutter" in result.summary) == search
     assert result.summary["rolling_shutter"]["seconds"] == pytest.approx(0.03, rel=0.1)
     assert errors[1] < 0.5 * errors[0], errors
-
-
-def test_matches_of_two_images_without_the_readout_of_either() -> None:
-    """Oracle: the pixels of a camera that reads at once, and each moved as far as its row's time says; half a metre and
-    half a radian a second shift them by 5 px.
-    """
-    rng, camera, size = np.random.default_rng(0), np.array([500.0, 500.0, 320.0, 240.0]), (480, 640)
-    still, depth, relative = rng.uniform((0, 0), (640, 480), (50, 2)), rng.uniform(2.0, 6.0, 50), np.eye(4)
-    relative[:3, 3] = 0.1, 0.02, -0.05
-    inverse, readout = 1 / depth, Readout(0.03, False, 0.0)
-    there, inverse_there = (part[0] for part in carried(still[None], inverse[None], relative[None], camera))
-    motions = rng.normal(0, 0.5, (2, 6))
-
-    def read(at: np.ndarray, depths: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        seen = at
-        for _ in range(20):  # the row in which it is seen says when
-            shift = image_shift(seen[None], depths[None], motion[None], camera, size, readout.columns)[0]
-            seen = at + readout.seconds * shift
-        return seen
-
-    before, after = read(still, inverse, motions[0]), read(there, inverse_there, motions[1])
-    found = pair_to_global_shutter(before, after, depth, relative, (motions[0], motions[1]), camera, size, readout)
-    for image, true, moved in zip(found, (still, there), (before, after), strict=True):
-        assert np.abs(moved - true).max() > 2.0
-        assert np.abs(image - true).max() < 0.1

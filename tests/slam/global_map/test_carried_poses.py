@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_keyframes import SIZE, keyframe
+from changed import changed
+from posed_keyframes import SIZE, small_keyframe
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
@@ -31,7 +32,7 @@ def _walked(begins: tuple[int, ...]) -> Slam:
     `begins` begin a submap; the others were tracked against the one before.
     """
     tracked, adjusted = _straight(1.0), _straight(1.5)
-    like = keyframe(0, np.ones(SIZE))
+    like = small_keyframe(0, np.ones(SIZE))
     keyframes = tuple(
         replace(like, number=number, frame=frame, timestamp=float(frame), pose=adjusted[frame])
         for number, frame in enumerate(KEYFRAMES)
@@ -81,13 +82,13 @@ def test_a_keyframe_that_was_tracked_wrongly_leaves_the_frames_before_it_where_t
     that frame alone where it did not; without depth they are another unit, or a length that was a guess. Oracle: the
     straight paths.
     """
-    slam = replace(_walked(begins=(0,)), map=replace(_walked(begins=(0,)).map, metric=metric))
+    slam = changed(_walked(begins=(0,)), "map", metric=metric)
     known = np.diag(np.repeat([sigma, 0.1], 3) ** -2.0)
     arrivals = [record for record in slam.frames if record.arrival is not None]
     ties = tuple(
         MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known, by_rays) for r in arrivals if r.arrival
     )
-    _, poses = carried_poses(replace(slam, map=replace(slam.map, factors=ties)))
+    _, poses = carried_poses(changed(slam, "map", factors=ties))
     for first in (0, 4):
         step = _straight(length) @ rigid.invert(_straight(length)[0])
         assert np.allclose(poses[first : first + 4] @ rigid.invert(poses[first]), step[:4], atol=1e-12)

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_keyframes import INTRINSICS, SIZE, keyframe
+from changed import changed
+from posed_keyframes import INTRINSICS, SIZE, small_keyframe
 from vggtgeo.models.roles import GeometryResult, PoseGuess
 
 from vggtgeo.geometry import pinhole, rigid
@@ -37,7 +38,9 @@ def walked(rng: np.random.Generator, points: int = POINTS) -> tuple[Slam, np.nda
     """
     pixels = rng.uniform(8, [SIZE[1] - 8, SIZE[0] - 8], (points, 2))
     inverse, none = 1 / rng.uniform(2.0, 4.0, points), np.zeros(points)
-    first = keyframe(0, np.ones(SIZE), Slots(pixels, inverse, inverse, none + 0.01, none + 1, none + 1, none + np.nan))
+    first = small_keyframe(
+        0, np.ones(SIZE), Slots(pixels, inverse, inverse, none + 0.01, none + 1, none + 1, none + np.nan)
+    )
     first = replace(first, pose=exponential(np.array([0.3, 0.1, -0.2, 0.1, 0.2, 0.3])))
     motion = exponential(MOVED)
     pose = motion @ first.pose
@@ -56,9 +59,7 @@ def walked(rng: np.random.Generator, points: int = POINTS) -> tuple[Slam, np.nda
 
 def with_second(slam: Slam, **values: object) -> Slam:
     """The state with another second frame."""
-    return replace(
-        slam, tracker=replace(slam.tracker, frames=(slam.frames[0], replace(slam.frames[1], **values), slam.frames[2]))
-    )
+    return changed(slam, "tracker", frames=(slam.frames[0], replace(slam.frames[1], **values), slam.frames[2]))
 
 
 def off(slam: Slam, pose: np.ndarray) -> float:
@@ -73,7 +74,6 @@ def test_a_frame_goes_to_where_the_finished_map_explains_what_it_shows() -> None
     rng = np.random.default_rng(0)
     slam, pose = walked(rng)
     seen = slam.frames[1].seen
-    assert seen is not None
     noise = rng.normal(0, 0.05, (POINTS, 2))
     noise[::6] += rng.uniform(3, 5, (POINTS // 6, 2))
     slam = with_second(slam, seen=replace(seen, pixels=seen.pixels + noise.astype(np.float32)))
@@ -91,7 +91,7 @@ def test_without_depth_what_tracking_knew_counts_less() -> None:
     """
     slam, pose = walked(np.random.default_rng(0))
     slam = with_second(slam, evidence=Evidence(sigma_translation=0.02, sigma_rotation=0.01))
-    left, measured = off(slam, pose), off(replace(slam, map=replace(slam.map, metric=True)), pose)
+    left, measured = off(slam, pose), off(changed(slam, "map", metric=True), pose)
     assert 4 * left < measured
 
 
@@ -104,7 +104,7 @@ def test_what_the_adjustment_did_to_points_and_keyframe_counts() -> None:
     points = replace(first.points, inverse_depth=2 * first.points.inverse_depth)
     half = pose @ rigid.invert(first.pose)
     half[:3, 3] /= 2
-    slam = replace(slam, map=replace(slam.map, keyframes=(replace(first, pose=first.pose @ world, points=points),)))
+    slam = changed(slam, "map", keyframes=(replace(first, pose=first.pose @ world, points=points),))
     assert off(slam, half @ first.pose @ world) < 1e-3
 
 
@@ -114,15 +114,14 @@ def test_without_enough_points_a_pose_stays() -> None:
     """
     slam = with_second(walked(np.random.default_rng(2), MIN_POINTS)[0], evidence=Evidence())
     few = slam.frames[1].seen
-    assert few is not None
     first = slam.keyframes[0]
     gone = replace(first, points=replace(first.points, inverse_depth=np.full(MIN_POINTS, np.nan)))
     for wrong in (
         with_second(slam, seen=SeenPoints(few.slots[1:], few.pixels[1:])),
-        replace(slam, map=replace(slam.map, keyframes=(gone,))),
+        changed(slam, "map", keyframes=(gone,)),
         with_second(slam, relative=exponential(np.array([0, 0, -9.0, 0, 0, 0]))),
         with_second(slam, tracked=False),
-        replace(slam, map=replace(slam.map, pose_sigma=None)),
+        changed(slam, "map", pose_sigma=None),
     ):
         np.testing.assert_array_equal(frame_poses(wrong)[1], carried_poses(wrong)[1])
     assert not np.array_equal(frame_poses(slam)[1], carried_poses(slam)[1])
@@ -145,7 +144,6 @@ def test_a_rolling_shutter_is_taken_out_of_what_a_frame_shows(columns: bool) -> 
     slam = with_second(slam, relative=pose @ rigid.invert(slam.keyframes[0].pose))  # its motion is known from that
     readout = Readout(0.09, columns, 1.0)
     first, seen = slam.keyframes[0], slam.frames[1].seen
-    assert seen is not None
     inverse = first.points.inverse_depth
     world = rigid.unproject(first.points.pixels, inverse, first.pose, INTRINSICS)
     there = 1 / (world @ pose[2, :3] + pose[2, 3])
@@ -157,9 +155,9 @@ def test_a_rolling_shutter_is_taken_out_of_what_a_frame_shows(columns: bool) -> 
 
     points = replace(first.points, pixels=read(first.points.pixels, inverse, 0))
     seen = replace(seen, pixels=read(seen.pixels, there, 1).astype(np.float32))
-    rolling = with_second(replace(slam, map=replace(slam.map, keyframes=(replace(first, points=points),))), seen=seen)
+    rolling = with_second(changed(slam, "map", keyframes=(replace(first, points=points),)), seen=seen)
     assert off(rolling, pose) > 0.001
-    assert off(replace(rolling, camera=replace(rolling.camera, readout=readout)), pose) < 0.2 * off(rolling, pose)
+    assert off(changed(rolling, "camera", readout=readout), pose) < 0.2 * off(rolling, pose)
 
 
 def test_a_frame_keeps_some_of_its_matches() -> None:
@@ -168,12 +166,10 @@ def test_a_frame_keeps_some_of_its_matches() -> None:
     slots, pixels = np.arange(500) + 7, np.random.default_rng(6).uniform(0, 100, (500, 2))
     guess = PoseGuess(np.eye(4), inliers, 0.3, GeometryResult.SUCCESS)
     seen = Located(guess, 500, np.zeros((500, 3)), 2.0, slots, pixels).seen
-    assert seen is not None
     assert len(seen.slots) == len(set(seen.slots.tolist())) == MAX_KEPT
     assert inliers[seen.slots - 7].all()
     np.testing.assert_allclose(seen.pixels, pixels[seen.slots - 7], atol=1e-4)
     few = Located(replace(guess, inliers=np.zeros(500, bool)), 500, np.zeros((500, 3)), 2.0, slots, pixels).seen
-    assert few is not None
     assert len(few.slots) == 0
     assert Located(guess, 500, np.zeros((500, 3)), 2.0).seen is None
 
@@ -185,7 +181,6 @@ def test_what_points_leave_open_is_smoothed_without_depth(monkeypatch: pytest.Mo
     rng, asked = np.random.default_rng(4), []
     slam, _ = walked(rng)
     seen = slam.frames[1].seen
-    assert seen is not None
     noisy = seen.pixels + rng.normal(0, 0.3, seen.pixels.shape).astype(np.float32)
     slam = with_second(slam, seen=replace(seen, pixels=noisy))
     monkeypatch.setattr(module, "smoothed", lambda *given: asked.append(given) or given[1])
@@ -199,5 +194,5 @@ def test_what_points_leave_open_is_smoothed_without_depth(monkeypatch: pytest.Mo
     expected = rows @ rows.T / (SHARED_ERRORS * 0.3**2)
     # Robust weights of a Gaussian take a share of it.
     assert 0.5 < np.trace(information[1]) / np.trace(expected) < 1.1
-    frame_poses(replace(slam, map=replace(slam.map, metric=True)))
+    frame_poses(changed(slam, "map", metric=True))
     assert len(asked) == 1

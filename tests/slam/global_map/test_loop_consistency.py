@@ -54,6 +54,17 @@ def _odometry(rng: np.random.Generator, true: np.ndarray, bias: float) -> list[M
     ]
 
 
+def _loops(
+    rng: np.random.Generator, true: np.ndarray, rows: range, later: int, aside: float = 0.0
+) -> list[MeasuredRelativePose]:
+    """Loops from keyframes to those so much later, all off by so many metres to the side."""
+    shift = np.eye(4)
+    shift[0, 3] = aside
+    return [
+        _measured(rng, row, row + later, shift @ true[row + later] @ rigid.invert(true[row]), KNOWN) for row in rows
+    ]
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("bias", [0.0, 1.5])
 def test_true_loops_stay_and_false_ones_that_agree_go(seed: int, bias: float) -> None:
@@ -62,9 +73,7 @@ def test_true_loops_stay_and_false_ones_that_agree_go(seed: int, bias: float) ->
     """
     rng, true = np.random.default_rng(seed), _there_and_back()
     section = round(SECTION / STEP)
-    loops = [
-        _measured(rng, row, row + 2 * SIDE, true[row + 2 * SIDE] @ rigid.invert(true[row]), KNOWN) for row in range(6)
-    ]
+    loops = _loops(rng, true, range(6), 2 * SIDE)
     # A keyframe one section further looks as if it stood a section back.
     for row in range(section, SIDE):
         for start in (0, SIDE):
@@ -80,11 +89,7 @@ def test_a_less_plausible_cluster_that_contradicts_a_taken_one_goes() -> None:
     """
     rng, true = np.random.default_rng(0), _there_and_back()
     motions = _odometry(rng, true, 0.0)
-    aside = np.eye(4)
-    aside[0, 3] = 0.5
-    motion = lambda first, second: true[second] @ rigid.invert(true[first])
-    right = [_measured(rng, row, row + 2 * SIDE, motion(row, row + 2 * SIDE), KNOWN) for row in range(3)]
-    wrong = [_measured(rng, row, row + 2 * SIDE, aside @ motion(row, row + 2 * SIDE), KNOWN) for row in range(10)]
+    right, wrong = _loops(rng, true, range(3), 2 * SIDE), _loops(rng, true, range(10), 2 * SIDE, 0.5)
     assert np.all(Odometry.of(motions, len(true)).distances(wrong) < LOOP_GATE), "odometry alone should allow them"
     kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
     assert np.array_equal(np.flatnonzero(kept), [10, 11, 12]), np.flatnonzero(kept)
@@ -96,11 +101,7 @@ def test_a_true_loop_tells_how_far_odometry_can_be_off_elsewhere() -> None:
     """
     rng, true = np.random.default_rng(0), _there_and_back()
     motions = _odometry(rng, true, 0.0)
-    aside = np.eye(4)
-    aside[0, 3] = 0.5
-    motion = lambda first, second: true[second] @ rigid.invert(true[first])
-    right = [_measured(rng, row, row + 2 * SIDE, motion(row, row + 2 * SIDE), KNOWN) for row in range(6)]
-    wrong = [_measured(rng, row, row + SIDE, aside @ motion(row, row + SIDE), KNOWN) for row in range(20, 26)]
+    right, wrong = _loops(rng, true, range(6), 2 * SIDE), _loops(rng, true, range(20, 26), SIDE, 0.5)
     assert consistent_loops(wrong, motions, LOOP_GATE).all(), "odometry alone should allow them"
     kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(6, 12)), np.flatnonzero(kept)
@@ -125,11 +126,7 @@ def test_submaps_are_joined_by_the_larger_cluster() -> None:
     """
     rng, true = np.random.default_rng(0), _there_and_back()
     motions = [motion for motion in _odometry(rng, true, 0.0) if motion.second != 2 * SIDE]
-    aside = np.eye(4)
-    aside[0, 3] = SECTION
-    motion = lambda first, second: true[second] @ rigid.invert(true[first])
-    wrong = [_measured(rng, row, row + 2 * SIDE, aside @ motion(row, row + 2 * SIDE), KNOWN) for row in range(3)]
-    right = [_measured(rng, row, row + 2 * SIDE, motion(row, row + 2 * SIDE), KNOWN) for row in range(6)]
+    wrong, right = _loops(rng, true, range(3), 2 * SIDE, SECTION), _loops(rng, true, range(6), 2 * SIDE)
     kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(3, 9)), np.flatnonzero(kept)
     assert not consistent_loops(right[:1], motions, LOOP_GATE).any()

@@ -6,30 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vggtgeo.models.classical import NoDepth, SiftMatcher
+from changed import changed
+from recorded_run import ROLES, SETTINGS, room, run_over
+from vggtgeo.models.classical import NoDepth
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.simulation import simulate
-from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
-from vggtgeo.slam.pending_window import merge_pending_window
-from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory, run_frames
-from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import place_waiting
 from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, UnplacedFrame
 
 SIZE = (320, 240)
-# The window of test_pipeline.py, so that the solver is compiled once.
-SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48),
-    refinement=GlobalMapSettings(global_adjustment=False),
-)
-ROLES = Roles(points=SiftMatcher(count=500))
 FREE_ROLES = replace(ROLES, depth=NoDepth())
 KNOWN = 12
 """Frames of the walk that are tracked; the others are lost."""
@@ -37,17 +28,14 @@ KNOWN = 12
 
 @pytest.fixture(scope="module")
 def walk() -> tuple[list[Frame], Camera, Trajectory]:
-    sequence = simulate("room", 24, 0, SIZE, rate=10.0)
-    truth = sequence.ground_truth()
-    assert truth is not None
-    return list(sequence.frames()), sequence.camera, truth
+    return room()
 
 
 @pytest.fixture(scope="module")
 def lost(walk: tuple[list[Frame], Camera, Trajectory]) -> Slam:
     """A map of the first frames whose scale is free, and all later frames without a pose."""
     frames, camera, _ = walk
-    slam = merge_pending_window(list(run_frames(iter(frames[:KNOWN]), camera, ROLES, SETTINGS, Clock()))[-1])
+    slam = run_over(frames[:KNOWN], camera)
     last = slam.frames[-1]
     later = [replace(last, frame=frame.index, timestamp=frame.timestamp, tracked=False) for frame in frames[KNOWN:]]
     unplaced = tuple(_waiting(frame) for frame in frames[KNOWN:])
@@ -77,7 +65,7 @@ def test_keyframes_are_listed_by_time(lost: Slam) -> None:
     """A keyframe that was made at the end of a frame in between is listed where it was seen. Oracle: the times."""
     first, second, *others = lost.keyframes
     swapped = (replace(first, timestamp=second.timestamp), replace(second, timestamp=first.timestamp), *others)
-    listed = keyframe_trajectory(replace(lost, map=replace(lost.map, keyframes=swapped)))
+    listed = keyframe_trajectory(changed(lost, "map", keyframes=swapped))
     assert listed.timestamps.tolist() == sorted(keyframe.timestamp for keyframe in swapped)
 
 
@@ -89,9 +77,7 @@ def test_frames_of_another_place_stay_lost(lost: Slam, walk: tuple[list[Frame], 
     elsewhere = tuple(
         replace(_waiting(frame), frame=KNOWN + row, timestamp=(KNOWN + row) / 10) for row, frame in enumerate(mirrored)
     )
-    found = place_lost_without_depth(
-        replace(lost, tracker=replace(lost.tracker, unplaced=elsewhere)), FREE_ROLES, SETTINGS
-    )
+    found = place_lost_without_depth(changed(lost, "tracker", unplaced=elsewhere), FREE_ROLES, SETTINGS)
     assert found.map is lost.map
     assert not any(record.tracked for record in found.frames[KNOWN:])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import compress
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,21 +121,15 @@ def test_units_that_drift_are_brought_back(seed: int) -> None:
     assert abs(np.log(true[60] / true[0])) > 0.3
 
 
-def test_a_guessed_length_takes_the_jump_of_the_scale() -> None:
-    """Where one of 59 motions had to guess its length, three times too long, and three loops tell, the units change
-    there and nowhere else, to 5 %. Oracle: the jump that was made.
+@pytest.mark.parametrize(
+    "uncertain", [{"by_rays": True}, {"information": np.diag([1.0 / 0.15**2] * 3 + [1e6] * 3)}], ids=["guess", "noise"]
+)
+def test_an_uncertain_length_takes_the_jump_of_the_scale(uncertain: dict[str, Any]) -> None:
+    """Where one of 59 motions had to guess its length, or measured it to half of itself only, three times too long, and
+    three loops tell, the units change there and nowhere else, to 5 %. Oracle: the jump that was made.
     """
-    motions = [replace(_tracked(number), by_rays=number == 30) for number in range(1, 60)]
-    loops = [ScaleRatio(first, first + 40, 1.0 / 3.0) for first in (5, 8, 11)]
-    found = solve_scales(60, motions, loops)
-    np.testing.assert_allclose(found, np.where(np.arange(60) < 30, 1.0, 1.0 / 3.0), rtol=0.05)
-
-
-def test_a_length_within_its_noise_takes_the_jump_of_the_scale() -> None:
-    """The same for a motion whose length was measured, but to half of itself only: a turn with few known depths."""
-    poor = np.diag([1.0 / 0.15**2] * 3 + [1e6] * 3)
     motions = [_tracked(number) for number in range(1, 60)]
-    motions[29] = replace(motions[29], information=poor)
+    motions[29] = replace(motions[29], **uncertain)
     loops = [ScaleRatio(first, first + 40, 1.0 / 3.0) for first in (5, 8, 11)]
     found = solve_scales(60, motions, loops)
     np.testing.assert_allclose(found, np.where(np.arange(60) < 30, 1.0, 1.0 / 3.0), rtol=0.05)

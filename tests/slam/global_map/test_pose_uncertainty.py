@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,15 +9,14 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 import pytest
+from changed import changed
 from degenerate_scenes import packed, without_matches_of
 from recorded_run import recorded_run
 from reported import pattern
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 
 import vggtgeo as vg
-from vggtgeo.cli.progress import print_result
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.loop import simulate_loop
 from vggtgeo.slam.global_map import global_adjustment, pose_uncertainty
@@ -36,7 +34,6 @@ def test_keyframes_have_the_deviations_of_their_covariances() -> None:
     state = vg.solve(problem, initial).state
     known = vg.covariances(problem, state)
     sigma = keyframe_sigma(problem, state, 3)
-    assert sigma is not None
     factor = max(float(known.variance_factor), 1.0)
     for column, part in enumerate((slice(0, 3), slice(3, 6))):
         worst = np.linalg.eigvalsh(np.asarray(known.poses)[:3, part, part])[:, -1]
@@ -51,8 +48,6 @@ def test_an_undetermined_keyframe_leaves_the_others_known() -> None:
     found = keyframe_sigma(problem, state, 3)
     held = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[2].set(True))
     expected = keyframe_sigma(held, state, 3)
-    assert found is not None
-    assert expected is not None
     assert np.isnan(found[2]).all()
     np.testing.assert_allclose(found[:2], expected[:2], rtol=1e-9, atol=1e-15)
     alone = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[1].set(True))
@@ -87,16 +82,13 @@ def test_a_large_graph_without_a_band_is_asked_in_places(monkeypatch: pytest.Mon
     monkeypatch.setattr(pose_uncertainty, "choose_reduced_solver", lambda problem: ConjugateGradients())
     monkeypatch.setattr(pose_uncertainty, "SPREAD", 15)
     found = keyframe_sigma(problem, state, 30)
-    assert exact is not None
-    assert found is not None
     np.testing.assert_allclose(found, exact, rtol=0.25, atol=1e-12)
 
 
 @pytest.mark.long
 def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """95 % of the poses are within three standard deviations of the truth, relative to the first, and the deviations
-    are not so large that this says nothing. Oracle: the renderer's poses; the folder and what is printed have the same
-    numbers.
+    are not so large that this says nothing. Oracle: the renderer's poses; the folder has the same numbers.
     """
     monkeypatch.setattr(pose_uncertainty, "DEPTH_SCALE", 0.0)  # the renderer's depth has no factor of its own,
     monkeypatch.setattr(pose_uncertainty, "FOCAL_SIGMA", 0.0)  # its camera is the one that is given,
@@ -105,9 +97,6 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     small = SlamSettings(window=WindowSettings(size=4, point_slots=96, line_slots=48))
     result = vg.reconstruct(vg.simulate("room", 24, size=(320, 240), rate=6.0), settings=small)
     stated = result.uncertainty
-    assert stated is not None
-    assert result.record is not None
-    assert result.record.truth is not None
     against_first = lambda poses: rigid.invert(poses[0])[None] @ poses
     found, true = against_first(result.trajectory.poses), against_first(result.record.truth.poses)
     off = np.array([tangent(rigid.invert(one) @ other) for one, other in zip(found, true, strict=True)])
@@ -118,7 +107,6 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     # What an image's moment leaves open grows with the speed of turning.
     monkeypatch.setattr(pose_uncertainty, "MOMENT", 0.01)
     moving = result.uncertainty
-    assert moving is not None
     poses, times = result.record.truth.poses, stated.timestamps
     rate = Rotation.from_matrix((rigid.invert(poses[:-2]) @ poses[2:])[:, :3, :3]).magnitude() / (
         times[2:] - times[:-2]
@@ -130,34 +118,26 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
     # What a focal length leaves open grows with the angle to the first pose.
     monkeypatch.setattr(pose_uncertainty, "FOCAL_SIGMA", 0.01)
     calibrated = result.uncertainty
-    assert calibrated is not None
     angles = Rotation.from_matrix(true[:, :3, :3]).magnitude()
     np.testing.assert_allclose(np.sqrt(calibrated.rotation**2 - stated.rotation**2), 0.01 * angles, atol=1e-4)
     monkeypatch.setattr(pose_uncertainty, "FOCAL_SIGMA", 0.0)
     # A principal point that nobody has measured turns all cameras alike, and with the first one the whole path.
     monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.01)
     nominal, focal = result.uncertainty, result.record.slam.intrinsics[0]
-    assert nominal is not None
     turn, distance = 0.01 * 320 / focal, np.linalg.norm(found[:, :3, 3], axis=1)
     np.testing.assert_allclose(np.sqrt(nominal.translation**2 - stated.translation**2), turn * distance, atol=1e-4)
     np.testing.assert_allclose(
         np.sqrt(nominal.rotation**2 - stated.rotation**2), turn * 2 * np.sin(angles / 2), atol=1e-4
     )
     given = result.record.slam.camera.given + [0.0, 0.0, 3.0, 0.0]
-    moved = replace(result.record.slam, camera=replace(result.record.slam.camera, given=given))
+    moved = changed(result.record.slam, "camera", given=given)
     measured = pose_uncertainty.frame_uncertainty(moved)
-    assert measured is not None
     np.testing.assert_allclose(measured.translation, stated.translation)
     monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.0)
-    summary = result.save(tmp_path / "run")
+    result.save(tmp_path / "run")
     again = vg.Result.load(tmp_path / "run").uncertainty
-    assert again is not None
     for read, written in zip(again, stated, strict=True):
         np.testing.assert_allclose(read, written, atol=1e-6)
-    page = io.StringIO()
-    print_result(Console(file=page), result, summary, tmp_path / "run")
-    assert f"{100 * np.median(stated.translation):.1f} cm" in page.getvalue()
-    assert f"{np.rad2deg(np.median(stated.rotation)):.2f} deg" in page.getvalue()
 
 
 def test_keyframes_without_an_uncertainty_are_named() -> None:
@@ -165,17 +145,11 @@ def test_keyframes_without_an_uncertainty_are_named() -> None:
     at all, and nothing if it is whole. Oracle: rows made NaN by hand.
     """
     slam = recorded_run().slam
-    slam = replace(slam, map=replace(slam.map, keyframes=tuple(replace(slam.keyframes[0], frame=n) for n in range(8))))
+    slam = changed(slam, "map", keyframes=tuple(replace(slam.keyframes[0], frame=n) for n in range(8)))
     sigma = np.full((8, 2), 0.01)
-    noted = lambda values: global_adjustment._uncertainty_notes(replace(slam, map=replace(slam.map, pose_sigma=values)))
+    noted = lambda values: global_adjustment._uncertainty_notes(changed(slam, "map", pose_sigma=values))
     assert noted(sigma) == []
     assert len(noted(None)) == 1
     sigma[[2, 3, 4, 6]] = np.nan
     (note,) = noted(sigma)
     assert all(re.search(pattern(part), note) for part in (4, 8, "2 to 4", "6 to 6"))
-    # A keyframe placed at the end has the last number, and an earlier frame.
-    frames = (0, 1, 2, 4, 5, 6, 7, 3)
-    keyframes = tuple(replace(slam.keyframes[0], frame=frame) for frame in frames)
-    slam = replace(slam, map=replace(slam.map, keyframes=keyframes))
-    (note,) = noted(np.where(np.isin(frames, [2, 3, 4])[:, None], np.nan, 0.01))
-    assert re.search(pattern("2 to 4"), note)

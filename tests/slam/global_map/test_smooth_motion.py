@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_keyframes import INTRINSICS
+from posed_keyframes import INTRINSICS
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.global_map.smooth_motion import smoothed

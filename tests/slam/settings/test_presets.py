@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +13,8 @@ import tiny_networks as tiny
 from tiny_sequences import seven_scenes
 from typer.testing import CliRunner
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
-from vggtgeo.models.onnx.registry import NETWORKS, files_of, players
+from vggtgeo.models.onnx.registry import files_of, players
 from vggtgeo.models.onnx.session import Session
-from vggtgeo.models.roles import PoseQuery
 from vggtgeo.models.window_locator import WindowLocator
 
 from vggtgeo.cli.main import make_app
@@ -30,7 +28,6 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 
 RUN_AND_WRITE = "vggtgeo.cli.run_sequence"
 """The module from which the command takes `run_and_write`."""
-EXPORTS = "VGGTGEO_EXPORTS"
 SIZE = (192, 256)
 
 
@@ -188,64 +185,10 @@ def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
     assert "this result means nothing" in (tmp_path / "run" / "report.html").read_text()
 
 
-def _exports() -> Path:
-    folder = os.environ.get(EXPORTS)
-    if folder is None:
-        pytest.skip(f"needs the exported files of the paper preset in a folder that {EXPORTS} names")
-    return Path(folder)
-
-
-@pytest.mark.slow
-def test_every_adapter_takes_real_exports(counted: dict[str, int]) -> None:
-    # Proves that the outputs of the published architectures, random weights or not, go through every adapter of the
-    # paper's preset: each role answers for two frames, in its own checked type. Oracle: a count of the networks.
-    found = perception("paper", Roles(), _exports())
-    first, second = (frame.image for frame in simulate("room", 2, 0, (640, 480), rate=5.0).frames())
-    roles, camera = found.roles, np.array([532.5, 532.5, 319.5, 239.5])
-    matches = roles.points.match(roles.points.describe(first), roles.points.describe(second))
-    lines = [roles.line_matches.describe(image, roles.lines.detect(image)) for image in (first, second)]
-    roles.line_matches.match(*lines)
-    depth = roles.depth.estimate(first, None, tuple(camera))
-    omega = roles.confidence.confidence(first)
-    nothing = np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0)
-    window = {"window_images": (first,), "window_poses": (np.eye(4),), "window_depths": (np.full((480, 640), 2.0),)}
-    guess = roles.geometry.locate(PoseQuery(second, camera, *nothing, **window))
-    assert set(counted) == set(NEEDED["paper"])
-    assert depth.depth.shape == omega.shape == (480, 640)
-    assert np.isfinite(matches.pixels_j).all()
-    assert np.isfinite(guess.pose).all()
-
-
-@pytest.mark.slow
-def test_real_exports_keep_their_contracts_and_run(tmp_path: Path) -> None:
-    # Proves that the files of `vggtgeo models export`, random weights or not, open, agree with PyTorch where that is
-    # recorded, give finite outputs on a rendered room, and carry a whole run. Oracle: the records of the exports.
-    folder = _exports()
-    for name in NEEDED["paper"]:
-        file = folder / NETWORKS[name].file
-        result = CliRunner().invoke(make_app(), ["models", "verify", str(file), "--runs", "1", "--json"])
-        assert result.exit_code == 0, result.output
-        assert json.loads(result.output)["network"] == NETWORKS[name].contract_name
-    summary = _whole_run(tmp_path, folder, (640, 480))
-    assert summary["frames"] == 10
-    assert all(network["calls"] > 0 for network in summary["networks"].values()), summary["networks"]
-
-
-def test_roles_are_mixed_by_name(files: Path) -> None:
-    # Proves that a role is played by whom its name says, on top of a preset too, that no other network is opened, and
-    # the error of a name that is not there. Oracle: the classes, and the networks opened.
-    classical = Roles()
-    found = perception("classical", classical, files, mixed={"lines": "mlsd", "depth": "moge2-small"})
-    assert set(found.networks) == {"mlsd", "moge2-small"}
-    assert type(found.roles.lines.source).__name__ == "MlsdDetector"
-    assert type(found.roles.depth.source).__name__ == "MogeDepth"
-    assert found.roles.points is classical.points
-    less = perception("light", classical, files, mixed={"depth": "classical", "lines": "letr"})
-    assert set(less.networks) == {"dinov3-small", "letr"}
-    assert less.roles.depth is classical.depth
-    assert less.roles.line_matches.source.features is less.roles.confidence.source
+def test_a_role_takes_networks_of_its_kind_alone(files: Path) -> None:
+    # Proves the error of a name that cannot play a role. Oracle: the names of those who can.
     with pytest.raises(InputError, match="`lines` is 'moge2'; what can be mixed is points: classical, orb, mast3r,"):
-        perception("classical", classical, files, mixed={"lines": "moge2"})
+        perception("classical", Roles(), files, mixed={"lines": "moge2"})
 
 
 def test_every_mixture_of_roles_is_reached_from_the_command_line(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from posed_keyframes import keyframe_of, slots_of
 from scipy.stats import chi2
 from vggtgeo.models.classical import sample_segments
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, RelativeView, Segments
@@ -15,7 +16,6 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.covisibility import Directed, match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 from vggtgeo.slam.tracking.evidence import MAX_SIGMA, tangent, worst_sigma
 from vggtgeo.slam.tracking.line_alignment import END_SIGMA, align_lines
 from vggtgeo.slam.window.line_triangulation import with_segment_depths
@@ -70,12 +70,9 @@ def _keyframe(points: np.ndarray, rng: np.random.Generator, sigma: float) -> Key
     on_line = inverse[segment, 0] + fraction * (inverse[segment, 1] - inverse[segment, 0])
     ones = np.ones_like(on_line)
     samples = Slots(pixels, on_line, on_line, sigma * on_line, ones, ones, np.nan * ones)
-    none, image = np.zeros(0), np.zeros((*SIZE[::-1], 3), np.uint8)
-    points_slots = Slots(np.zeros((0, 2)), none, none, none, none, none, none)
-    blank = np.zeros(image.shape[:2], np.float16)
-    images = KeyframeImages(image, blank, blank, blank.astype(np.uint8))
-    features = Features(np.zeros((0, 2)), none)
-    return Keyframe(0, 0, 0.0, np.eye(4), images, features, lines, 1.0 / inverse, points_slots, samples, segment)
+    image = np.zeros((*SIZE[::-1], 3), np.uint8)
+    blank = keyframe_of(0, image, np.eye(4), slots_of(np.zeros((0, 2)), np.zeros(0)), np.zeros(image.shape[:2]))
+    return replace(blank, lines=lines, line_depths=1.0 / inverse, samples=samples, sample_segment=segment)
 
 
 def test_lines_bring_a_wrong_start_to_the_true_motion() -> None:
@@ -90,7 +87,6 @@ def test_lines_bring_a_wrong_start_to_the_true_motion() -> None:
         found = align_lines(
             _keyframe(points, rng, 0.02), _seen(points, MOTION, rng), _Same(8), start, NOTHING, INTRINSICS
         )
-        assert found is not None
         assert found.agreed >= 28
         off = tangent(found.motion @ rigid.invert(MOTION))
         distances.append(off @ found.information @ off)
@@ -120,7 +116,6 @@ def test_what_parallel_lines_do_not_say_is_missing() -> None:
         points = _segments(40, rng, along)
         keyframe, seen = _keyframe(points, rng, 0.02), _seen(points, MOTION, rng)
         found = align_lines(keyframe, seen, _Same(), wrong, 1e-2 * np.eye(6), INTRINSICS)
-        assert found is not None
         sigma = worst_sigma(found.information)[0]
         assert sigma > MAX_SIGMA, f"{sigma:.2f} m claimed along the lines"
         off = tangent(found.motion @ rigid.invert(MOTION))[:3]

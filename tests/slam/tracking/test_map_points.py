@@ -45,7 +45,6 @@ def view() -> View:
     """Keyframes at frames 0, 3, 6 of a room; frame 8 with its features; the true pose; intrinsics."""
     sequence = simulate("room", 30, 0, SIZE, rate=10.0)
     truth = sequence.ground_truth()
-    assert truth is not None
     intrinsics = np.array(sequence.camera.intrinsics)
     poses = rigid.invert(truth.poses)
     made = []
@@ -72,8 +71,6 @@ def test_points_of_several_keyframes_bring_a_pose_right(view: View) -> None:
     """
     keyframes, _, true, _ = view
     found, alone = (_refined(view, some, OFF @ true) for some in (keyframes, keyframes[:1]))
-    assert found is not None
-    assert alone is not None
     assert (found.keyframes, alone.keyframes) == (3, 1)
     off = tangent(found.pose @ rigid.invert(true))
     assert np.linalg.norm(off[:3]) < 0.006, f"{1000 * np.linalg.norm(off[:3]):.1f} mm"
@@ -93,8 +90,6 @@ def test_a_keyframe_that_drifted_is_left_out(view: View) -> None:
     sure = np.diag(1.0 / np.array([0.002, 0.002, 0.002, 0.001, 0.001, 0.001]) ** 2)
     found = _refined(view, (keyframes[0], drifted, keyframes[2]), true, sure)
     without = _refined(view, (keyframes[0], keyframes[2]), true, sure)
-    assert found is not None
-    assert without is not None
     assert found.keyframes == 2
     np.testing.assert_allclose(found.pose, without.pose, atol=1e-9)
 

@@ -6,9 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from changed import changed
+from recorded_run import ROLES, SETTINGS, black, room, run_over
 from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
 from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery, Segments
 
@@ -19,17 +20,13 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
-from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.join_at_end import join_at_end
 from vggtgeo.slam.global_map.join_submaps import join_submaps, scale_submap
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.description import Description
-from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, _align, _median, compile_alignment
+from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, _align, compile_alignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import step
-from vggtgeo.slam.run import frame_trajectory, run_frames
-from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
-from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.state import Slam
@@ -38,30 +35,13 @@ from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, track
 
 SIZE = (320, 240)
-# The window of test_pipeline.py, so that the solver is compiled once.
-SETTINGS = SlamSettings(
-    window=WindowSettings(size=4, point_slots=96, line_slots=48),
-    refinement=GlobalMapSettings(global_adjustment=False),
-)
-ROLES = Roles(points=SiftMatcher(count=500))
 FREE_ROLES = replace(ROLES, depth=NoDepth())
 Room = tuple[list[Frame], Camera, Trajectory]
 
 
-@pytest.fixture(scope="module")
-def room() -> Room:
-    sequence = simulate("room", 24, 0, SIZE, rate=10.0)
-    truth = sequence.ground_truth()
-    assert truth is not None
-    return list(sequence.frames()), sequence.camera, truth
-
-
-def _run(frames: list[Frame], camera: Camera, roles: Roles = ROLES) -> Slam:
-    return merge_pending_window(list(run_frames(iter(frames), camera, roles, SETTINGS, Clock()))[-1])
-
-
-def _black(frame: Frame) -> Frame:
-    return replace(frame, image=np.zeros_like(frame.image), depth=np.full(frame.image.shape[:2], np.nan, np.float32))
+@pytest.fixture(scope="module", name="room")
+def _room() -> Room:
+    return room()
 
 
 def _unlit(frame: Frame) -> Frame:
@@ -100,7 +80,6 @@ def test_alignment_brings_a_wrong_start_to_the_true_motion(room: Room) -> None:
     wrong[:3, :3] = cv2.Rodrigues(np.array([0.02, -0.015, 0.01]))[0] @ motion[:3, :3]
     wrong[:3, 3] += [0.03, -0.02, 0.02]
     found = RgbdAlignment().align(*views, wrong)
-    assert found is not None
     off = np.linalg.norm(found.motion[:3, 3] - motion[:3, 3])
     assert off < 0.005, f"{1000 * off:.1f} mm"
     assert rigid.angle_between(found.motion, motion) < np.deg2rad(0.3)
@@ -134,25 +113,11 @@ def test_what_is_compiled_ahead_is_what_is_needed(room: Room) -> None:
     assert _align.prepared == before
 
 
-@pytest.mark.parametrize("count", [61, 100, 2399])
-def test_the_middle_of_what_is_in_view(count: int) -> None:
-    """The median that weighs samples, to a part in two thousand, whatever stands where nothing is in view; oracle:
-    sorting.
-    """
-    generator = np.random.default_rng(count)
-    values = generator.exponential(3.0, 2400).astype(np.float32)
-    used = np.zeros(2400, bool)
-    used[generator.permutation(2400)[:count]] = True
-    values[~used] = np.nan
-    found = float(_median(jnp.asarray(values), jnp.asarray(used), jnp.int32(count)))
-    assert found == pytest.approx(np.sort(values[used])[count // 2], rel=5e-4)
-
-
 def test_a_network_depth_states_its_own_noise(room: Room) -> None:
     """A role other than a sensor tells keyframes its noise, and tracking nothing; oracle: the role's own numbers."""
     frames, camera, _ = room
     roles = replace(ROLES, depth=_Guessing())
-    slam = _run(frames[:1], camera, roles)
+    slam = run_over(frames[:1], camera, roles)
     np.testing.assert_allclose(slam.keyframes[0].depth_sigma, 0.07, rtol=1e-3)
     assert roles.tracking_depth(frames[0].depth) is None
     depth, sigma = ROLES.tracking_depth(np.full((4, 4), 2.0, np.float32))
@@ -193,7 +158,7 @@ def test_frames_are_described_where_flow_fails(room: Room) -> None:
         (None, 16, 16),
     ):
         _Counting.described = 0
-        slam = _run(frames, camera, replace(ROLES, points=_Counting(count=500), flow=flow))
+        slam = run_over(frames, camera, replace(ROLES, points=_Counting(count=500), flow=flow))
         assert least <= _Counting.described <= most, f"{_Counting.described} descriptions with {flow}"
         assert all(record.tracked for record in slam.frames)
         errors.append(_error(slam, truth))
@@ -265,7 +230,7 @@ def test_a_step_that_no_hand_makes_is_not_believed(room: Room) -> None:
     Oracle: the renderer's poses, relative to those of the first frame.
     """
     frames, camera, truth = room
-    slam = _run(frames[:12], camera, replace(ROLES, geometry=_Mirage(6)))
+    slam = run_over(frames[:12], camera, replace(ROLES, geometry=_Mirage(6)))
     true = rigid.invert(truth.poses) @ truth.poses[0]
     assert any("tracking was lost" in note for note in slam.notes)
     for record in slam.frames:
@@ -280,26 +245,11 @@ def test_a_step_that_no_hand_makes_is_not_believed(room: Room) -> None:
         (Evidence(matches=51, inliers=12, chi2=4.0), False),
         (Evidence(matches=20, inliers=14, correlation=0.7, surface=0.95, overlap=0.6, chi2=4.0), True),
         (Evidence(matches=0, inliers=0, correlation=0.75, surface=0.97, overlap=0.6, chi2=4.0), True),
-        (Evidence(matches=0, inliers=0, correlation=0.75, surface=0.97, overlap=0.6, chi2=90.0), False),
         (Evidence(matches=300, inliers=280, correlation=-0.1, surface=0.5, overlap=0.5, chi2=4.0), False),
         (Evidence(matches=90, inliers=80, sigma_translation=0.4, chi2=4.0), False),
         (Evidence(lines=20, visible_lines=35, sigma_translation=0.02, chi2=4.0), True),
         (Evidence(lines=20, visible_lines=35, sigma_translation=0.4, chi2=4.0), False),
-        (Evidence(lines=20, visible_lines=35, sigma_translation=0.02, chi2=90.0), False),
         (Evidence(lines=20, visible_lines=70, sigma_translation=0.02, chi2=4.0), False),
-    ],
-    ids=[
-        "mirrored",
-        "a fifth agrees",
-        "points and picture",
-        "picture",
-        "picture, far",
-        "picture differs",
-        "vague",
-        "lines",
-        "parallel lines",
-        "lines, far",
-        "few of the lines",
     ],
 )
 def test_what_is_believed(evidence: Evidence, believed: bool) -> None:
@@ -307,11 +257,19 @@ def test_what_is_believed(evidence: Evidence, believed: bool) -> None:
     assert evidence.accepted is believed
 
 
+@pytest.mark.parametrize(
+    ("old", "present", "well"), [(0.51, 0.93, False), (0.85, 0.95, True), (0.5, 0.6, True), (float("nan"), 0.9, True)]
+)
+def test_an_old_keyframe_shows_a_frame_as_well_as_the_present_one(old: float, present: float, well: bool) -> None:
+    """Half the correlation is not as well; nothing to compare is no reason against. Oracle: the definition."""
+    assert Evidence(correlation=old).shows_as_well(Evidence(correlation=present)) is well
+
+
 def test_black_frames_are_lost_and_the_map_goes_on(room: Room) -> None:
     """Five black frames are called lost, all others are tracked in one map; oracle: the renderer's poses."""
     frames, camera, truth = room
     dark = range(12, 17)
-    slam = _run([_black(frame) if frame.index in dark else frame for frame in frames], camera)
+    slam = run_over([black(frame) if frame.index in dark else frame for frame in frames], camera)
     assert [record.frame for record in slam.frames if not record.tracked] == list(dark)
     assert len(slam.map.roots) == 1
     assert len(frame_trajectory(slam)) == len(frames) - len(dark), "a frame without a pose is not in the trajectory"
@@ -325,7 +283,7 @@ def test_a_camera_that_comes_back_is_found_again(room: Room) -> None:
     other = simulate("room", 2000, 0, SIZE, rate=10.0)
     away = [replace(other.frame(60 + i), index=24 + i, timestamp=(24 + i) / 10) for i in range(5)]
     back = [replace(frames[2 + i], index=29 + i, timestamp=(29 + i) / 10) for i in range(6)]
-    slam = _run([*frames[:24], *away, *back], camera)
+    slam = run_over([*frames[:24], *away, *back], camera)
     assert len(slam.map.roots) == 1
     assert any("found again" in note for note in slam.notes), slam.notes
     true = rigid.invert(truth.poses) @ truth.poses[0]
@@ -345,7 +303,7 @@ def test_a_keyframe_without_a_match_is_tied(room: Room) -> None:
         replace(frame, image=cv2.GaussianBlur(frame.image, (0, 0), 4.0)) if frame.index in blurred else frame
         for frame in frames
     ]
-    slam = _run(soft, camera)
+    slam = run_over(soft, camera)
     assert all(record.tracked for record in slam.frames)
     tied = {factor.keyframes[1] for factor in slam.map.factors}
     assert tied == set(range(1, len(slam.keyframes))), "every keyframe but the first is tied to another"
@@ -364,7 +322,7 @@ def test_a_place_is_recognised(room: Room) -> None:
 @pytest.fixture(scope="module")
 def tracked(room: Room) -> Slam:
     """After all frames."""
-    return _run(*room[:2])
+    return run_over(*room[:2])
 
 
 @pytest.mark.long
@@ -390,7 +348,7 @@ def test_a_place_that_drift_has_moved_is_used_again(
         replace(tie, pose=away @ tie.pose) for tie in slam.map.odometry_factors if crossing(tie) and contradicted
     )
     kept = (*(factor for factor in slam.map.factors if not crossing(factor)), *cut)
-    slam = replace(slam, map=replace(slam.map, keyframes=tuple(moved), factors=kept))
+    slam = changed(slam, "map", keyframes=tuple(moved), factors=kept)
     played = [*range(len(frames) - 1, -1, -2)]
     for index, row in enumerate(played, start=len(frames)):
         frame = replace(frames[row], index=index, timestamp=index / 10)
@@ -418,25 +376,23 @@ def torn(room: Room) -> tuple[Slam, Slam]:
     """
     frames, camera, _ = room
     seen = [replace(f, index=i, timestamp=i / 10) for i, f in enumerate((*frames[:16], *frames[14:4:-1]))]
-    whole = _run(seen, camera)
-    whole = replace(whole, map=replace(whole.map, metric=False))
+    whole = run_over(seen, camera)
+    whole = changed(whole, "map", metric=False)
     origin = 2 * len(whole.keyframes) // 3
     own = lambda ends: len({number < origin for number in ends}) == 1
-    torn_apart = replace(
+    torn_apart = changed(
         whole,
-        map=replace(
-            whole.map,
-            roots=(0, origin),
-            pairs=tuple(pair for pair in whole.map.pairs if own(pair.key)),
-            factors=tuple(factor for factor in whole.map.factors if own(factor.keyframes)),
-        ),
+        "map",
+        roots=(0, origin),
+        pairs=tuple(pair for pair in whole.map.pairs if own(pair.key)),
+        factors=tuple(factor for factor in whole.map.factors if own(factor.keyframes)),
     )
     apart = scale_submap(torn_apart, 1.6, lambda number: number >= origin)
     moved = np.eye(4)
     moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
     moved[:3, 3] = [0.5, -1.0, 2.0]
     keyframes = tuple(replace(k, pose=k.pose @ moved) if k.number >= origin else k for k in apart.keyframes)
-    return whole, replace(apart, map=replace(apart.map, keyframes=keyframes))
+    return whole, changed(apart, "map", keyframes=keyframes)
 
 
 def test_submaps_of_free_scale_join_by_a_similarity(room: Room, torn: tuple[Slam, Slam]) -> None:

@@ -11,8 +11,9 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from posed_keyframes import keyframe_of
 from vggtgeo.models.classical import PnpGeometry
-from vggtgeo.models.roles import Features, GeometryResult, LineFeatures, PointMatches, Segments
+from vggtgeo.models.roles import GeometryResult, LineFeatures, PointMatches, Segments
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import pinhole, rigid
@@ -20,7 +21,6 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.run import default_roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
 from vggtgeo.slam.tracking.evidence import Evidence, tangent
 from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput, track, unless_contradicted
 from vggtgeo.slam.tracking.two_view_motion import two_view_motion, usual_step
@@ -50,12 +50,8 @@ def _views() -> Views:
     count = len(pixels)
     nothing, ones = np.full(count, np.nan), np.ones(count)
     slots = Slots(pixels, nothing, nothing, nothing, ones, ones, nothing)
-    none = np.zeros((0, 2))
-    image = np.zeros((270, 480, 3), np.uint8)
-    images = KeyframeImages(image, image[..., 0].astype(np.float16), image[..., 0].astype(np.float16), image[..., 0])
-    features = Features(pixels, ones, None)
-    empty = Slots(none, none[:, 0], none[:, 0], none[:, 0], none[:, 0], none[:, 0], none[:, 0])
-    keyframe = Keyframe(0, 0, 0.0, np.eye(4), images, features, LINES, none, slots, empty, np.zeros(0, int))
+    keyframe = keyframe_of(0, np.zeros((270, 480, 3), np.uint8), np.eye(4), slots, np.zeros((270, 480)))
+    keyframe = replace(keyframe, lines=LINES)
     rows = np.arange(count)
     return Views(keyframe, PointMatches(rows, rows, pixels, seen, ones))
 
@@ -66,7 +62,6 @@ def test_a_motion_without_known_depths() -> None:
     """
     length = float(np.linalg.norm(TRUE[:3, 3]))
     found = two_view_motion(_views().matches, 2 * length, INTRINSICS, PnpGeometry(), NOISE)
-    assert found is not None
     assert np.degrees(rigid.angle_between(found.motion, TRUE)) < 0.3
     cosine = found.motion[:3, 3] @ TRUE[:3, 3] / (2 * length * length)
     assert np.degrees(np.arccos(min(cosine, 1.0))) < 2.0
@@ -78,7 +73,6 @@ def test_the_information_says_that_the_length_is_a_guess() -> None:
     """
     length = float(np.linalg.norm(TRUE[:3, 3]))
     found = two_view_motion(_views().matches, length, INTRINSICS, PnpGeometry(), NOISE)
-    assert found is not None
     along = np.append(found.motion[:3, 3] / np.linalg.norm(found.motion[:3, 3]), np.zeros(3))
     deviation = 1.0 / np.sqrt(along @ found.information @ along)
     assert deviation / length == pytest.approx(0.7, rel=0.01)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from changed import changed
 
 import vggtgeo as vg
 from vggtgeo.slam.submaps import stretches
@@ -42,7 +43,7 @@ def test_a_lost_frame_keeps_its_place_in_the_claim() -> None:
     # and that they are told. Oracle: the frames' numbers.
     *_, slam = vg.run(vg.simulate("room", 3, size=(160, 120)))
     middle = replace(slam.frames[1], tracked=False)
-    slam = replace(slam, tracker=replace(slam.tracker, frames=(slam.frames[0], middle, slam.frames[2])))
+    slam = changed(slam, "tracker", frames=(slam.frames[0], middle, slam.frames[2]))
     claim = Claim.of(slam)
     assert len(claim.times) == len(claim.poses) == len(claim.frames) == 3
     assert len(vg.frame_trajectory(slam)) == 2

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from changed import changed
 from corner_walk import K, walk
 from recorded_run import recorded_run
 from scipy.spatial.transform import Rotation
@@ -39,7 +40,7 @@ def test_a_run_is_judged_as_a_whole() -> None:
     assert judge(run.slam, recorder.frames[:-1]).level == "good"
     assert Result.of(run.slam, recorder.frames).verdict.level == "good"
     keyframes = [replace(k, pose=k.pose @ _turn(30.0 * k.number)) for k in run.slam.keyframes]
-    wrong = replace(run.slam, map=replace(run.slam.map, keyframes=tuple(keyframes)))
+    wrong = changed(run.slam, "map", keyframes=tuple(keyframes))
     stirred = judge(wrong, recorder.frames)
     assert stirred.level != "good"
     assert judge(wrong, recorder.frames[:-1]).level != "good"

@@ -1,6 +1,6 @@
-"""Frames that were lost, and runs that never began.
+"""The record of a run: frames that were lost or left out, runs that never began, a path no longer than its error.
 
-The defect is planted into a healthy synthetic walk, which the check is silent about without it.
+Each defect is planted into a healthy synthetic walk, which the check is silent about without it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,10 @@ import pytest
 from corner_walk import Walk, walk
 from reported import pattern
 
-from vggtgeo.slam.verdict.judge import check_frozen, check_record
+from vggtgeo.geometry import rigid
+from vggtgeo.io.errors import LeftOutWarning
+from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
+from vggtgeo.slam.verdict.judge import check_extent, check_frozen, check_input, check_record, stated_share
 
 
 def test_lost_frames_count_by_what_they_cost(healthy: Walk) -> None:
@@ -88,3 +91,24 @@ def test_pictures_that_are_shown_again_while_the_camera_moves(still: bool, told:
         for one in corners
     ]
     assert check_frozen(claim, moved) == []
+
+
+def test_frames_left_out_are_told() -> None:
+    """A tenth of the frames left out by the reader is told, one of a hundred is not."""
+    assert check_input([LeftOutWarning("unreadable"), "something else"], 99) == ()
+    assert [f.level for f in check_input([LeftOutWarning("repeated", 30)], 30)] == ["degraded"]
+
+
+def test_a_path_without_depth_and_shorter_than_its_error_is_told(healthy: Walk) -> None:
+    """Of free scale, places that are known to two thirds of their spread are told, and those known to a third are not;
+    with metres it is no matter of scale. Oracle: the spread of the walk's own path.
+    """
+    free = replace(healthy.claim, metric=False)
+    spread = float(np.sqrt(rigid.centres(free.poses).var(0).sum()))
+    sigma = np.where(np.arange(len(free)) % 3, np.nan, spread / 1.5)
+    known = lambda places: stated_share(free, PoseUncertainty(free.times, places, np.zeros(len(free))))
+    assert [f.check for f in check_extent(free, known(sigma))] == ["extent"]
+    assert re.search(pattern("67"), check_extent(free, known(sigma))[0].text)
+    assert check_extent(free, known(sigma / 2)) == []
+    assert check_extent(free, stated_share(free, None)) == []
+    assert check_extent(healthy.claim, known(sigma)) == []

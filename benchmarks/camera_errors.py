@@ -1,14 +1,21 @@
-"""Errors of real cameras, applied to simulated recordings with exact depth and poses.
+"""Errors of real cameras, applied to simulated recordings with exact depth and poses; used by `verdict_faults.py`.
 
 A pixel moves with the motion field of the frame (Longuet-Higgins and Prazdny, 1980). With the camera's velocity `v` and
 angular velocity `w` a point `p` of the camera's frame moves by `p' = w x p + v`, and its pixel by the derivative of the
 projection. It is nearly constant over an exposure, so blur and rolling shutter need a few resamplings, no rendering.
+
+A depth camera that triangulates, with a projector or a second camera, measures disparity, `d = f b / z`, by matching
+windows. From this follow its errors:
+
+- the error of depth grows with the square of depth, and depth is quantised: `dz = z^2 / (f b) dd`;
+- a window at an edge matches the nearer surface, so that this one is too large by half a window;
+- what the second view does not see has no depth: a shadow beside each nearer surface.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,6 +26,8 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.degradations import Recording, camera_velocities, with_images
 
+NATIVE_WIDTH = 640
+"""Pixels of the sensor's own images, in which disparities and windows are given."""
 INSTANTS = 5
 """Moments of an exposure whose mean is the image."""
 ROUNDS = 2
@@ -140,3 +149,63 @@ def _source(field: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndar
         x, y = columns - late * at[..., 0], rows - late * at[..., 1]
         at = cv2.remap(field, x, y, cv2.INTER_LINEAR, **_BORDER)
     return columns - late * at[..., 0], rows - late * at[..., 1]
+
+
+@dataclass(frozen=True)
+class DisparitySensor:
+    """The error model of a depth camera that triangulates.
+
+    focal_baseline: focal length times baseline, pixels x metres. noise: standard deviation of the disparity, pixels.
+    grain: pixels over which this noise is correlated. step: quantisation of the disparity, pixels. window: side of the
+    matching window, pixels. far: metres; depth beyond it is missing. All pixels are those of images `NATIVE_WIDTH`
+    wide.
+    """
+
+    focal_baseline: float
+    noise: float
+    grain: float
+    step: float
+    window: float
+    far: float
+
+    def measured(self, depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Measure exact depth, float [H, W], metres, NaN where there is no surface.
+
+        Returns float32 [H, W], metres, NaN where the sensor has no depth.
+        """
+        scale = depth.shape[1] / NATIVE_WIDTH
+        disparity = np.where(np.isfinite(depth) & (depth > 0), self.focal_baseline / np.maximum(depth, 1e-6), 0.0)
+        reach = round(self.window * scale / 2)
+        if reach:
+            disparity = cv2.dilate(disparity, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+        seen = (disparity > 0) & ~_hidden(disparity * scale)
+        disparity = disparity + self.noise * _correlated(rng, disparity.shape, self.grain * scale)
+        if self.step:
+            disparity = np.rint(disparity / self.step) * self.step
+        measured = self.focal_baseline / np.maximum(disparity, 1e-6)
+        return np.where(seen & (measured < self.far), measured, np.nan).astype(np.float32)
+
+
+KINECT = DisparitySensor(focal_baseline=43.5, noise=0.06, grain=3.0, step=0.125, window=3.0, far=5.0)
+"""A structured-light camera: 580 px x 7.5 cm, steps of 1/8 pixel; 1.4 mm of noise at 1 m (Khoshelham and Oude Elberink,
+2012)."""
+STEREO = DisparitySensor(focal_baseline=30.0, noise=0.08, grain=7.0, step=0.03125, window=9.0, far=8.0)
+"""A small stereo camera: 500 px x 6 cm, 0.08 pixels of noise over windows of 9 pixels."""
+
+
+def _hidden(disparity: np.ndarray) -> np.ndarray:
+    """Return pixels that the second view does not see: one to their right is nearer, and covers their place in it."""
+    place = np.arange(disparity.shape[1]) - disparity
+    beyond = np.minimum.accumulate(place[:, ::-1], axis=1)[:, ::-1]
+    hidden = np.zeros(disparity.shape, bool)
+    hidden[:, :-1] = beyond[:, 1:] <= place[:, :-1]
+    return hidden
+
+
+def _correlated(rng: np.random.Generator, shape: tuple[int, ...], grain: float) -> np.ndarray:
+    """Return white noise, or noise that is correlated over `grain` pixels; standard deviation 1."""
+    white = rng.standard_normal(shape)
+    if grain < 1:
+        return white
+    smooth = cv2.GaussianBlur(white, (0, 0), 0.5 * grain, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(smooth / smooth.std())
