@@ -19,8 +19,11 @@ from vggtgeo.simulation.degradations import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.given_camera import keyframe_pairs
+from vggtgeo.slam.camera.pixel_shifts import carried
 from vggtgeo.slam.camera.rolling_shutter import (
     find_readout,
+    image_shift,
+    pair_to_global_shutter,
     without_readout,
 )
 from vggtgeo.slam.global_map.carried_poses import carried_poses
@@ -252,3 +255,28 @@ def test_a_run_finds_the_shutter_of_its_camera() -> None:
         assert ("rolling_shutter" in result.summary) == search
     assert result.summary["rolling_shutter"]["seconds"] == pytest.approx(0.03, rel=0.1)
     assert errors[1] < 0.5 * errors[0], errors
+
+
+def test_matches_of_two_images_without_the_readout_of_either() -> None:
+    """Oracle: the pixels of a camera that reads at once, and each moved as far as its row's time says; half a metre and
+    half a radian a second shift them by 5 px.
+    """
+    rng, camera, size = np.random.default_rng(0), np.array([500.0, 500.0, 320.0, 240.0]), (480, 640)
+    still, depth, relative = rng.uniform((0, 0), (640, 480), (50, 2)), rng.uniform(2.0, 6.0, 50), np.eye(4)
+    relative[:3, 3] = 0.1, 0.02, -0.05
+    inverse, readout = 1 / depth, Readout(0.03, False, 0.0)
+    there, inverse_there = (part[0] for part in carried(still[None], inverse[None], relative[None], camera))
+    motions = rng.normal(0, 0.5, (2, 6))
+
+    def read(at: np.ndarray, depths: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        seen = at
+        for _ in range(20):  # the row in which it is seen says when
+            shift = image_shift(seen[None], depths[None], motion[None], camera, size, readout.columns)[0]
+            seen = at + readout.seconds * shift
+        return seen
+
+    before, after = read(still, inverse, motions[0]), read(there, inverse_there, motions[1])
+    found = pair_to_global_shutter(before, after, depth, relative, (motions[0], motions[1]), camera, size, readout)
+    for image, true, moved in zip(found, (still, there), (before, after), strict=True):
+        assert np.abs(moved - true).max() > 2.0
+        assert np.abs(image - true).max() < 0.1
