@@ -69,7 +69,7 @@ def shape_of(
     edges, counts = sum(edges_of_host), Counter(type(factor) for factor in factors)
     usual = shape_for(keyframes, edges, settings)
     size = usual.size
-    if keyframes > SMALL[-1] and size.edges > MAX_PADDING * edges:
+    if keyframes > SMALL[-1] and padded_edges(edges, size.keyframes) > MAX_PADDING * edges:
         size = replace(size, keyframes=keyframes, degree=max(edges_of_host), edges=edges)
     room = {kind: max(padded_count(count), usual.room.get(kind, 0)) for kind, count in counts.items()}
     return GlobalShape(size, tuple(room.items()), max(padded_count(pairs), usual.pairs))
