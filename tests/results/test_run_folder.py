@@ -23,9 +23,9 @@ from vggtgeo.io.interruption import end_on_signals
 from vggtgeo.io.locks import LockedError, locked
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.results.files import write_depth
+from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import RESERVE, open_run_folder
-from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 pytestmark = [

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.options import JsonOption
+from vggtgeo.cli.options import EXIT_INPUT, JsonOption
 
 data = typer.Typer(
     help="Where to get recordings, and what is wrong with one.", no_args_is_help=True, add_completion=False
@@ -21,10 +21,6 @@ data = typer.Typer(
 @data.command("list")
 def list_command(as_json: JsonOption = False) -> None:
     """List what the readers know: where to get it, its size, licence and layout."""
-    from dataclasses import asdict
-
-    from vggtgeo.cli.data import catalogue
-
     entries = catalogue()
     if as_json:
         typer.echo(json.dumps([asdict(entry) for entry in entries]))
@@ -45,7 +41,6 @@ def check_command(
     as_json: JsonOption = False,
 ) -> None:
     """Say what is wrong with the recording at PATH, in sentences; exit code 2 where something is."""
-    from vggtgeo.cli.main import EXIT_INPUT
     from vggtgeo.datasets.check import inspect
 
     found = inspect(path if "://" in path or path.startswith("webcam") else Path(path), kind)

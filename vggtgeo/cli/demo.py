@@ -11,7 +11,7 @@ import typer
 
 from vggtgeo.cli.options import AssignmentsOption, ReportOptions, RerunOption, with_option_groups
 from vggtgeo.cli.run_options import ResumeOption
-from vggtgeo.cli.settings_file import SettingsOption
+from vggtgeo.cli.settings_file import SettingsOption, pipeline_settings
 
 SIZE = (480, 360)
 """Pixels: large enough for a dense map, small enough to render during the run."""
@@ -38,7 +38,6 @@ def demo(
     report: ReportOptions,
 ) -> None:
     """Run in a synthetic office with exact truth, rendered on the spot."""
-    from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.results.run_options import RunOptions
     from vggtgeo.simulation import simulate

@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from vggtgeo.cli.options import EXIT_FAILED, JsonOption, with_option_groups
-from vggtgeo.io.errors import InputError, InputWarning, collected_warnings
+from vggtgeo.io.errors import InputWarning, collected_warnings
 from vggtgeo.io.text_files import whole_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rich.table import Table
-
-    from vggtgeo.evaluation import ErrorStatistics, TrajectoryReport
+    from vggtgeo.evaluation import TrajectoryReport
     from vggtgeo.geometry.trajectory import Trajectory
 
 MAX_TIME_DIFFERENCE = 0.01
@@ -76,6 +74,7 @@ def evaluate(
     """
     from vggtgeo.evaluation import comparability, estimate_offsets, evaluate_trajectory, shifted
     from vggtgeo.evaluation.alignment import AXES
+    from vggtgeo.results.reading import load_estimate
 
     with collected_warnings() as warned:
         true, metres = load_truth(truth)
@@ -87,17 +86,14 @@ def evaluate(
         metric = metres is not False and scale is not None and scale.startswith("metric")
         verdict = comparability(found, true, max_dt, metric)
         offsets = estimate_offsets(found, true, max_dt)
-        left = verdict
-        if offsets is not None and offsets.significant:
-            true = offsets.removed(found, true)
-            left = comparability(found, true, max_dt, metric)
         for text in (*verdict.reasons, *verdict.doubts):
             warnings.warn(text, InputWarning, stacklevel=2)
         if offsets is not None and offsets.explains:
             warnings.warn(offsets.message, InputWarning, stacklevel=2)
-        rest = None
+        rest, left = None, verdict
         if comparison.estimate_offset and offsets is not None:
-            rest = evaluate_trajectory(found, true, *rules)
+            true = offsets.removed(found, true)
+            rest, left = evaluate_trajectory(found, true, *rules), comparability(found, true, max_dt, metric)
     if as_json:
         known: dict[str, Any] = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
         known["offsets"] = None if offsets is None else offsets.as_dict()
@@ -111,22 +107,9 @@ def evaluate(
         if rest is not None and offsets is not None:
             typer.echo(f"without {', '.join(offsets.significant) or 'any, as none is significant'}:")
             print_report(rest, scale, metres)
-    if (left if rest is not None else verdict).reasons:
+    if left.reasons:
         typer.echo("NOT COMPARABLE: these errors are meaningless, see the warnings", err=True)
         raise typer.Exit(EXIT_FAILED)
-
-
-def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
-    """Load the trajectory of a file, or `trajectory.txt` of a folder. truth: gives the times of poses without times."""
-    from vggtgeo.datasets.pose_files import load_trajectory
-    from vggtgeo.results.summary import warn_if_truncated
-    from vggtgeo.results.unfinished import unfinished_message
-
-    unfinished = unfinished_message(path)
-    if unfinished:
-        warnings.warn(unfinished, InputWarning, stacklevel=2)
-    file = path / "trajectory.txt" if path.is_dir() else path
-    return warn_if_truncated(file, load_trajectory(file, truth))
 
 
 def load_scale(path: Path) -> str | None:
@@ -140,7 +123,7 @@ def load_scale(path: Path) -> str | None:
         return None
     try:
         return str(json.loads(whole_text(file, errors="strict"))["scale"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         text = f"`{file}` is invalid ({describe_error(error)}): scale and verdict of the run are unknown"
         warnings.warn(InputWarning(text), stacklevel=2)
         return None
@@ -148,26 +131,18 @@ def load_scale(path: Path) -> str | None:
 
 def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
     """Load the trajectory of a file, or the ground truth of a dataset folder; return it, and whether its lengths are
-    metres (None if unknown).
+    metres: by a run's summary, or by a benchmark's file name; None if unknown.
     """
     from vggtgeo.datasets import open_sequence
     from vggtgeo.datasets.pose_files import load_trajectory
+    from vggtgeo.results.reading import truth_of
 
-    if not path.is_dir():
-        return load_trajectory(path), _in_metres(path)
-    sequence = open_sequence(path)
-    truth = sequence.ground_truth()
-    if truth is None:
-        raise InputError(f"`{path}` has no ground truth; give a trajectory in the TUM format")
-    return truth, getattr(sequence, "truth_in_metres", True)
-
-
-def _in_metres(file: Path) -> bool | None:
-    """Return whether the poses of a file are in metres: by a run's summary, or by a benchmark's file name."""
-    scale = load_scale(file)
-    if scale is not None:
-        return scale.startswith("metric")
-    return True if file.name.endswith(_BENCHMARKS) else None
+    if path.is_dir():
+        sequence = open_sequence(path)
+        return truth_of(sequence), getattr(sequence, "truth_in_metres", True)
+    scale = load_scale(path)
+    known = True if path.name.endswith(_BENCHMARKS) else None
+    return load_trajectory(path), known if scale is None else scale.startswith("metric")
 
 
 def print_report(report: TrajectoryReport, scale: str | None = None, metres: bool | None = True) -> None:
@@ -189,39 +164,35 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
         f"{report.sim3.alignment.scale:.4f}; RPE over {report.relative.interval}",
         soft_wrap=True,
     )
-    # In a narrow terminal wrap numbers instead of truncating them: 4.4413e-17 is not "4.44…".
-    table = Table(*(Column(name, overflow="fold") for name in ("", "RMSE", "mean", "median", "max")))
-    angles = ErrorStatistics.of(np.degrees(report.relative.rotation))
-    free = scale is not None and scale.startswith("free")
     if scale is not None:
         console.print(f"scale of the estimate: {scale}", soft_wrap=True)
     if not metres:
         console.print(_NO_UNIT[metres], soft_wrap=True)
-    length = _centimetres if metres else "{:.5g}".format
-    if not free:
-        _add_row(table, "ATE, SE(3)", report.se3.statistics, length)
-    _add_row(table, "ATE, Sim(3)", report.sim3.statistics, length)
-    if not free:
-        _add_row(table, "ATE, yaw only", report.yaw.statistics, length)
-        _add_row(table, "ATE, not aligned", report.unaligned.statistics, length)
-        _add_row(table, "RPE translation", report.relative.translation_statistics, length)
-    _add_row(table, "RPE translation, Sim(3)", report.relative_sim3.translation_statistics, length)
-    _add_row(table, "RPE rotation", angles, "{:.3f} deg".format)
+    # In a narrow terminal wrap numbers instead of truncating them: 4.4413e-17 is not "4.44…".
+    table = Table(*(Column(name, overflow="fold") for name in ("", "RMSE", "mean", "median", "max")))
+    length: Callable[[float], str] = (lambda value: f"{100 * value:.3f} cm") if metres else "{:.5g}".format
+    rows = {
+        "ATE, SE(3)": report.se3.statistics,
+        "ATE, Sim(3)": report.sim3.statistics,
+        "ATE, yaw only": report.yaw.statistics,
+        "ATE, not aligned": report.unaligned.statistics,
+        "RPE translation": report.relative.translation_statistics,
+        "RPE translation, Sim(3)": report.relative_sim3.translation_statistics,
+        "RPE rotation": ErrorStatistics.of(np.degrees(report.relative.rotation)),
+    }
+    for name, errors in rows.items():
+        if scale is not None and scale.startswith("free") and name in _METRIC_ONLY:
+            continue
+        shown = "{:.3f} deg".format if name == "RPE rotation" else length
+        values = (errors.rmse, errors.mean, errors.median, errors.maximum)
+        table.add_row(name, *(shown(value) if value == value else "-" for value in values))
     console.print(table)
     for warning in report.warnings:
         console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
 
 
+_METRIC_ONLY = ("ATE, SE(3)", "ATE, yaw only", "ATE, not aligned", "RPE translation")
 _NO_UNIT = {
     None: "lengths are in the unit of GT, which is not known from its file",
     False: "lengths are in the unit of GT, which is not the metre",
 }
-
-
-def _centimetres(metres: float) -> str:
-    return f"{100 * metres:.3f} cm"
-
-
-def _add_row(table: Table, name: str, errors: ErrorStatistics, shown: Callable[[float], str]) -> None:
-    values = (errors.rmse, errors.mean, errors.median, errors.maximum)
-    table.add_row(name, *(shown(value) if value == value else "-" for value in values))

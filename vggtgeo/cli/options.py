@@ -6,13 +6,15 @@ import dataclasses
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+EXIT_INTERNAL = 1
+EXIT_INPUT = 2
 EXIT_FAILED = 3
 """The run ended with the verdict "failed"; its outputs are written."""
 EXIT_INTERRUPTED = 130
@@ -70,13 +72,16 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     fields have theirs.
     """
     hints = typing.get_type_hints(command, include_extras=True)
-    options = [
-        option
-        for parameter in inspect.signature(command).parameters.values()
-        for option in _options(parameter, hints[parameter.name])
-    ]
-    signature = inspect.Signature(options)
     groups = {name: kind for name, kind in hints.items() if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
+    options = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        if name not in groups:
+            options.append(_option(name, hints[name], parameter.default))
+            continue
+        types = typing.get_type_hints(groups[name], include_extras=True)
+        for entry in dataclasses.fields(groups[name]):
+            options.append(_option(entry.name, types[entry.name], entry.default))
+    signature = inspect.Signature(options)
 
     @functools.wraps(command)
     def with_groups(*args: Any, **kwargs: Any) -> None:
@@ -92,16 +97,6 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     with_groups.__signature__ = signature  # type: ignore[attr-defined]
     with_groups.__annotations__ = {option.name: option.annotation for option in options}
     return with_groups
-
-
-def _options(parameter: inspect.Parameter, kind: Any) -> Iterator[inspect.Parameter]:
-    if not dataclasses.is_dataclass(kind):
-        yield _option(parameter.name, kind, parameter.default)
-        return
-    hints = typing.get_type_hints(kind, include_extras=True)
-    for entry in dataclasses.fields(kind):
-        default = inspect.Parameter.empty if entry.default is dataclasses.MISSING else entry.default
-        yield _option(entry.name, hints[entry.name], default)
 
 
 def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:

@@ -5,7 +5,6 @@ Heavy modules are imported inside functions, so that `vggtgeo run --help` is fas
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,12 +15,11 @@ from vggtgeo.cli.run_options import (
     InputOptions,
     OutputOption,
     PerceptionOptions,
-    Provider,
     ResultOptions,
     SequenceArgument,
     SwitchOptions,
 )
-from vggtgeo.cli.settings_file import SettingsOption
+from vggtgeo.cli.settings_file import SettingsOption, pipeline_settings
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning, collected_warnings
 
 if TYPE_CHECKING:
@@ -51,28 +49,36 @@ def run(
     """Estimate trajectory and map of the sequence at PATH."""
     from vggtgeo.datasets.frame import check_selection
     from vggtgeo.datasets.opening import check_there
-    from vggtgeo.results.output_checks import check_can_be_written, check_output
+    from vggtgeo.io.network_files import as_input_errors
+    from vggtgeo.models.onnx.providers import choose_provider
+    from vggtgeo.results.output_checks import check_can_be_written, check_output, is_in_results
     from vggtgeo.viewing.target import check_target
 
     rerun = check_target(options.rerun) if options.rerun else None
-    check_flags(perception.memory_limit_gb, given.fps)
+    if perception.memory_limit_gb is not None and not 0 < perception.memory_limit_gb < float("inf"):
+        raise InputError(f"`--memory-limit-gb` must be positive, got {perception.memory_limit_gb:g}")
+    if given.fps is not None and not 0 < given.fps <= MAX_FPS:
+        raise InputError(f"`--fps` must be positive, at most {MAX_FPS:g} frames per second, got {given.fps:g}")
     if given.kind != "camera":
         check_there(path)
     if options.save_map is not None:
         check_map_place(options.save_map, output)
-    if rerun:
-        check_recording_file(rerun, output)
+    if rerun and rerun not in ("spawn", "serve") and is_in_results(output, Path(rerun)):
+        raise InputError(
+            f"`--rerun` is `{rerun}`, in a folder that the run replaces; give another, for example `{output}/run.rrd`"
+        )
     check_output(output, Path(path))
     check_can_be_written(output)
     with collected_warnings() as warned:
         sequence = open_input(path, given)
     if len(sequence):  # zero for a live camera
         check_selection(sequence.name, len(sequence), given.start, given.end, given.stride)
-    check_provider(perception.provider)
+    if perception.provider == "cuda":
+        with as_input_errors():
+            choose_provider("cuda")  # is there a GPU?
     if options.save_depth and options.dense == "none":
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
         warnings.warn(text, InputWarning, stacklevel=2)
-    from vggtgeo.cli.pipeline_settings import pipeline_settings
     from vggtgeo.cli.run_sequence import Output, run_and_write
     from vggtgeo.results.run_options import RunOptions
     from vggtgeo.slam.known_map import load_map
@@ -119,31 +125,17 @@ def tables_of_switches(switches: SwitchOptions, options: ResultOptions) -> dict[
 
 def check_map_place(file: Path, output: Path) -> None:
     """Raise InputError if the map's file is not writable, or would be replaced by results of the run."""
+    from vggtgeo.io.files import whole_path
+    from vggtgeo.results.output_checks import check_can_be_written, is_result
+
     if file.is_dir():
         raise InputError(f"`--save-map` is `{file}`, which is a folder; give the name of a file")
-    from vggtgeo.io.files import whole_path
-    from vggtgeo.results.output_checks import is_result
-
     if is_result(output, file) or whole_path(file) == whole_path(output):
         raise InputError(
             f"`--save-map` is `{file}`, the name of a result of the run itself, or its folder; give another, such as "
             f"`{output}.map`"
         )
-    there = next(folder for folder in file.absolute().parents if folder.exists())
-    try:
-        tempfile.TemporaryFile(dir=there).close()
-    except OSError as error:
-        raise InputError(f"`--save-map` is `{file}`, which cannot be written: {error.strerror or error}") from None
-
-
-def check_recording_file(target: str, output: Path) -> None:
-    """Raise InputError if the run's results would replace the recording."""
-    from vggtgeo.results.output_checks import is_in_results
-
-    if target not in ("spawn", "serve") and is_in_results(output, Path(target)):
-        raise InputError(
-            f"`--rerun` is `{target}`, in a folder that the run replaces; give another, for example `{output}/run.rrd`"
-        )
+    check_can_be_written(file.parent, "--save-map")
 
 
 def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool) -> dict[str, str]:
@@ -159,25 +151,6 @@ def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool
         if named[role] is not None:
             raise InputError(f"`{named[role]}` was chosen, but `{flag}` disables its role; give one of the two")
     return {role: name for role, name in named.items() if name is not None} | dict.fromkeys(disabled, "classical")
-
-
-def check_flags(memory_limit_gb: float | None, fps: float | None = None) -> None:
-    """Raise InputError for numbers out of range."""
-    if memory_limit_gb is not None and not 0 < memory_limit_gb < float("inf"):
-        raise InputError(f"`--memory-limit-gb` must be positive, got {memory_limit_gb:g}")
-    if fps is not None and not 0 < fps <= MAX_FPS:
-        raise InputError(f"`--fps` must be positive, at most {MAX_FPS:g} frames per second, got {fps:g}")
-
-
-def check_provider(provider: Provider) -> None:
-    """Raise InputError if a GPU is requested and not available."""
-    if provider != "cuda":
-        return
-    from vggtgeo.io.network_files import as_input_errors
-    from vggtgeo.models.onnx.providers import choose_provider
-
-    with as_input_errors():
-        choose_provider(provider)
 
 
 def open_input(path: str | Path, given: InputOptions) -> Sequence:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from vggtgeo.cli.options import AssignmentsOption, JsonOption, QuietOption, RerunOption
-from vggtgeo.results.unfinished import EVERY
+from vggtgeo.results.output_checks import EVERY
 
 Provider = Literal["auto", "cuda", "cpu"]
 SequenceArgument = Annotated[

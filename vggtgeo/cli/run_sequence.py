@@ -24,11 +24,11 @@ from vggtgeo.io.network_files import as_input_errors
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
+from vggtgeo.results.output_checks import EVERY, EXPORTS, SUMMARY
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
 from vggtgeo.results.run_options import RunOptions
-from vggtgeo.results.unfinished import EVERY, EXPORTS, SUMMARY
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings

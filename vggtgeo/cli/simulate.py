@@ -1,4 +1,4 @@
-"""`vggtgeo simulate`: a synthetic scene as a TUM RGB-D folder, with exact truth."""
+"""`vggtgeo simulate`: a synthetic scene as a TUM RGB-D folder; `vggtgeo warm-up`: compile before the first run."""
 
 import json
 from dataclasses import dataclass
@@ -74,3 +74,15 @@ def parse_size(text: str) -> tuple[int, int]:
     if min(width, height) < 16 or max(width, height) > 8192:
         raise InputError(f"`--size` must have sides of 16 to 8192 pixels, got {text!r}")
     return width, height
+
+
+def warm_up(
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the images with depth, pixels.")] = "640x480",
+) -> None:
+    """Compile what runs with default settings need, into the cache; takes some minutes once."""
+    width, height = parse_size(size)
+
+    from vggtgeo.slam.global_map.compile_ahead import compile_before_runs
+    from vggtgeo.slam.settings.slam_settings import SlamSettings
+
+    compile_before_runs(SlamSettings(), width, height)

@@ -26,9 +26,8 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.output_checks import check_checkpoint_path
+from vggtgeo.results.output_checks import EVERY, check_checkpoint_path
 from vggtgeo.results.summary import versions
-from vggtgeo.results.unfinished import EVERY
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam

@@ -33,6 +33,7 @@ from vggtgeo.results.files import (
     write_trajectories,
     write_uncertainty,
 )
+from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.reread_frames import depth_of_frames
 from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
 from vggtgeo.results.scene import write_scene
@@ -44,7 +45,6 @@ from vggtgeo.results.summary import (
     summarise,
     summary_error,
 )
-from vggtgeo.results.unfinished import unfinished_message
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import merge_pending_window

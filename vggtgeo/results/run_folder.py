@@ -25,8 +25,7 @@ from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.results.checkpoints import frames_kept
-from vggtgeo.results.output_checks import NAMES, NOTE, check_output
-from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED
+from vggtgeo.results.output_checks import CHECKPOINT, NAMES, NOTE, SUMMARY, UNFINISHED, check_output
 
 RESERVE = 96 * 2**20
 """Bytes reserved on the disk until the results are written: a map of 500,000 points (14 MB), a mesh of a million faces
