@@ -15,9 +15,9 @@ from conftest import ROOT
 from reported import raises
 
 from vggtgeo.benchmark.cluster import Cluster, run_remotely
+from vggtgeo.benchmark.jobs import Store
 from vggtgeo.benchmark.processes import Limits, claim_cores
 from vggtgeo.benchmark.runner import all_rows
-from vggtgeo.benchmark.store import Store
 
 LIMITS = Limits(60.0, 2.0)
 SCRIPT = """
@@ -72,7 +72,7 @@ def test_a_driver_that_dies_goes_on_where_it_was(tmp_path: Path) -> None:
         f"import sys; sys.path[:0] = [{str(ROOT / 'tests' / 'helpers')!r}, {str(ROOT)!r}]\n"
         "import tiny_suites as tiny\nfrom pathlib import Path\nfrom test_bench_cluster import LIMITS, command\n"
         "from vggtgeo.benchmark.cluster import Cluster\nfrom vggtgeo.benchmark.runner import all_rows\n"
-        "from vggtgeo.benchmark.store import Store\n"
+        "from vggtgeo.benchmark.jobs import Store\n"
         f"store = Store(Path({str(tmp_path / 'wild')!r}), 't', 's')\n"
         "all_rows(tiny.jobs(), store, LIMITS, cluster=Cluster('local'), command=command)\n"
     )

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import tiny_suites as tiny
 
+from vggtgeo.benchmark.jobs import Store
 from vggtgeo.benchmark.processes import Limits, run_limited, shares
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.runner import all_rows
-from vggtgeo.benchmark.store import Store
 from vggtgeo.io.errors import InputError
 
 LIMITS = Limits(seconds=20.0, memory_gb=2.0)

@@ -6,7 +6,6 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import pytest
 import typer
 from conftest import ROOT
 from typer.testing import CliRunner

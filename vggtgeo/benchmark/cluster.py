@@ -17,11 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.benchmark.jobs import Job
+from vggtgeo.benchmark.jobs import Job, Store
 from vggtgeo.benchmark.processes import Limits, claim_cores, run_limited
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.scheduling import Command, Finished, check_space, describe_ending, worker_command
-from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import JOB, LOG, ROW
 from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path

@@ -9,10 +9,11 @@ import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
+from vggtgeo.benchmark.suite import WalkTable
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence, without_depth
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import is_there
@@ -23,6 +24,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
+from vggtgeo.io.locks import locked
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry
 from vggtgeo.models.roles import InitialGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
@@ -75,7 +77,7 @@ class Input:
 
     sequence: Sequence
     perception: Perception
-    exact: ExactFrames | None = None
+    exact: SimulatedOracle | RecordedFrames | None = None
     scan: TanksAndTemples | None = None
     simulated: bool = False
     references: Mapping[str, Trajectory] = field(default_factory=dict)
@@ -102,21 +104,18 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
             scan.scanned_points()
         references = {name: Trajectory.load_tum(Path(spec["path"]) / file) for name, file in spec["references"].items()}
         return Input(sequence, _perceived(spec, sequence.has_depth), exact, scan, references=references)
-    rendered = _rendered(spec["simulate"], seed, scratch)
+    rendered, is_plain = _rendered(spec["simulate"], seed, scratch), spec["degrade"] == "base"
     if spec["perception"] == "simulated":
-        if spec["degrade"] != "base":
+        if not is_plain:
             raise InputError(
                 f"`degrade` is {spec['degrade']!r}, but simulated roles use the undegraded images; leave it out, or "
                 "use other roles"
             )
-        return Input(
-            rendered, Perception(simulated_roles(rendered.oracle, spec, seed), {}), rendered.oracle, simulated=True
-        )
-    if spec["degrade"] == "base":
-        sequence = _without(rendered, spec)
-        return Input(sequence, _perceived(spec, sequence.has_depth), rendered.oracle, simulated=True)
-    sequence = _without(degraded(rendered, spec["degrade"], seed), spec)
-    return Input(sequence, _perceived(spec, sequence.has_depth), simulated=True)
+        roles = Perception(simulated_roles(rendered.oracle, spec, seed), {})
+        return Input(rendered, roles, rendered.oracle, simulated=True)
+    sequence = _without(rendered if is_plain else degraded(rendered, spec["degrade"], seed), spec)
+    exact = rendered.oracle if is_plain else None
+    return Input(sequence, _perceived(spec, sequence.has_depth), exact, simulated=True)
 
 
 def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
@@ -126,24 +125,25 @@ def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
 
 def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> RenderedWalk:
     """Return the walk of a suite's table `simulate`, from the scratch folder or rendered (0.25 s a frame)."""
-    kept = None if scratch is None else scratch / walk_name(table, seed)
-    if kept is not None and kept.is_file():
-        with kept.open("rb") as stream:
-            walk: RenderedWalk = pickle.load(stream)  # safe: written below, in a folder private to this user
-        return walk
-    options = {**table}
-    scene, frames = options.pop("scene", "office"), options.pop("frames", 60)
-    size = tuple(options.pop("size", (640, 480)))
-    try:
-        oracle = SimulatedOracle(simulate(scene, frames, seed, size, **options), kept=frames)
-    except TypeError as error:
-        raise InputError(f"`simulate` in the suite: {error}") from None
-    recording = Recording(list(oracle.frames()), oracle.camera, oracle.ground_truth())
-    walk = RenderedWalk(oracle.name, recording, oracle)
-    if kept is not None:
-        with atomic_open(kept, "wb") as stream:
-            pickle.dump(walk, stream, pickle.HIGHEST_PROTOCOL)
+    if scratch is None:
+        return _render(table, seed)
+    kept = scratch / walk_name(table, seed)
+    with locked(kept.with_suffix(".lock"), timeout=-1):  # of the runs on one walk, one renders it
+        if not kept.is_file():
+            with atomic_open(kept, "wb") as stream:
+                pickle.dump(_render(table, seed), stream, pickle.HIGHEST_PROTOCOL)
+    with kept.open("rb") as stream:
+        walk: RenderedWalk = pickle.load(stream)  # safe: written above, in a folder private to this user
     return walk
+
+
+def _render(table: Mapping[str, Any], seed: int) -> RenderedWalk:
+    asked = WalkTable(**table)
+    size = asked.size[0], asked.size[1]
+    rendered = simulate(asked.scene, asked.frames, seed, size, rate=asked.rate, speed=asked.speed)
+    oracle = SimulatedOracle(rendered, kept=asked.frames)
+    recording = Recording(list(oracle.frames()), oracle.camera, oracle.ground_truth())
+    return RenderedWalk(oracle.name, recording, oracle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,26 +229,6 @@ _DELAY = 0.005
 """Largest time between a frame and its true pose, seconds: rendered ones are simultaneous."""
 
 
-@runtime_checkable
-class ExactFrames(Protocol):
-    """Exact depth and poses by the frame's index in the sequence."""
-
-    @property
-    def camera(self) -> Camera:
-        """Pinhole camera."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def depth(self, index: int) -> np.ndarray:
-        """Return the true depth, float64 [H, W], metres, NaN = unknown."""
-        ...
-
-    def pose(self, index: int) -> np.ndarray:
-        """Return the true pose, world -> camera, float64 [4, 4]; NaN if unknown."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class RecordedFrames:
     """Exact frames of a recording whose depth files are exact."""
@@ -289,6 +269,10 @@ class RecordedFrames:
         times = np.array([] if frame is None else [frame.timestamp])
         _, rows = nearest_in_time(times, self.truth.timestamps, _DELAY)
         return rigid.invert(self.truth.poses[rows])[0] if len(rows) else np.full((4, 4), np.nan)
+
+
+ExactFrames = SimulatedOracle | RecordedFrames
+"""Exact depth and poses by the frame's index in the sequence."""
 
 
 def exact_cloud(frames: ExactFrames, max_frames: int = 30, step: int = 4) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,23 +15,24 @@ import numpy as np
 from vggtgeo.benchmark import markdown
 from vggtgeo.benchmark.cells import COMPARED, finished, is_covered
 from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
-from vggtgeo.benchmark.external import external_rows, warn_of_missing
 from vggtgeo.benchmark.figures import ablation_figure
 from vggtgeo.benchmark.inputs import data_folders
-from vggtgeo.benchmark.jobs import Job, jobs_of
+from vggtgeo.benchmark.jobs import Job, Store, jobs_of
+from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.page import write_page
 from vggtgeo.benchmark.processes import Limits
-from vggtgeo.benchmark.provenance import source_digest
+from vggtgeo.benchmark.provenance import input_hash, source_digest
 from vggtgeo.benchmark.scheduling import run_jobs
-from vggtgeo.benchmark.store import Store
-from vggtgeo.benchmark.suite import Suite, load_suite, restrict
+from vggtgeo.benchmark.suite import ExternalTable, Suite, load_suite, restrict
 from vggtgeo.benchmark.table import LESS_BASELINE, Row, as_csv, write_parquet
+from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets.image_files import is_there
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import evaluate_trajectory, followed
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
 from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import locked_folder
@@ -140,12 +142,8 @@ def bench(
     """
     chosen = suite if isinstance(suite, Suite) else load_suite(path_of("suite", suite))
     chosen = restrict(chosen, _names("sequences", sequences), _names("settings", settings), seeds, first_seed, frames)
-    chosen = replace(
-        chosen,
-        recordings=chosen.recordings if recordings is None else recordings,
-        timeout_minutes=chosen.timeout_minutes if timeout_minutes is None else timeout_minutes,
-        memory_gb=chosen.memory_gb if memory_gb is None else memory_gb,
-    )
+    overrides: dict[str, Any] = {"recordings": recordings, "timeout_minutes": timeout_minutes, "memory_gb": memory_gb}
+    chosen = replace(chosen, **{name: value for name, value in overrides.items() if value is not None})
     folder = path_of("output", output)
     _check_output(folder)
     if workers < 1:
@@ -212,6 +210,54 @@ def _names(what: str, names: Iterable[str] | None) -> tuple[str, ...] | None:
     if isinstance(names, str):  # a text would be iterated by characters
         raise InputError(f"`{what}` must be a list of names, as [{names!r}], got {names!r}")
     return None if names is None else tuple(names)
+
+
+def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> list[Row]:
+    """Return a row for each existing file of `[[external]]`; `files` is relative to the folder `base`.
+
+    The ground truth is that of a run on the same sequence and seed (in `runs`), or of the recording.
+    """
+    found: list[Row] = []
+    for table in suite.external:
+        places: dict[Path, Job] = {}
+        for job in jobs:
+            file = base / table.file(job.sequence, job.seed)
+            if is_there(file):
+                places.setdefault(file, job)
+        found += [_external_row(suite, table, job, file, runs) for file, job in places.items()]
+    return found
+
+
+def warn_of_missing(suite: Suite, jobs: Sequence[Job], base: Path) -> None:
+    """Warn of each `[[external]]` without any file, before the runs begin."""
+    for table in suite.external:
+        files = list(dict.fromkeys(base / table.file(job.sequence, job.seed) for job in jobs))
+        if files and not any(map(is_there, files)):
+            more = f", nor any other of {len(files)} files" if len(files) > 1 else ""
+            text = f"external `{table.name}` has no trajectory: `{files[0]}` does not exist{more}"
+            warnings.warn(text, InputWarning, stacklevel=2)
+
+
+def _external_row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -> Row:
+    row = {"suite": suite.name, "sequence": job.sequence, "setting": table.name, "seed": job.seed}
+    row |= {"external": str(file), "input_hash": input_hash(file), "metric": table.metric}
+    row |= {"protocol": job.spec["protocol"], "status": "ok", "simulated": bool(job.spec["simulate"])}
+    try:
+        truth = _truth(job, runs)
+        errors, _ = trajectory_errors(load_trajectory(file, truth), truth, table.metric, vertical=job.spec["vertical"])
+    except InputError as error:
+        return {**row, "status": "error", "message": str(error)}
+    return {**row, **errors}
+
+
+def _truth(job: Job, runs: Path) -> Trajectory:
+    kept = sorted(runs.glob(f"{job.sequence}.*.{job.seed}/truth.txt"))
+    if kept:
+        return Trajectory.load_tum(kept[0])
+    truth = open_sequence(job.spec["path"], job.spec["kind"]).ground_truth() if job.spec["path"] else None
+    if truth is None:
+        raise InputError("the sequence has no ground truth")
+    return truth
 
 
 def subtract_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row]:

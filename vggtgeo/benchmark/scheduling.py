@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import os
+import queue
 import shutil
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.inputs import walk_name
-from vggtgeo.benchmark.jobs import Job
+from vggtgeo.benchmark.jobs import Job, Store
 from vggtgeo.benchmark.processes import Ending, Limits, run_limited, shares
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.table import Row
 from vggtgeo.benchmark.worker import LOG, NO_SPACE
 from vggtgeo.io.errors import InputError
@@ -25,7 +26,6 @@ from vggtgeo.io.errors import InputError
 Command = Callable[[Path, Path], Sequence[str]]
 """Returns the command line of a run for its folder and the scratch folder."""
 Finished = Callable[[Job, Row], None]
-_WAIT = 0.1
 _FULL = "no space"  # in place of a status: no row is written
 _TAIL = 2000  # characters at the end of a log that are searched for its last line
 
@@ -49,32 +49,35 @@ def run_jobs(
     of `finished`, all processes are ended; finished runs are stored.
     """
     with _scratch(store.folder) as scratch:
-        queue = _Queue(list(jobs), scratch)
-        stop = threading.Event()
+        walks = [walk_name(job.spec["simulate"], job.seed) for job in jobs if job.spec["simulate"]]
+        needed, lock, stop = Counter(walks), threading.Lock(), threading.Event()
+        free: queue.SimpleQueue[tuple[int, ...]] = queue.SimpleQueue()
+        for cores in shares(workers):
+            free.put(cores)
 
-        def work(cores: Sequence[int]) -> None:
-            while (job := queue.take(stop)) is not None:
-                try:
-                    row = run_one(job, store, limits, cores, command, scratch, stop)
-                finally:
-                    queue.give_back(job)
+        def work(job: Job) -> None:
+            cores = free.get()
+            try:
+                row = run_one(job, store, limits, cores, command, scratch, stop)
+            finally:
+                free.put(cores)
+            with lock:
+                if job.spec["simulate"]:
+                    name = walk_name(job.spec["simulate"], job.seed)
+                    needed[name] -= 1
+                    if not needed[name]:
+                        (scratch / name).unlink(missing_ok=True)
                 if finished is not None:
-                    with queue.changed:
-                        finished(job, row)
+                    finished(job, row)
 
         with ThreadPoolExecutor(workers) as pool:
-            futures = [pool.submit(work, cores) for cores in shares(workers)]
             try:
-                while not all(future.done() for future in futures):
-                    time.sleep(_WAIT / 5)
-                    if any(future.done() and future.exception() for future in futures):
-                        break
-            finally:
-                if not all(future.done() and not future.exception() for future in futures):
-                    stop.set()
-            errors = [error for future in futures if (error := future.exception()) is not None]
-            if errors:  # KeyboardInterrupt may be that of workers stopped because of another error
-                raise min(errors, key=lambda error: isinstance(error, KeyboardInterrupt))
+                for future in as_completed([pool.submit(work, job) for job in jobs]):
+                    future.result()
+            except BaseException:
+                stop.set()
+                pool.shutdown(cancel_futures=True)
+                raise
 
 
 def run_one(
@@ -136,41 +139,3 @@ def _scratch(folder: Path) -> Iterator[Path]:
         yield place
     finally:
         shutil.rmtree(place, ignore_errors=True)
-
-
-class _Queue:
-    """Jobs in order; of those that share a rendered walk, the first renders it while the others wait."""
-
-    def __init__(self, jobs: list[Job], scratch: Path) -> None:
-        self._waiting = jobs
-        self._running: list[Job] = []
-        self._scratch = scratch
-        self.changed = threading.Condition(threading.RLock())
-
-    def take(self, stop: threading.Event) -> Job | None:
-        """Return the next job that can run; None if no job is left, or after a stop."""
-        with self.changed:
-            while self._waiting and not stop.is_set():
-                for job in self._waiting:
-                    if self._can_run(job):
-                        self._waiting.remove(job)
-                        self._running.append(job)
-                        return job
-                self.changed.wait(_WAIT)
-            return None
-
-    def give_back(self, job: Job) -> None:
-        """Mark a job as ended; delete its walk if no other job needs it."""
-        with self.changed:
-            self._running.remove(job)
-            walk = self._walk(job)
-            if walk is not None and not any(self._walk(other) == walk for other in self._waiting + self._running):
-                walk.unlink(missing_ok=True)
-            self.changed.notify_all()
-
-    def _can_run(self, job: Job) -> bool:
-        walk = self._walk(job)
-        return walk is None or walk.is_file() or not any(self._walk(other) == walk for other in self._running)
-
-    def _walk(self, job: Job) -> Path | None:
-        return self._scratch / walk_name(job.spec["simulate"], job.seed) if job.spec["simulate"] else None

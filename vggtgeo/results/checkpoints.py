@@ -66,7 +66,7 @@ class Checkpoints:
     def __post_init__(self) -> None:
         path_of("path", self.path)
         check_real("checkpoint-every", self.every, "seconds, at least 0")
-        if not (math.isfinite(self.every) and self.every >= 0):
+        if not 0 <= self.every < math.inf:
             raise InputError(f"`checkpoint-every` must be seconds, at least 0, got {self.every:g}")
 
 
@@ -117,8 +117,7 @@ class RunSoFar:
     def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
         """Add the checkpoint's counts to `refusals`."""
         for role, counts in self.refused.items():
-            for entry, value in zip(dataclasses.fields(Refusals), counts, strict=True):
-                setattr(refusals[role], entry.name, value)
+            vars(refusals[role]).update(vars(Refusals(*counts)))
 
 
 KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, FrameEvidence, WindowRecord)
@@ -176,14 +175,9 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
 
 def _header(path: Path) -> dict[str, Any]:
     try:
-        found = CHECKPOINT.facts(path)
+        return CHECKPOINT.facts(path)
     except InputError as error:
         raise InputError(f"{error}; start again with `--no-resume`") from None
-    types = {"identity": dict, "frames": int, "last": int, "digest": str}
-    valid = found.keys() == types.keys() and all(type(found[name]) is kind for name, kind in types.items())
-    if not valid or not all(type(value) is str for value in found["identity"].values()):
-        raise InputError(f"`{path}` contains no run; start again with `--no-resume`")
-    return found
 
 
 def _excerpt(value: str | None) -> str:
@@ -237,7 +231,7 @@ class CheckpointWriter:
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="checkpoint"))
     _writing: Future[float] | None = None
     _next: float = 0.0
-    _kept: int = 0
+    _written: bool = False
     _failed: bool = False
 
     def __post_init__(self) -> None:
@@ -253,7 +247,7 @@ class CheckpointWriter:
     def on_end(self, slam: Slam, frame: Frame | None) -> None:
         """Write a checkpoint after the last frame, if the run was long enough for an earlier one."""
         self._wait()
-        if self._kept and frame is not None and not self._failed:
+        if self._written and frame is not None and not self._failed:
             self._begin(slam, frame)
 
     def close(self) -> None:
@@ -266,8 +260,7 @@ class CheckpointWriter:
             self._ended(self._writing)
 
     def _begin(self, slam: Slam, frame: Frame) -> None:
-        so_far = self.gather(slam)
-        self._writing = self._pool.submit(self._write, so_far, frame)
+        self._writing = self._pool.submit(self._write, self.gather(slam), frame)
 
     def _write(self, so_far: RunSoFar, frame: Frame) -> float:
         """Write the file, once a window that is being adjusted is done; return the processor time, s."""
@@ -286,5 +279,5 @@ class CheckpointWriter:
             self._failed = True
             self.message(f"cannot write the checkpoint `{self.asked.path}`, this run cannot be resumed: {error}")
             return
-        self._kept += 1
+        self._written = True
         self._next = time.monotonic() + (max(self.asked.every, took / SHARE) if self.asked.every else 0.0)

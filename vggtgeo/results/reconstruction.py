@@ -256,28 +256,21 @@ def _calibrate(
         return None
     end = start + count * stride
     refused = {role: replace(counts) for role, counts in perception.refusals.items()}
+
+    def progress(passes: int, done: int | None) -> None:
+        name = f"camera calibration, pass {passes}"
+        if not done:
+            hooks.each("on_stage", f"{name}: adjusting" if done is None else f"{name} of at most {MAX_PASSES}")
+        if done is not None:
+            hooks.each("on_stage_frame", done, count)
+
     with hooks.clock.measure("self-calibration"), stop.at_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         frames = lambda: source.frames.frames(start, end, stride)
-        found = self_calibrate(
-            frames,
-            source.camera,
-            perception.roles,
-            settings,
-            lambda passes, done: _calibrating(hooks, passes, done, count),
-        )
+        found = self_calibrate(frames, source.camera, perception.roles, settings, progress)
     for role, counts in refused.items():
         vars(perception.refusals[role]).update(vars(counts))
     return found
-
-
-def _calibrating(hooks: RunCallbacks, passes: int, done: int | None, count: int) -> None:
-    """Report the progress of self-calibration, see `self_calibrate`."""
-    name = f"camera calibration, pass {passes}"
-    if not done:
-        hooks.each("on_stage", f"{name}: adjusting" if done is None else f"{name} of at most {MAX_PASSES}")
-    if done is not None:
-        hooks.each("on_stage_frame", done, count)
 
 
 def _without_overlay(

@@ -43,7 +43,6 @@ from vggtgeo.results.summary import (
     load_poses,
     read_summary,
     summarise,
-    summary_error,
 )
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
@@ -161,14 +160,10 @@ class Result:
     def load(cls, folder: str | os.PathLike[str]) -> Self:
         """Load the folder of `Result.save` or `vggtgeo run`; raise InputError if a file is missing or invalid."""
         place = path_of("folder", folder)
-        unfinished = unfinished_message(place)
-        if unfinished:
+        if unfinished := unfinished_message(place):
             warnings.warn(unfinished, InputWarning, stacklevel=2)
         summary, verdict = read_summary(place)
-        try:
-            fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
-        except (KeyError, TypeError, ValueError) as error:
-            raise summary_error(place, error) from None
+        fx, fy, cx, cy = summary["intrinsics"].values()
         return cls(
             load_poses(place, "trajectory.txt"),
             load_poses(place, "keyframes.txt"),
