@@ -26,7 +26,6 @@ def test_summaries_are_those_of_the_textbook() -> None:
     assert not Summary.of(np.zeros(3)).differs
     one = Summary.of(np.array([5.0]))
     assert (one.mean, np.isnan(one.half), one.differs) == (5.0, True, False)
-    assert cells.number_cell(one, 2) == "5.00"
 
 
 def test_differences_are_taken_run_by_run() -> None:

@@ -343,25 +343,6 @@ def test_rotation_angle_is_accurate_at_both_ends() -> None:
     assert np.abs(found - angles).max() < 1e-14 * 100, f"off by {np.abs(found - angles)}"
 
 
-def test_direction_error_knows_no_scale() -> None:
-    # Proves that the error of direction is the same at any scale, and NaN where the camera stood. Oracle: invariance.
-    truth, estimate = _truth(), _estimate(_truth())
-    found = [
-        relative_error(Trajectory(truth.timestamps, _scaled(estimate.poses, scale)), truth).direction
-        for scale in (1.0, 9.0)
-    ]
-    np.testing.assert_allclose(found[0], found[1], atol=1e-12)
-    assert np.median(found[0]) < 0.8
-    still = Trajectory(truth.timestamps, np.tile(np.eye(4), (len(truth), 1, 1)))
-    assert np.isnan(relative_error(still, truth).direction).all()
-
-
-def _scaled(poses: np.ndarray, scale: float) -> np.ndarray:
-    result = poses.copy()
-    result[:, :3, 3] *= scale
-    return result
-
-
 def test_a_delta_beyond_the_trajectory_gives_no_pairs() -> None:
     # Proves that a delta longer than the trajectory is nothing to measure, not a crash; the report has None for it.
     truth = _truth(10)

@@ -8,7 +8,6 @@ from textwrap import wrap
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from vggtgeo.benchmark import cells
@@ -16,8 +15,7 @@ from vggtgeo.benchmark.suite import Suite
 from vggtgeo.benchmark.table import Row, Summary, select, values
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import align, associate
-from vggtgeo.figures.plots import NotebookFigure, view_axes
-from vggtgeo.figures.style import BLUE, INK, ORANGE, RULE, line_colour, style
+from vggtgeo.figures.plots import BLUE, INK, ORANGE, RULE, NotebookFigure, line_colour, style, view_axes
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -49,7 +47,6 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
     rows_of = {name: [_wrapped(label(name, key), _LABEL) for key in keys] for name, keys in panels.items()}
     heights = [_height(labels) + _MARGIN for labels in rows_of.values()]
     figure = NotebookFigure(figsize=(width, sum(heights) + 0.5 if panels else 1.5), layout="constrained")
-    FigureCanvasAgg(figure)
     if not panels:
         return figure
     drawn = figure.subplots(len(panels), 1, height_ratios=heights, squeeze=False)[:, 0]
@@ -151,7 +148,6 @@ def _truth_file(place: Path, folder: Path, sequence: str, seed: object) -> Path:
 def paths_figure(given: Sequence[Path3], width: float = 5.0) -> NotebookFigure:
     """Draw the paths from above, with the truth, and the error along the time."""
     figure = NotebookFigure(figsize=(width, 1.25 * width), layout="constrained")
-    FigureCanvasAgg(figure)
     above, along = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
     view, origin = view_axes(given[0].truth, level_world=True), given[0].truth.positions[0]
     flat = lambda trajectory: ((trajectory.positions - origin) @ view.T)[:, :2].T
@@ -188,7 +184,6 @@ def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> Notebo
         name for name in sorted(names, key=lambda name: -totals[name]) if totals[name] > 0.01 * sum(totals.values())
     ]
     figure = NotebookFigure(figsize=(width, _height([name for name, _ in groups]) + 1.6), layout="constrained")
-    FigureCanvasAgg(figure)
     time, memory = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
     left = np.zeros(len(groups))
     for number, name in enumerate(stages):

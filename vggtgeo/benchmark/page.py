@@ -21,6 +21,8 @@ def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> N
     good = cells.finished(rows)
     there = [row for row in rows if row["status"] != "absent"]
     has_error = cells.summary_of(good, figures.headline(good)).count > 0
+    versions = sorted({name for row in rows for name in row if name.startswith("version_")})
+    names = ("version", "commit", "source", "machine", *versions)
     text = template("vggtgeo.benchmark", "page.html.j2").render(
         style=style(),
         title=suite.title,
@@ -32,13 +34,22 @@ def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> N
         compared=[column.head for column in cells.COMPARED],
         differences=cells.differences(suite, good),
         ablations=svg(figures.ablation_figure(suite, good, 7.5)) if has_error else None,
-        sequences=[_sequence(suite, there, name, folder) for name in cells.sequences_of(suite, good)],
+        sequences=[
+            {
+                "name": name,
+                "figure": svg(figures.paths_figure(drawn))
+                if (drawn := figures.paths(suite, good, name, folder))
+                else None,
+                "tables": _details(suite, there, name),
+            }
+            for name in cells.sequences_of(suite, good)
+        ],
         cost=svg(figures.cost_figure(suite, good, 7.5)) if any("frames" in row for row in good) else None,
         runs=[_run(suite, row, folder) for row in rows],
         broken=[row for row in rows if row["status"] not in ("ok", "absent")],
         absent=sorted({row["sequence"] for row in rows if row["status"] == "absent"}),
         published=[published(name) for name in suite.published],
-        provenance=_provenance(rows),
+        provenance=[(name.removeprefix("version "), text) for name, text in cells.provenance(rows, names)],
     )
     write_text(path, text)
 
@@ -63,15 +74,6 @@ def _accuracy_tables(suite: Suite, rows: Sequence[Row]) -> list[dict[str, Any]]:
         for column, lines in both.items()
         if any(cell.text for _, line in lines for cell in line)
     ]
-
-
-def _sequence(suite: Suite, rows: Sequence[Row], name: str, folder: Path) -> dict[str, Any]:
-    given = figures.paths(suite, cells.finished(rows), name, folder)
-    return {
-        "name": name,
-        "figure": svg(figures.paths_figure(given)) if given else None,
-        "tables": _details(suite, rows, name),
-    }
 
 
 def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> list[dict[str, Any]]:
@@ -108,13 +110,3 @@ def _run(suite: Suite, row: Row, folder: Path) -> dict[str, Any]:
         "setting": suite.title_of(str(row["setting"])),
         "links": there,
     }
-
-
-def _provenance(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    names = sorted({name for row in rows for name in row if name.startswith("version_")})
-    found = []
-    for name in ("version", "commit", "source", "machine", *names):
-        values = [str(value) for value in dict.fromkeys(row.get(name) for row in rows) if value]
-        if values:
-            found.append((name.removeprefix("version_").replace("_", " "), ", ".join(values)))
-    return found

@@ -37,12 +37,9 @@ class LimitOptions:
     workers: Annotated[int, typer.Option(min=1, help="Processes; the processors are shared out.")] = 1
     timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None
     memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None
-    retry: Annotated[bool, typer.Option("--retry/--no-retry", help="Run again what ended without a result.")] = False
+    retry: Annotated[bool, typer.Option(help="Run again what ended without a result.")] = False
     recordings: Annotated[
-        bool | None,
-        typer.Option(
-            "--recordings/--no-recordings", help="A file run.rrd of each run, for Rerun.", show_default="the suite's"
-        ),
+        bool | None, typer.Option(help="A file run.rrd of each run, for Rerun.", show_default="the suite's")
     ] = None
 
 
@@ -71,7 +68,7 @@ def bench(
     runs: SelectionOptions,
     limits: LimitOptions,
     ray: ClusterOptions,
-    quiet: Annotated[bool, typer.Option("--quiet/--no-quiet", help="Print the tables only.")] = False,
+    quiet: Annotated[bool, typer.Option(help="Print the tables only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a suite of sequences, settings and seeds, and write its tables and its page.
@@ -93,17 +90,8 @@ def bench(
         report = run_suite(
             suite,
             folder,
-            data=runs.data,
-            sequences=_list(runs.sequences),
-            settings=_list(runs.settings),
-            seeds=runs.seeds,
-            first_seed=runs.first_seed,
-            frames=runs.frames,
-            workers=limits.workers,
-            timeout_minutes=limits.timeout_minutes,
-            memory_gb=limits.memory_gb,
-            retry=limits.retry,
-            recordings=limits.recordings,
+            **{**vars(runs), "sequences": _list(runs.sequences), "settings": _list(runs.settings)},
+            **vars(limits),
             progress=bar.advance,
             cluster=Cluster(ray.address, ray.cpus, ray.gpus) if ray.engine == "ray" else None,
         )

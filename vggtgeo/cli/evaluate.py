@@ -36,9 +36,7 @@ class PairOptions:
     unit: Annotated[
         Literal["poses", "seconds", "metres"], typer.Option(help="Of --delta: poses, seconds, or metres of true path.")
     ] = "poses"
-    all_pairs: Annotated[
-        bool, typer.Option("--all-pairs/--no-all-pairs", help="Overlapping pairs for RPE, not consecutive ones.")
-    ] = False
+    all_pairs: Annotated[bool, typer.Option(help="Overlapping pairs for RPE, not consecutive ones.")] = False
 
 
 @dataclass(frozen=True)
@@ -50,11 +48,7 @@ class ComparisonOptions:
     ] = "z"
     time_offset: Annotated[float, typer.Option(help="Seconds to add to the times of GT (its clock is late).")] = 0.0
     estimate_offset: Annotated[
-        bool,
-        typer.Option(
-            "--estimate-offset/--no-estimate-offset",
-            help="Report the errors without the estimated offsets of clock and body, too.",
-        ),
+        bool, typer.Option(help="Report the errors without the estimated offsets of clock and body, too.")
     ] = False
 
 

@@ -160,23 +160,16 @@ class ExportOptions:
     """Weights and shape of the exported network."""
 
     checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None
-    random_weights: Annotated[
-        bool,
-        typer.Option("--random-weights/--no-random-weights", help="For tests and timing: random weights."),
-    ] = False
+    random_weights: Annotated[bool, typer.Option(help="For tests and timing: random weights.")] = False
     height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None
     width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None
     views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None
     tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None
     variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None
     allow_extra_weights: Annotated[
-        bool,
-        typer.Option(
-            "--allow-extra-weights/--no-allow-extra-weights",
-            help="Leave out weights of the checkpoint that the network has no place for.",
-        ),
+        bool, typer.Option(help="Leave out weights of the checkpoint that the network has no place for.")
     ] = False
-    half: Annotated[bool, typer.Option("--half/--no-half", help="Attention and perceptrons in float16.")] = False
+    half: Annotated[bool, typer.Option(help="Attention and perceptrons in float16.")] = False
 
 
 @with_option_groups

@@ -41,13 +41,10 @@ class InputOptions:
     end: Annotated[int | None, typer.Option(min=1, help="Frame to stop before.")] = None
     stride: Annotated[int, typer.Option(min=1, help="Take every n-th frame.")] = 1
     fps: Annotated[
-        float | None,
-        typer.Option("--fps", help="Frames per second of a video or a folder of images, instead of the file's."),
+        float | None, typer.Option(help="Frames per second of a video or a folder of images, instead of the file's.")
     ] = None
     intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels, instead of the folder's.")] = None
-    rgb_only: Annotated[
-        bool, typer.Option("--rgb-only/--no-rgb-only", help="Ignore depth images: the scale stays free.")
-    ] = False
+    rgb_only: Annotated[bool, typer.Option(help="Ignore depth images: the scale stays free.")] = False
     depth_scale: Annotated[
         float | None,
         typer.Option(help="Units per metre of depth files, instead of their layout's: 1000 is millimetres."),
@@ -62,11 +59,7 @@ class SwitchOptions:
         bool, typer.Option("--no-lines/--use-lines", help="Leave out residuals of lines: an ablation.")
     ] = False
     depth_prior: Annotated[
-        bool,
-        typer.Option(
-            "--depth-prior/--no-depth-prior",
-            help="Depth holds the estimate; without it, it starts it only: an ablation.",
-        ),
+        bool, typer.Option(help="Depth holds the estimate; without it, it starts it only: an ablation.")
     ] = True
     no_confidence: Annotated[
         bool, typer.Option("--no-confidence/--use-confidence", help="All matches weigh the same: an ablation.")
@@ -98,8 +91,8 @@ class PerceptionOptions:
             help="Implementation of the perception roles: classical code, or networks (see `vggtgeo models list`)."
         ),
     ] = "classical"
-    models: Annotated[Path | None, typer.Option("--models", help="Folder of the networks' files.")] = None
-    cache: Annotated[Path | None, typer.Option("--cache", help="Folder for cached outputs of the networks.")] = None
+    models: Annotated[Path | None, typer.Option(help="Folder of the networks' files.")] = None
+    cache: Annotated[Path | None, typer.Option(help="Folder for cached outputs of the networks.")] = None
     provider: Annotated[Provider, typer.Option(help="Where networks run.")] = "auto"
     memory_limit_gb: Annotated[
         float | None, typer.Option(help="Most GPU memory of each network, GB; has no effect on the CPU.")
@@ -144,14 +137,11 @@ class ResultOptions:
             "as measured; none, points alone; auto, as measured, else mvs."
         ),
     ] = "auto"
-    save_depth: Annotated[
-        bool, typer.Option("--save-depth/--no-save-depth", help="Write each keyframe's dense depth.")
-    ] = False
+    save_depth: Annotated[bool, typer.Option(help="Write each keyframe's dense depth.")] = False
     save_every_depth: Annotated[
         bool,
         typer.Option(
-            "--save-every-depth/--no-save-every-depth",
-            help="Write depth and picture of every frame; depth where no sensor has it: what near keyframes saw.",
+            help="Write depth and picture of every frame; depth where no sensor has it: what near keyframes saw."
         ),
     ] = False
     assignments: AssignmentsOption = None
@@ -160,15 +150,10 @@ class ResultOptions:
         Path | None,
         typer.Option("--map", help="Map of an earlier run (`--save-map`): frames are placed in it, and extend it."),
     ] = None
-    localise_only: Annotated[
-        bool,
-        typer.Option(
-            "--localise-only/--no-localise-only", help="Only place frames in the map of `--map`; it stays as it is."
-        ),
-    ] = False
-    save_map: Annotated[
-        Path | None, typer.Option("--save-map", help="File for the map, so that another run can go on in it.")
-    ] = None
+    localise_only: Annotated[bool, typer.Option(help="Only place frames in the map of `--map`; it stays as it is.")] = (
+        False
+    )
+    save_map: Annotated[Path | None, typer.Option(help="File for the map, so that another run can go on in it.")] = None
     pose_prior: Annotated[
         str | None,
         typer.Option(

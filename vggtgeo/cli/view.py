@@ -20,7 +20,7 @@ from vggtgeo.results.output_checks import EXPORTS, check_can_be_shown, check_is_
 def view(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that a run wrote.")],
     rerun: Annotated[str, typer.Option(metavar="TARGET", help="spawn, serve, or a file ending with .rrd.")] = "spawn",
-    page: Annotated[bool, typer.Option("--page/--no-page", help="Open the report and its 3D view.")] = False,
+    page: Annotated[bool, typer.Option(help="Open the report and its 3D view.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:

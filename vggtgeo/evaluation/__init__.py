@@ -1,9 +1,5 @@
 """Metrics of trajectories, depth and maps: functions on arrays and trajectories, without files or printing."""
 
-from vggtgeo.evaluation.absolute import AbsoluteError as AbsoluteError
-from vggtgeo.evaluation.absolute import ErrorStatistics as ErrorStatistics
-from vggtgeo.evaluation.absolute import absolute_error as absolute_error
-from vggtgeo.evaluation.alignment import ALIGNMENTS as ALIGNMENTS
 from vggtgeo.evaluation.alignment import Alignment as Alignment
 from vggtgeo.evaluation.alignment import Similarity as Similarity
 from vggtgeo.evaluation.alignment import align as align
@@ -25,11 +21,13 @@ from vggtgeo.evaluation.maps import surface_points as surface_points
 from vggtgeo.evaluation.offsets import Offsets as Offsets
 from vggtgeo.evaluation.offsets import estimate_offsets as estimate_offsets
 from vggtgeo.evaluation.offsets import shifted as shifted
-from vggtgeo.evaluation.relative import UNITS as UNITS
-from vggtgeo.evaluation.relative import RelativeError as RelativeError
-from vggtgeo.evaluation.relative import Unit as Unit
-from vggtgeo.evaluation.relative import relative_error as relative_error
-from vggtgeo.evaluation.relative import rotation_angle as rotation_angle
+from vggtgeo.evaluation.pose_errors import AbsoluteError as AbsoluteError
+from vggtgeo.evaluation.pose_errors import ErrorStatistics as ErrorStatistics
+from vggtgeo.evaluation.pose_errors import RelativeError as RelativeError
+from vggtgeo.evaluation.pose_errors import Unit as Unit
+from vggtgeo.evaluation.pose_errors import absolute_error as absolute_error
+from vggtgeo.evaluation.pose_errors import relative_error as relative_error
+from vggtgeo.evaluation.pose_errors import rotation_angle as rotation_angle
 from vggtgeo.evaluation.report import TrajectoryReport as TrajectoryReport
 from vggtgeo.evaluation.report import coverage as coverage
 from vggtgeo.evaluation.report import evaluate_trajectory as evaluate_trajectory

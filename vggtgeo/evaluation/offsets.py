@@ -14,15 +14,23 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
-from vggtgeo.evaluation.absolute import absolute_error
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check_trajectories
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
 from vggtgeo.evaluation.comparability import MAX_LEFT, comparability
-from vggtgeo.evaluation.interpolation import ContinuousTrajectory
-from vggtgeo.evaluation.offset_model import LEVEL, LEVER, MAX_OFFSET, TIME, TURN, UNKNOWNS, Fit, OffsetModel
+from vggtgeo.evaluation.offset_model import (
+    LEVEL,
+    LEVER,
+    MAX_OFFSET,
+    TIME,
+    TURN,
+    UNKNOWNS,
+    ContinuousTrajectory,
+    Fit,
+    OffsetModel,
+)
+from vggtgeo.evaluation.pose_errors import absolute_error
 from vggtgeo.evaluation.report import FEW_MATCHES
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.given import check_real
 
 _PARTS = {"time offset": TIME, "lever arm": LEVER, "rotation": TURN}
 
@@ -124,7 +132,6 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
         0.05
 
     """
-    check_trajectories(estimate, truth)
     plain = absolute_error(*associate(estimate, truth, max_dt), "sim3").statistics.rmse
     first, last = estimate.timestamps[[0, -1]]
     near = truth.select((truth.timestamps >= first - 2 * MAX_OFFSET) & (truth.timestamps <= last + 2 * MAX_OFFSET))
@@ -163,8 +170,6 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
 
 def shifted(estimate: Trajectory, truth: Trajectory, seconds: float) -> Trajectory:
     """Return the ground truth with `seconds` added to its times, and poses interpolated at the estimate's times."""
-    check_trajectories(estimate, truth)
-    check_real("seconds", seconds)
     times = truth.timestamps + seconds
     moved = Trajectory(times, truth.poses)
     if len(truth) < 2:

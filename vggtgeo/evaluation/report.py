@@ -6,16 +6,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
 from vggtgeo.evaluation.alignment import VERTICAL
 from vggtgeo.evaluation.association import (
     MAX_TIME_DIFFERENCE,
     associate,
-    check_trajectories,
     nearest_in_time,
     spans,
 )
-from vggtgeo.evaluation.relative import RelativeError, Unit, relative_error
+from vggtgeo.evaluation.pose_errors import AbsoluteError, RelativeError, Unit, absolute_error, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -164,7 +162,6 @@ def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = MAX_G
     If the ground truth itself has a larger interval, gaps of two of its intervals are allowed. NaN for a ground truth
     without duration.
     """
-    check_trajectories(estimate, truth)
     if len(truth) < 2:
         return float("nan")
     begin, end = truth.timestamps[[0, -1]]

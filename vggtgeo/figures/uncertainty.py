@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Ellipse
 
 from vggtgeo.bundle.analysis.covariances import Covariances
 from vggtgeo.bundle.analysis.observability_report import WEAK, Observability, lost_shares
 from vggtgeo.bundle.problem import State
-from vggtgeo.figures.plots import NotebookFigure
-from vggtgeo.figures.style import BLUE, INK, ORANGE, line_colour, style
+from vggtgeo.figures.plots import BLUE, INK, ORANGE, NotebookFigure, line_colour, style
 from vggtgeo.geometry import rigid
 
 _FACTORS = (1, 3, 10, 30, 100, 300, 1000)
@@ -40,7 +36,9 @@ def covariance_figure(
     extent = max(float(np.ptp(centres, axis=0).max()), 1e-6)
     seen = [factor for factor in _FACTORS if factor * half_axes.max() <= _MAX_SHARE * extent]
     factor = sigmas if sigmas is not None else (seen or _FACTORS)[-1 if seen else 0]
-    figure, axes = _figure(6.5, 4.4)
+    figure = NotebookFigure(figsize=(6.5, 4.4), layout="constrained")
+    axes = figure.subplots()
+    style(axes)
     for place, sizes, directions in zip(centres, half_axes, vectors, strict=True):
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
         size = 2 * factor * sizes[::-1]
@@ -64,7 +62,6 @@ def observability_figure(found: Observability) -> NotebookFigure:
     information about each common motion and the free intrinsics that is lost without each kind.
     """
     figure = NotebookFigure(figsize=(10.0, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[2, 3])
     shown = min(int(np.sum(found.free)), found.whole.values.shape[-1])
     floor = 0.1 * float(np.finfo(found.whole.values.dtype).eps)
@@ -92,11 +89,3 @@ def observability_figure(found: Observability) -> NotebookFigure:
     for axes in (left, right):
         style(axes)
     return figure
-
-
-def _figure(width: float, height: float) -> tuple[NotebookFigure, Any]:
-    figure = NotebookFigure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    style(axes)
-    return figure, axes

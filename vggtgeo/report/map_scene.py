@@ -11,10 +11,9 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from vggtgeo.evaluation import align, associate
@@ -24,6 +23,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.report.figures import jpeg
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
@@ -70,12 +70,12 @@ def pictured(keyframes: Sequence[Keyframe]) -> list[Pictured]:
     rows = np.unique(np.linspace(0, len(keyframes) - 1, min(MAX_KEYFRAMES, len(keyframes))).round().astype(int))
     return [
         Pictured(
-            f"frame {keyframes[row].frame}",
-            np.linalg.inv(keyframes[row].pose),
-            keyframes[row].timestamp,
-            _jpeg(keyframes[row].image),
+            f"frame {one.frame}",
+            np.linalg.inv(one.pose),
+            one.timestamp,
+            jpeg(one.image, _IMAGE_WIDTH, _IMAGE_QUALITY),
         )
-        for row in rows
+        for one in (keyframes[row] for row in rows)
     ]
 
 
@@ -225,12 +225,6 @@ def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> 
     x, y = cx / fx, cy / fy
     corners = length * np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]])
     return np.einsum("kij,cj->kci", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
-
-
-def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    scale = min(1.0, _IMAGE_WIDTH / image.shape[1])
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    return bytes(cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _IMAGE_QUALITY])[1])
 
 
 _GROWTH = 1.2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -36,33 +35,6 @@ VERDICT_LINES = {
 }
 _SAMPLE_WIDTH = 300
 """Pixels."""
-
-
-@dataclass(frozen=True)
-class Fact:
-    """A number at the top of the page."""
-
-    value: str
-    name: str
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Images of a keyframe as data URIs; depth and confidence may be None."""
-
-    name: str
-    image: str
-    depth: str | None
-    confidence: str | None
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Duration of a stage, s, and its share of the longest."""
-
-    name: str
-    seconds: float
-    share: float
 
 
 def write_page(
@@ -168,22 +140,23 @@ def _draw_trajectory(slam: Slam, trajectory: Trajectory, truth: Trajectory | Non
     return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric, metres)
 
 
-def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[Fact]:
+def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the numbers at the top of the page, each with its name."""
     facts = [
-        Fact(f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
-        Fact(f"{summary['keyframes']}", "keyframes"),
+        (f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
+        (f"{summary['keyframes']}", "keyframes"),
     ]
     if "frames_per_second" in summary:
-        facts.append(Fact(f"{summary['frames_per_second']:.1f}", "frames per second"))
+        facts.append((f"{summary['frames_per_second']:.1f}", "frames per second"))
     if summary["scale"] == "metric":
-        facts.append(Fact(f"{trajectory.length:.2f} m", "path length"))
+        facts.append((f"{trajectory.length:.2f} m", "path length"))
     if (truth := summary.get("truth")) is not None:
         aligned, name = ("ate_se3_m", "SE(3)") if slam.metric and truth["in_metres"] else ("ate_sim3_m", "Sim(3)")
         error = truth[aligned]["rmse"]
         shown = f"{100 * error:.2f} cm" if truth["in_metres"] else f"{error:.4g}"
-        facts.append(Fact(shown, f"ATE after {name}" + ("" if truth["in_metres"] else ", in the truth's unit")))
-    facts.append(Fact(f"{len(cloud):,}".replace(",", "\u202f"), "points in the map"))
-    facts.append(Fact(f"{summary['peak_memory_gb']:.2f} GB", "peak memory"))
+        facts.append((shown, f"ATE after {name}" + ("" if truth["in_metres"] else ", in the truth's unit")))
+    facts.append((f"{len(cloud):,}".replace(",", "\u202f"), "points in the map"))
+    facts.append((f"{summary['peak_memory_gb']:.2f} GB", "peak memory"))
     return facts
 
 
@@ -222,10 +195,11 @@ def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[st
     return [(title, [show(errors[name], by) for name in names]) for title, errors, by in rows]
 
 
-def _stages(seconds: Mapping[str, float]) -> list[Stage]:
+def _stages(seconds: Mapping[str, float]) -> list[tuple[str, float, float]]:
+    """Return name, duration in seconds, and its share of the longest, of each stage."""
     shown = {name: value for name, value in seconds.items() if name != "all" and value >= 0.005}
     longest = max(shown.values(), default=1.0)
-    return [Stage(name, value, value / longest) for name, value in sorted(shown.items(), key=lambda item: -item[1])]
+    return [(name, value, value / longest) for name, value in sorted(shown.items(), key=lambda item: -item[1])]
 
 
 def _spread(values: Sequence[_Value], count: int) -> list[_Value]:
@@ -242,17 +216,18 @@ def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
     return float(np.quantile(known, 0.02)), float(np.quantile(known, 0.98))
 
 
-def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: float) -> Sample:
+def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: float) -> dict[str, str | None]:
+    """Return a name, and image, depth and confidence as data URIs."""
     image = figures.picture(keyframe.image, _SAMPLE_WIDTH)
     depth = confidence = None
     if depth_map is not None and np.isfinite(low):
         depth = figures.picture(figures.depth_colours(depth_map.depth, low, high), _SAMPLE_WIDTH)
-        shades = np.rint(255 * depth_map.confidence).astype(np.uint8)
-        confidence = figures.picture(figures.confidence_colours(shades), _SAMPLE_WIDTH)
+        shades = figures.shades(np.rint(255 * depth_map.confidence).astype(np.uint8) / 255.0)
+        confidence = figures.picture(shades, _SAMPLE_WIDTH)
     title = f"frame {keyframe.frame}, {keyframe.timestamp:.2f} s"
     if keyframe.recorded is not None:
         title = f"from the known map, recorded at {keyframe.recorded:.2f} s"
-    return Sample(title, image, depth, confidence)
+    return {"name": title, "image": image, "depth": depth, "confidence": confidence}
 
 
 def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | None:
@@ -261,13 +236,10 @@ def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return the settings as text, by name or `group.name`."""
-    rows: dict[str, str] = {}
+    rows: dict[str, Any] = {}
     for name, value in settings.items():
-        if isinstance(value, Mapping):
-            rows |= {f"{name}.{field}": _plain(own) for field, own in value.items()}
-        else:
-            rows[name] = _plain(value)
-    return rows
+        rows |= {f"{name}.{key}": own for key, own in value.items()} if isinstance(value, Mapping) else {name: value}
+    return {name: _plain(value) for name, value in rows.items()}
 
 
 def _plain(value: Any) -> str:
