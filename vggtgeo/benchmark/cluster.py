@@ -1,6 +1,6 @@
 """Run a suite on a Ray cluster (extra `cluster`): each run is a task with processors and, optionally, a GPU.
 
-A task starts the same process with the same limits as `scheduling`, and returns its row and its small files, which the
+A task starts the same process with the same limits as `processes`, and returns its row and its small files, which the
 driver writes into the store. Ray restarts tasks whose worker or node is lost; each result is stored once. Recordings
 must have the same path on every node. If the driver dies, call it again.
 """
@@ -18,9 +18,17 @@ from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.jobs import Job, Store
-from vggtgeo.benchmark.processes import Limits, claim_cores, run_limited
+from vggtgeo.benchmark.processes import (
+    Command,
+    Finished,
+    Limits,
+    check_space,
+    claim_cores,
+    describe_ending,
+    run_limited,
+    worker_command,
+)
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.scheduling import Command, Finished, check_space, describe_ending, worker_command
 from vggtgeo.benchmark.worker import JOB, LOG, ROW
 from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path

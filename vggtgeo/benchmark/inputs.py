@@ -275,12 +275,13 @@ ExactFrames = SimulatedOracle | RecordedFrames
 """Exact depth and poses by the frame's index in the sequence."""
 
 
-def exact_cloud(frames: ExactFrames, max_frames: int = 30, step: int = 4) -> np.ndarray:
-    """Return world points of the visible surfaces, float64 [n, 3]: every `step`-th pixel of `max_frames` frames."""
+def exact_cloud(frames: ExactFrames) -> np.ndarray:
+    """Return world points of the visible surfaces, float64 [n, 3]: every fourth pixel of at most 30 frames."""
+    step = 4
     fx, fy, cx, cy = frames.camera.intrinsics
     count = len(frames)
     clouds = []
-    for index in np.unique(np.linspace(0, count - 1, min(count, max_frames)).round().astype(int)):
+    for index in np.unique(np.linspace(0, count - 1, min(count, 30)).round().astype(int)):
         depth, pose = frames.depth(int(index))[::step, ::step], frames.pose(int(index))
         v, u = np.nonzero(np.isfinite(depth) & np.isfinite(pose).all())
         z = depth[v, u]

@@ -9,7 +9,7 @@ from typing import Any
 from vggtgeo.benchmark import cells, figures, markdown
 from vggtgeo.benchmark.published import published
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row, select
+from vggtgeo.benchmark.table import Row, run_name, select
 from vggtgeo.benchmark.worker import LOG, RECORDING
 from vggtgeo.io.files import write_text
 from vggtgeo.report.figures import svg
@@ -102,7 +102,7 @@ def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> list[dict[str,
 
 
 def _run(suite: Suite, row: Row, folder: Path) -> dict[str, Any]:
-    place = Path("runs") / f"{row['sequence']}.{row['setting']}.{row['seed']}"
+    place = Path("runs") / run_name(row)
     files = {"page": "report.html", "poses": "estimate.txt", "recording": RECORDING, "log": LOG}
     there = {name: (place / file).as_posix() for name, file in files.items() if (folder / place / file).is_file()}
     return {

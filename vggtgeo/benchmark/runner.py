@@ -20,11 +20,10 @@ from vggtgeo.benchmark.inputs import data_folders
 from vggtgeo.benchmark.jobs import Job, Store, jobs_of
 from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.page import write_page
-from vggtgeo.benchmark.processes import Limits
+from vggtgeo.benchmark.processes import Limits, run_jobs
 from vggtgeo.benchmark.provenance import input_hash, source_digest
-from vggtgeo.benchmark.scheduling import run_jobs
 from vggtgeo.benchmark.suite import ExternalTable, Suite, load_suite, restrict
-from vggtgeo.benchmark.table import LESS_BASELINE, Row, as_csv, write_parquet
+from vggtgeo.benchmark.table import LESS_BASELINE, Row, as_csv, run_name, write_parquet
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.image_files import is_there
 from vggtgeo.datasets.pose_files import load_trajectory
@@ -281,7 +280,7 @@ def subtract_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row
 
 def _pose_differences(row: Row, base: Row, runs: Path) -> dict[str, Any]:
     """Return the differences of the pose errors; empty if a trajectory is missing."""
-    truth = _place(base, runs) / "truth.txt"
+    truth = runs / run_name(base) / "truth.txt"
     files = _estimate(row, runs), _estimate(base, runs)
     if not all(file.is_file() for file in (truth, *files)):
         return {}
@@ -304,9 +303,5 @@ def _errors(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
     }
 
 
-def _place(row: Row, runs: Path) -> Path:
-    return runs / f"{row['sequence']}.{row['setting']}.{row['seed']}"
-
-
 def _estimate(row: Row, runs: Path) -> Path:
-    return Path(row["external"]) if "external" in row else _place(row, runs) / "estimate.txt"
+    return Path(row["external"]) if "external" in row else runs / run_name(row) / "estimate.txt"

@@ -32,6 +32,11 @@ FIRST = (
 """Columns that come first, in this order; the others follow by name."""
 
 
+def run_name(row: Row) -> str:
+    """Return the name of the run's folder."""
+    return f"{row['sequence']}.{row['setting']}.{row['seed']}"
+
+
 def columns(rows: Iterable[Row]) -> list[str]:
     """Return the columns of a table, in order."""
     there = {name for row in rows for name in row}

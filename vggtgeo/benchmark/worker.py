@@ -128,12 +128,12 @@ def _save(folder: Path, result: Result, truth: Trajectory | None, spec: Mapping[
         truth.save_tum(folder / "truth.txt")
 
 
-def end_with_parent(parent: int, seconds: float = 1.0) -> None:
+def end_with_parent(parent: int) -> None:
     """End this process when its `parent` has ended, even if that was during the imports."""
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(seconds)
+            time.sleep(1.0)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

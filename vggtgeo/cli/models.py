@@ -5,10 +5,7 @@ Heavy modules are imported inside functions, so that `--help` is fast.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import signal
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -40,11 +37,6 @@ FLAGS = {
 models = typer.Typer(
     no_args_is_help=True, add_completion=False, help="List, check, fetch and export the networks of the roles."
 )
-
-
-@models.callback()
-def group() -> None:
-    """List, check, fetch and export the networks of the roles."""
 
 
 @models.command("list")
@@ -141,20 +133,6 @@ def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
     }
 
 
-@contextlib.contextmanager
-def _exit_on_sigterm() -> Iterator[None]:
-    """Turn SIGTERM into an exception, as Ctrl-C, so that temporary folders are removed."""
-
-    def leave(number: int, _: object) -> None:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 @dataclass(frozen=True)
 class ExportOptions:
     """Weights and shape of the exported network."""
@@ -172,6 +150,7 @@ class ExportOptions:
     half: Annotated[bool, typer.Option(help="Attention and perceptrons in float16.")] = False
 
 
+@models.command()
 @with_option_groups
 def export(
     name: Annotated[
@@ -209,8 +188,7 @@ def export(
         )
         from vggtgeo.models.exporters.export import export as write
 
-        with _exit_on_sigterm():
-            report = write(recipe, request, output, show, tolerance)
+        report = write(recipe, request, output, show, tolerance)
     except ExportError as error:
         raise InputError(str(error)) from error
     if as_json:
@@ -222,6 +200,3 @@ def export(
         f"{report.megabytes:.0f} MB, differs from PyTorch by {report.parity:.1e}, "
         f"{report.latency:.2f} s a call on the CPU"
     )
-
-
-models.command("export")(export)

@@ -58,7 +58,6 @@ def pose_consistency(
     place_sigma: Float[np.ndarray, " n"],
     rotation_sigma: Float[np.ndarray, " n"],
     scale: float = 1.0,
-    max_dt: float = MAX_TIME_DIFFERENCE,
 ) -> tuple[Consistency, Consistency]:
     """Return the NEES of positions and of rotations, for standard deviations relative to the first pose.
 
@@ -66,7 +65,7 @@ def pose_consistency(
     scale: factor on the estimate's lengths. Poses with a standard deviation of zero or NaN are left out; InputError if
     none is left.
     """
-    rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)
+    rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, MAX_TIME_DIFFERENCE)
     found, true = (
         rigid.invert(poses[:1]) @ poses if len(poses) else poses
         for poses in (estimate.poses[rows], truth.poses[others])

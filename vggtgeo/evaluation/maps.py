@@ -97,7 +97,7 @@ Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices, metres, and the vertex indices of each face."""
 
 
-def surface_points(mesh: Mesh, spacing: float, seed: int = 0) -> Float[np.ndarray, "k 3"]:
+def surface_points(mesh: Mesh, spacing: float) -> Float[np.ndarray, "k 3"]:
     """Sample points on the faces of `mesh`, uniform by area, one per square of `spacing` metres on average.
 
     A face is drawn by its area, then a point in it: with u, v uniform in [0, 1] and s = sqrt(u), the point
@@ -110,7 +110,7 @@ def surface_points(mesh: Mesh, spacing: float, seed: int = 0) -> Float[np.ndarra
     total = float(areas.sum())
     if not total > 0:
         raise InputError("`mesh` has no face with an area")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     face = rng.choice(len(faces), max(round(total / spacing**2), 1), p=areas / total)
     s, v = np.sqrt(rng.random((len(face), 1))), rng.random((len(face), 1))
     return np.asarray((1 - s) * a[face] + s * (1 - v) * b[face] + s * v * c[face])

@@ -156,8 +156,8 @@ def evaluate_trajectory(
     )
 
 
-def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = MAX_GAP) -> float:
-    """Return the share of the ground truth's duration between estimated poses at most `longest_gap` seconds apart.
+def coverage(estimate: Trajectory, truth: Trajectory) -> float:
+    """Return the share of the ground truth's duration between estimated poses at most `MAX_GAP` seconds apart.
 
     If the ground truth itself has a larger interval, gaps of two of its intervals are allowed. NaN for a ground truth
     without duration.
@@ -166,24 +166,22 @@ def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = MAX_G
         return float("nan")
     begin, end = truth.timestamps[[0, -1]]
     times = np.clip(estimate.timestamps, begin, end)
-    return float(np.diff(times)[_close(estimate, truth, longest_gap)].sum() / (end - begin))
+    return float(np.diff(times)[_close(estimate, truth)].sum() / (end - begin))
 
 
-def followed(
-    times: Float[np.ndarray, " n"], estimate: Trajectory, truth: Trajectory, longest_gap: float = MAX_GAP
-) -> Bool[np.ndarray, " n"]:
+def followed(times: Float[np.ndarray, " n"], estimate: Trajectory, truth: Trajectory) -> Bool[np.ndarray, " n"]:
     """Return which of `times` (seconds) are covered as in `coverage`, or are at an estimated pose."""
     poses = estimate.timestamps
     after = np.searchsorted(poses, times)
-    close = np.concatenate([[False], _close(estimate, truth, longest_gap), [False]])
+    close = np.concatenate([[False], _close(estimate, truth), [False]])
     near = np.zeros(len(times), bool)
     near[nearest_in_time(times, poses, MAX_TIME_DIFFERENCE)[0]] = True
     return near | close[after]
 
 
-def _close(estimate: Trajectory, truth: Trajectory, longest_gap: float) -> np.ndarray:
+def _close(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
     usual = float(np.median(np.diff(truth.timestamps))) if len(truth) > 1 else 0.0
-    return np.diff(estimate.timestamps) <= max(longest_gap, 2.0 * usual)
+    return np.diff(estimate.timestamps) <= max(MAX_GAP, 2.0 * usual)
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
