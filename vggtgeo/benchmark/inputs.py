@@ -114,8 +114,8 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
         roles = Perception(simulated_roles(rendered.oracle, spec, seed), {})
         return Input(rendered, roles, rendered.oracle, simulated=True)
     sequence = _without(rendered if is_plain else degraded(rendered, spec["degrade"], seed), spec)
-    exact = rendered.oracle if is_plain else None
-    return Input(sequence, _perceived(spec, sequence.has_depth), exact, simulated=True)
+    perceived = _perceived(spec, sequence.has_depth)
+    return Input(sequence, perceived, rendered.oracle if is_plain else None, simulated=True)
 
 
 def walk_name(simulate: Mapping[str, Any], seed: int) -> str:

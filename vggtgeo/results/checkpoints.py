@@ -7,7 +7,6 @@ atomically. The interval grows so that all checkpoints take at most `SHARE` of t
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import math
 import re
@@ -132,12 +131,9 @@ def run_identity(
     source: `Source.identity`. networks: digest of each network file. more: further values.
     """
     by_stage = {
-        f"{group.name}.{entry.name}": getattr(getattr(settings, group.name), entry.name)
-        for group in dataclasses.fields(settings)
-        for entry in dataclasses.fields(getattr(settings, group.name))
+        f"{group}.{name}": value for group, values in vars(settings).items() for name, value in vars(values).items()
     }
-    by_role = {entry.name: getattr(roles, entry.name) for entry in dataclasses.fields(roles)}
-    every = {**versions(), **source, **by_stage, **by_role, **networks, **more}
+    every = {**versions(), **source, **by_stage, **vars(roles), **networks, **more}
     # The default `repr` of an object contains its address, which differs between processes.
     return {name: re.sub(r" at 0x[0-9a-f]+", "", repr(value)) for name, value in every.items()}
 
@@ -230,9 +226,8 @@ class CheckpointWriter:
     message: Callable[[str], None]
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="checkpoint"))
     _writing: Future[float] | None = None
-    _next: float = 0.0
     _written: bool = False
-    _failed: bool = False
+    _next: float = 0.0
 
     def __post_init__(self) -> None:
         self._next = time.monotonic() + self.asked.every
@@ -240,24 +235,20 @@ class CheckpointWriter:
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         """Start to write a checkpoint after a frame, if it is time."""
         if self._writing is not None and (self._writing.done() or self.asked.every == 0):
-            self._ended(self._writing)
-        if self._writing is None and not self._failed and time.monotonic() >= self._next:
+            self._wait()
+        if self._writing is None and time.monotonic() >= self._next:
             self._begin(slam, frame)
 
     def on_end(self, slam: Slam, frame: Frame | None) -> None:
         """Write a checkpoint after the last frame, if the run was long enough for an earlier one."""
         self._wait()
-        if self._written and frame is not None and not self._failed:
+        if self._written and frame is not None:
             self._begin(slam, frame)
 
     def close(self) -> None:
         """Wait until the last file is written."""
         self._wait()
         self._pool.shutdown()
-
-    def _wait(self) -> None:
-        if self._writing is not None:
-            self._ended(self._writing)
 
     def _begin(self, slam: Slam, frame: Frame) -> None:
         self._writing = self._pool.submit(self._write, self.gather(slam), frame)
@@ -270,14 +261,15 @@ class CheckpointWriter:
         CHECKPOINT.write(self.asked.path, so_far, facts)
         return time.thread_time() - began
 
-    def _ended(self, writing: Future[float]) -> None:
-        """Schedule the next checkpoint; after an error the run continues without checkpoints."""
-        self._writing = None
+    def _wait(self) -> None:
+        """Wait for the file, and schedule the next; after an error the run continues without checkpoints."""
+        if self._writing is None:
+            return
+        writing, self._writing = self._writing, None
         try:
             took = writing.result()
+            self._written, self._next = True, time.monotonic()
+            self._next += max(self.asked.every, took / SHARE) if self.asked.every else 0.0
         except (OSError, TypeError, ValueError) as error:
-            self._failed = True
+            self._written, self._next = False, math.inf
             self.message(f"cannot write the checkpoint `{self.asked.path}`, this run cannot be resumed: {error}")
-            return
-        self._written = True
-        self._next = time.monotonic() + (max(self.asked.every, took / SHARE) if self.asked.every else 0.0)

@@ -114,10 +114,9 @@ class Result:
     @property
     def intrinsics_as_read(self) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy, pixels of the original images, if the run reduced them (`camera.max_pixels`)."""
-        reduced = self.summary.get("images_reduced")
-        if reduced is None:
+        if "images_reduced" not in self.summary:
             return self.intrinsics
-        fx, fy, cx, cy = (float(reduced["intrinsics_as_read"][name]) for name in ("fx", "fy", "cx", "cy"))
+        fx, fy, cx, cy = map(float, self.summary["images_reduced"]["intrinsics_as_read"].values())
         return fx, fy, cx, cy
 
     @property
