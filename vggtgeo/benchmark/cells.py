@@ -207,19 +207,20 @@ def sequences_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
     return [table.name for table in suite.sequence if table.name in there]
 
 
-def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str, list[Cell]]]:
-    """Return a row per setting: a cell per sequence, then mean (with the mean of the medians over seeds) and median
-    over the sequences on which all settings are ranked (see `_common`). rows: include those without a result.
+def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> tuple[list[str], list[tuple[str, list[Cell]]]]:
+    """Return the heads, and a row per setting: a cell per sequence, then mean (with the mean of the medians over seeds)
+    and median over the sequences on which all settings that are ranked at all are ranked. rows: include those without a
+    result.
     """
     settings, sequences = settings_of(suite, rows), sequences_of(suite, rows)
     groups = {name: [select(rows, name, setting) for setting in settings] for name in sequences}
-    by_column = [ranked(groups[name], column) for name in sequences]
-    common = _common(suite, rows, column)
+    ranks = {name: [is_ranked(own, column) for own in groups[name]] for name in sequences}
+    used = [any(ranks[name][row] for name in sequences) for row in range(len(settings))]
+    common = [name for name in sequences if ranks[name] == used]
+    heads, by_column = [*sequences], [ranked(groups[name], column) for name in sequences]
     if len(common) > 1:
-        lists = [
-            [summary_of(groups[name][row], column) for name in common if is_ranked(groups[name][row], column)]
-            for row in range(len(settings))
-        ]
+        of = "" if len(common) == len(sequences) else f" of {len(common)}"
+        lists = [[summary_of(groups[name][row], column) for name in common if has] for row, has in enumerate(used)]
         pooled = [Summary.of(np.array([one.mean for one in own])) for own in lists]
         text = lambda number: f"{number:.{column.digits}f}" if np.isfinite(number) else ""
         # Means of medians, as in publications, if each sequence has enough seeds.
@@ -229,26 +230,13 @@ def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str,
         ]
         means = [one.mean for one in pooled]
         by_column.append(placed(means, column, list(map(text, means)), list(map(text, medians))))
+        heads.append(f"mean{of}")
         if len(common) >= MIN_FOR_MEDIAN:
+            heads.append(f"median{of}")
             numbers = [one.median for one in pooled]
             by_column.append(placed(numbers, column, list(map(text, numbers)), [""] * len(pooled)))
-    return [(suite.title_of(setting), [cells[row] for cells in by_column]) for row, setting in enumerate(settings)]
-
-
-def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """Return the sequences on which every setting that is ranked at all is ranked."""
-    names = sequences_of(suite, rows)
-    groups = [[select(rows, name, setting) for name in names] for setting in settings_of(suite, rows)]
-    ranks = [[is_ranked(own, column) for own in line] for line in groups]
-    return [name for place, name in enumerate(names) if all(line[place] for line in ranks if any(line))]
-
-
-def matrix_heads(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """Return the heads of `matrix`."""
-    sequences, common = sequences_of(suite, rows), _common(suite, rows, column)
-    of = "" if len(common) == len(sequences) else f" of {len(common)}"
-    pooled = [f"mean{of}"] * (len(common) > 1) + [f"median{of}"] * (len(common) >= MIN_FOR_MEDIAN)
-    return [*sequences, *pooled]
+    lines = [(suite.title_of(setting), [cells[row] for cells in by_column]) for row, setting in enumerate(settings)]
+    return heads, lines
 
 
 @dataclass(frozen=True)

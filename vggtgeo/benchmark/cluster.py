@@ -22,7 +22,6 @@ from vggtgeo.benchmark.processes import (
     Command,
     Finished,
     Limits,
-    check_space,
     claim_cores,
     describe_ending,
     run_limited,
@@ -58,7 +57,7 @@ def run_jobs_on_cluster(
 ) -> None:
     """Run `jobs` on the cluster, and store their rows as they finish.
 
-    InputError if Ray is not installed, no cluster answers at the address, or the disk of a node is full.
+    InputError if Ray is not installed, or no cluster answers at the address.
     """
     if not jobs:
         return
@@ -104,14 +103,9 @@ def _store_result(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[s
         lines = str(error).strip().splitlines()
         message = f"the cluster lost the task: {lines[0] if lines else error!r}"
         return store.complete(job, status="crash", message=message, **{**provenance(), "machine": "a lost node"})
-    for name, content in contents.items():
-        if name not in (JOB, ROW):
-            with atomic_path(place / name) as temporary:
-                temporary.write_bytes(content)
-    if ROW in contents:
-        with atomic_path(place / ROW) as temporary:
-            temporary.write_bytes(contents[ROW])
-    check_space(place, ending)
+    for name in sorted(contents.keys() - {JOB}, key=lambda name: name == ROW):  # the row last: it marks a finished run
+        with atomic_path(place / name) as temporary:
+            temporary.write_bytes(contents[name])
     return store.complete(job, **ending)
 
 

@@ -74,8 +74,8 @@ def _count(rows: Sequence[Row]) -> str:
 
 def accuracy(suite: Suite, rows: Sequence[Row], column: cells.Column) -> str:
     """Return a table with a row per setting and a column per sequence."""
-    body = [[title, *map(_marked, line)] for title, line in cells.matrix(suite, rows, column)]
-    return table(["setting", *cells.matrix_heads(suite, rows, column)], body)
+    heads, lines = cells.matrix(suite, rows, column)
+    return table(["setting", *heads], [[title, *map(_marked, line)] for title, line in lines])
 
 
 def differences(suite: Suite, rows: Sequence[Row]) -> str:

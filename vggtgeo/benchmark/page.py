@@ -70,8 +70,8 @@ def _facts(suite: Suite, rows: Sequence[Row]) -> list[tuple[str, str]]:
 def _accuracy_tables(suite: Suite, rows: Sequence[Row]) -> list[dict[str, Any]]:
     both = {column: cells.matrix(suite, rows, column) for column in (cells.SE3, cells.SIM3)}
     return [
-        {"head": column.head, "columns": cells.matrix_heads(suite, rows, column), "rows": lines}
-        for column, lines in both.items()
+        {"head": column.head, "columns": heads, "rows": lines}
+        for column, (heads, lines) in both.items()
         if any(cell.text for _, line in lines for cell in line)
     ]
 

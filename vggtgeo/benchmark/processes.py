@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from vggtgeo.benchmark.inputs import walk_name
 from vggtgeo.benchmark.jobs import Job, Store
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.table import Row
-from vggtgeo.benchmark.worker import LOG, NO_SPACE
+from vggtgeo.benchmark.worker import LOG
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.jax_environment import jax_environment
 from vggtgeo.io.locks import LockedError, locked
@@ -35,7 +35,6 @@ from vggtgeo.io.peak_memory import rusage_gb
 Command = Callable[[Path, Path], Sequence[str]]
 """Returns the command line of a run for its folder and the scratch folder."""
 Finished = Callable[[Job, Row], None]
-_FULL = "no space"  # in place of a status: no row is written
 _TAIL = 2000  # characters at the end of a log that are searched for its last line
 _POLL = 0.02
 _MEMORY_POLL = 0.25
@@ -198,7 +197,7 @@ def run_jobs(
 ) -> None:
     """Run `jobs`, `workers` at a time, and store their rows; crashes, timeouts and memory limits give rows as well.
 
-    Rendered walks are kept in a scratch folder while other runs need them. After Ctrl-C, a full disk, or an exception
+    Rendered walks are kept in a scratch folder while other runs need them. After Ctrl-C or an exception
     of `finished`, all processes are ended; finished runs are stored.
     """
     with _scratch(store.folder) as scratch:
@@ -242,31 +241,20 @@ def run_one(
     scratch: Path,
     stop: threading.Event | None = None,
 ) -> Row:
-    """Run one job and return its row; raise InputError if the disk is full, which would affect all later runs."""
+    """Run one job and return its row."""
     place = store.begin(job)
     began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     log = place / LOG
     ending = describe_ending(run_limited(command(place, scratch), log, limits, cores, stop), log.read_bytes())
-    check_space(place, ending)
     return store.complete(job, **ending, started=began, cpus=len(cores))
-
-
-def check_space(place: Path, ending: Mapping[str, Any]) -> None:
-    """Raise InputError if a run ended because the disk was full."""
-    if ending["status"] == _FULL:
-        raise InputError(
-            f"no space left for the run `{place}` ({ending['message']}); free disk space and call again: finished runs "
-            "are kept"
-        )
 
 
 def describe_ending(ending: Ending, log: bytes) -> dict[str, Any]:
     """Return the columns on how and where a process ended; their status is used if the run wrote no row."""
     message, status = ending.message, "crash" if ending.status in ("ended", "killed") else ending.status
-    if ending.status == "ended" and ending.code == NO_SPACE:
-        message, status = _last_line(log), _FULL
-    elif ending.status == "ended" and ending.code > 0:
-        message = f"{message}: {_last_line(log)}"
+    if ending.status == "ended" and ending.code > 0:
+        lines = log[-_TAIL:].decode(errors="replace").split("\n")
+        message += f": {next((line.strip() for line in reversed(lines) if line.strip()), '')}"
     return {
         "status": status,
         "message": message,
@@ -275,11 +263,6 @@ def describe_ending(ending: Ending, log: bytes) -> dict[str, Any]:
         "tries": ending.tries,
         **provenance(),
     }
-
-
-def _last_line(log: bytes) -> str:
-    lines = log[-_TAIL:].decode(errors="replace").splitlines()
-    return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 @contextmanager

@@ -62,10 +62,6 @@ class BenchReport:
         """Return the tables: means and standard deviations, differences to the baseline, failures, provenance."""
         return markdown.page(self.suite, self.rows)
 
-    def csv(self) -> str:
-        """Return all runs as CSV."""
-        return as_csv(self.rows)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the name of the suite and all rows as plain values."""
         return {"suite": self.suite.name, "rows": [dict(row) for row in self.rows]}
@@ -73,7 +69,7 @@ class BenchReport:
     def write(self, folder: Path) -> None:
         """Write the files of `OUTPUTS`."""
         write_text(folder / "tables.md", self.markdown())
-        write_text(folder / "runs.csv", self.csv())
+        write_text(folder / "runs.csv", as_csv(self.rows))
         write_page(folder / "report.html", self.suite, self.rows, self.folder)
         with suppress(InputError):
             write_parquet(folder / "runs.parquet", self.rows)

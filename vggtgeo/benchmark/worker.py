@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import shutil
@@ -12,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,23 +33,18 @@ from vggtgeo.viewing.target import open_target
 
 JOB, ROW, LOG, RECORDING = "job.json", "row.json", "log.txt", "run.rrd"
 """Files in the folder of a run."""
-NO_SPACE = 75
-"""Exit code of a run that ended because the disk was full: it writes no row, since that is no result of the run."""
 
 
 def run_job(folder: Path, scratch: Path | None = None) -> None:
     """Run the job of `folder`/job.json and write its row, atomically.
 
-    scratch: see `open_input`. An InputError gives a row with the status "error"; other exceptions, and a full disk,
-    propagate.
+    scratch: see `open_input`. An InputError gives a row with the status "error"; other exceptions propagate.
     """
     job = json.loads((folder / JOB).read_text(encoding="utf-8"))
     began = time.perf_counter()
     try:
         row = {"status": "ok", **_run(folder, job["spec"], job["seed"], scratch)}
     except InputError as error:
-        if _is_full(error):
-            raise
         row = {"status": "error", "message": str(error)}
     cost = {"seconds_process": time.perf_counter() - began, "peak_memory_gb": peak_memory_gb()}
     write_json(folder / ROW, {**identity(job), **row, **cost, **provenance()})
@@ -139,26 +133,6 @@ def end_with_parent(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def main(arguments: list[str]) -> None:
-    """Run `python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT`; PARENT is a process id."""
-    folder, scratch, parent = arguments
-    end_with_parent(int(parent))
-    try:
-        run_job(Path(folder), Path(scratch))
-    except (OSError, InputError) as error:
-        if not _is_full(error):
-            raise
-        with suppress(OSError):  # the log may be on the full disk
-            sys.stderr.write(f"{error}\n")
-        sys.exit(NO_SPACE)
-
-
-def _is_full(error: BaseException) -> bool:
-    """Return whether a full disk is the cause of an error."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return True
-    return error.__context__ is not None and _is_full(error.__context__)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+if __name__ == "__main__":  # python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT, the latter a process id
+    end_with_parent(int(sys.argv[3]))
+    run_job(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -14,7 +14,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TextIO
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -261,18 +261,11 @@ def main() -> None:
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
     """Return a function that shows `UserWarning`s in one line, and others as before."""
 
-    def show(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
         if issubclass(category, UserWarning):
             kind = "note" if issubclass(category, NoteWarning | GuessedCameraWarning) else "warning"
-            print(f"{kind}: {one_line(str(message))}", file=file or sys.stderr)
+            print(f"{kind}: {one_line(str(message))}", file=sys.stderr)
         else:
-            show_others(message, category, filename, lineno, file, line)
+            show_others(message, category, *rest, **more)
 
     return show

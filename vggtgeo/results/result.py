@@ -28,7 +28,6 @@ from vggtgeo.report import write_page
 from vggtgeo.results.files import (
     read_uncertainty,
     write_depth,
-    write_depth_maps,
     write_settings,
     write_trajectories,
     write_uncertainty,
@@ -247,10 +246,10 @@ class Result:
             meshed.result()
         if depth and self.record is not None:
             slam, depth_maps = self.record.slam, self.record.dense.depth_maps
-            if depth == "every":
-                write_depth_maps(place, depth_of_frames(slam, depth_maps, frames), slam.metric)
-            else:
-                write_depth(place, slam.keyframes, depth_maps, slam.metric)
+            numbers = (keyframe.frame for keyframe in slam.keyframes)
+            of_keyframes = zip(numbers, depth_maps, strict=True)
+            found = depth_of_frames(slam, depth_maps, frames) if depth == "every" else of_keyframes
+            write_depth(place, found, slam.metric)
         if self.record is not None:
             plain = add_writing_time(plain, time.perf_counter() - began)
         write_json(place / "summary.json", plain)
