@@ -45,15 +45,6 @@ def test_fields_are_options(flags: list[str], expected: tuple[object, ...]) -> N
     assert done.stdout.strip() == repr(expected)
 
 
-def test_bounds_of_a_field_hold() -> None:
-    """A value outside the bounds of a field is a usage error that names the option; oracle: the bound."""
-    app = typer.Typer()
-    app.command()(with_option_groups(command))
-    done = CliRunner().invoke(app, ["a", "--width", "0"])
-    assert done.exit_code == 2
-    assert "--width" in done.output
-
-
 def test_order_and_python_calls(capsys: pytest.CaptureFixture[str]) -> None:
     """Options stand in the order of parameters and fields, and a call from Python takes them by name; oracle: both."""
     grouped = with_option_groups(command)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.evaluation import Offsets, estimate_offsets, shifted
-from vggtgeo.evaluation.drift_noise import DriftNoise
+from vggtgeo.evaluation.offset_model import DriftNoise
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputWarning
 

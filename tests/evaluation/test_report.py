@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import equinox as eqx
 import numpy as np
 import pytest
+from checked_page import CheckedPage
 from recorded_run import FRAMES, RecordedRun, recorded_run
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
@@ -28,8 +28,6 @@ from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
 from vggtgeo.slam.window.sliding_window import MAX_ITERATIONS
-
-VOID = {"meta", "img", "link", "br", "hr", "input"}
 
 
 def test_residual_sizes_of_known_noise() -> None:
@@ -125,36 +123,13 @@ def test_errors_against_a_truth_without_metres_are_no_centimetres(run: RecordedR
     assert errors_line(metric["truth"], free=False).endswith(f"SE(3), {100 * error:.2f} cm after Sim(3) alignment")
 
 
-class _Checker(HTMLParser):
-    """Notes elements that are not closed in order, addresses that lead elsewhere, and identifiers given twice."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.wrong: list[str] = []
-        self.ids: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in VOID:
-            self.open.append(tag)
-        for name, value in attrs:
-            if name == "id":
-                self.ids.append(value or "")
-            if name in ("src", "href", "xlink:href") and not (value or "").startswith(("data:", "#")):
-                self.wrong.append(f"{tag} {name}={value}")
-
-    def handle_endtag(self, tag: str) -> None:
-        if not self.open or self.open.pop() != tag:
-            self.wrong.append(f"</{tag}>")
-
-
 def test_the_page_is_whole_and_needs_nothing_else(run: RecordedRun, tmp_path: Path) -> None:
     """Elements close, no address leads out of the file, identifiers are unique, and every part is there."""
     text = _page(run, tmp_path, warnings=["frame 3 is torn & skipped"])
-    checker = _Checker()
-    checker.feed(text)
+    checker = CheckedPage(text)
     assert checker.wrong == []
     assert checker.open == []
+    assert all(link.startswith("#") for link in checker.links)
     assert len(checker.ids) == len(set(checker.ids))
     assert "@import" not in text
     assert ("<script" in text) == has_viewer()

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vggtgeo.cli.models import FLAGS
 from vggtgeo.cli.options import with_option_groups
 from vggtgeo.cli.run_options import (
     InputOptions,
@@ -176,10 +177,7 @@ def make_perception(chosen: PerceptionOptions, classical: Roles, switches: Switc
     """
     from vggtgeo.slam.settings.presets import perception
 
-    named = {
-        **{"points": chosen.points, "lines": chosen.lines, "line_matches": chosen.line_matcher},
-        **{"confidence": chosen.confidence, "geometry": chosen.init, "depth": chosen.depth},
-    }
+    named = {role: getattr(chosen, flag.lstrip("-").replace("-", "_")) for role, flag in FLAGS.items()}
     mixed = mixture(named, switches.no_lines, switches.no_confidence)
     perceived = perception(
         *(chosen.preset, classical, chosen.models, chosen.cache, chosen.provider, chosen.memory_limit_gb, mixed)
