@@ -75,6 +75,9 @@ def bench(
 
     Exit code 1: no run has a result.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     from vggtgeo.benchmark.cluster import Cluster
     from vggtgeo.benchmark.runner import OUTPUTS
     from vggtgeo.benchmark.runner import bench as run_suite  # brings JAX, which --help does without
@@ -86,13 +89,22 @@ def bench(
         return
     load_suite(Path(suite))  # report errors in it before the progress bar starts
     folder = output or Path("runs") / Path(suite).stem
-    with _Bar(quiet or as_json) as bar:
+    console = Console(stderr=True, quiet=quiet or as_json)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    # Without a terminal the lines of the runs suffice.
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("runs", total=None)
+
+        def advance(done: int, total: int, row: Row) -> None:
+            bar.update(task, completed=done, total=total)
+            console.print(_line(row), markup=False, highlight=False, soft_wrap=True)
+
         report = run_suite(
             suite,
             folder,
             **{**vars(runs), "sequences": _list(runs.sequences), "settings": _list(runs.settings)},
             **vars(limits),
-            progress=bar.advance,
+            progress=advance,
             cluster=Cluster(ray.address, ray.cpus, ray.gpus) if ray.engine == "ray" else None,
         )
     typer.echo(json.dumps(report.to_dict()) if as_json else report.markdown())
@@ -100,34 +112,6 @@ def bench(
         typer.echo(f"in {folder}: {' '.join(name for name in OUTPUTS if (folder / name).is_file())}", err=True)
     if not any(row["status"] == "ok" for row in report.rows):
         raise typer.Exit(1)
-
-
-class _Bar:
-    """A progress bar of runs, and a line for each."""
-
-    def __init__(self, silent: bool) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._progress = Progress(*columns, console=Console(stderr=True, quiet=silent))
-        self._task = self._progress.add_task("runs", total=None)
-
-    def __enter__(self) -> _Bar:
-        if self._progress.console.is_terminal:  # else the lines of the runs suffice
-            self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if not self._progress.tasks[0].completed:  # an error follows: remove the bar
-            self._progress.live.transient = True
-        if self._progress.live.is_started:
-            self._progress.stop()
-
-    def advance(self, done: int, total: int, row: Row) -> None:
-        """Show a finished run."""
-        self._progress.update(self._task, completed=done, total=total)
-        self._progress.console.print(_line(row), markup=False, highlight=False, soft_wrap=True)
 
 
 def _line(row: Row) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from vggtgeo.cli.options import AssignmentsOption, ReportOptions, RerunOption, with_option_groups
-from vggtgeo.cli.run_options import ResumeOption
+from vggtgeo.cli.run_options import ResultOptions, ResumeOption
 from vggtgeo.cli.settings_file import SettingsOption, pipeline_settings
 
 SIZE = (480, 360)
@@ -38,14 +38,15 @@ def demo(
     report: ReportOptions,
 ) -> None:
     """Run in a synthetic office with exact truth, rendered on the spot."""
-    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.cli.run_sequence import run_and_write
     from vggtgeo.results.run_options import RunOptions
     from vggtgeo.simulation import simulate
     from vggtgeo.slam.settings.slam_settings import Roles
     from vggtgeo.slam.window.sliding_window import warm_up
     from vggtgeo.viewing.target import check_target
 
-    rerun = check_target(rerun) if rerun else None
+    if rerun:
+        check_target(rerun)
     slam_settings = pipeline_settings(settings, assignments or (), {})
     # While the light of the scene is computed, what every window needs is compiled.
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
@@ -58,11 +59,8 @@ def demo(
         sequence,
         Roles(),
         slam_settings,
-        Output(
-            *(output, settings.values() if settings else {}, rerun),
-            quiet=report.quiet,
-            as_json=report.as_json,
-            resume=resume,
-        ),
+        output,
+        ResultOptions(rerun=rerun, resume=resume, quiet=report.quiet, as_json=report.as_json),
         RunOptions(title=f"simulated {world.scene}", facts={"simulated": True}),
+        flags=settings.values() if settings else {},
     )

@@ -55,7 +55,7 @@ def run(
     from vggtgeo.results.output_checks import check_can_be_written, check_output, is_in_results
     from vggtgeo.viewing.target import check_target
 
-    rerun = check_target(options.rerun) if options.rerun else None
+    rerun = options.rerun and check_target(options.rerun)
     if perception.memory_limit_gb is not None and not 0 < perception.memory_limit_gb < float("inf"):
         raise InputError(f"`--memory-limit-gb` must be positive, got {perception.memory_limit_gb:g}")
     if given.fps is not None and not 0 < given.fps <= MAX_FPS:
@@ -80,30 +80,21 @@ def run(
     if options.save_depth and options.dense == "none":
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
         warnings.warn(text, InputWarning, stacklevel=2)
-    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.cli.run_sequence import run_and_write
     from vggtgeo.results.run_options import RunOptions
-    from vggtgeo.slam.known_map import load_map
     from vggtgeo.slam.run import default_roles
 
     slam_settings = pipeline_settings(settings, options.assignments or (), tables_of_switches(switches, options))
     perceived = make_perception(perception, default_roles(sequence.has_depth), switches)
-    flags = settings.values() if settings else {}
     run_and_write(
         sequence,
         perceived,
         slam_settings,
-        Output(
-            *(output, flags, rerun, "every" if options.save_every_depth else options.save_depth),
-            quiet=options.quiet,
-            as_json=options.as_json,
-            source=Path(path),
-            save_map=options.save_map,
-            resume=options.resume,
-            checkpoint_every=options.checkpoint_every,
-        ),
+        output,
+        options,
         RunOptions(given.start, given.end, given.stride, options.seed, options.dense, warned=warned),
-        known_map=None if options.map_file is None else load_map(options.map_file),
-        pose_prior=options.pose_prior,
+        flags=settings.values() if settings else {},
+        source=Path(path),
     )
 
 
