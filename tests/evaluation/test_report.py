@@ -20,8 +20,8 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.mapping.dense import dense_depths
-from vggtgeo.report import write_page
+from vggtgeo.mapping.dense import DenseMap, dense_depths
+from vggtgeo.report import RunRecord, write_page
 from vggtgeo.report.viewer import has_viewer
 from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
@@ -58,12 +58,14 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     path = frame_trajectory(slam)
     report = evaluate_trajectory(path, truth) if len(path) else None
     facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
-    verdict = options.setdefault("verdict", Verdict("good"))
+    verdict = options.get("verdict", Verdict("good"))
     settings, seconds = {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}
     summary = summarise(slam, verdict, settings=settings, seconds=seconds, report=report, **facts)
-    given = {"title": "a <room>", "truth": truth, "cloud": run.cloud, "records": run.recorder.records}
-    given["depth_maps"] = dense_depths(slam.keyframes, slam.intrinsics, "auto" if _deep(slam) else "none")
-    write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
+    maps = tuple(dense_depths(slam.keyframes, slam.intrinsics, "auto" if _deep(slam) else "none"))
+    dense = DenseMap(maps, slam.keyframes, maps, slam.intrinsics, options.get("cloud", run.cloud), 0.02)
+    given = {"windows": tuple(run.recorder.records), "truth": truth, "warnings": (), "title": "a <room>"}
+    given = {name: options.get(name, value) for name, value in given.items()}
+    write_page(folder / "report.html", RunRecord(slam, dense, **given), options.get("summary", summary), verdict)
     return (folder / "report.html").read_text()
 
 
@@ -170,7 +172,7 @@ def test_the_page_without_depth_and_without_windows(run: RecordedRun, tmp_path: 
     blank = [replace(k, images=images) for k, images in zip(run.slam.keyframes, without, strict=True)]
     slam = replace(run.slam, map=replace(run.slam.map, keyframes=tuple(blank), metric=False))
     empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    text = _page(run, tmp_path, slam, cloud=empty, records=[], truth=None)
+    text = _page(run, tmp_path, slam, cloud=empty, windows=(), truth=None)
     for words in ("No window was adjusted", "The sequence has no depth", "too few points", "lengths have no unit"):
         assert words in text, words
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,6 +14,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
+from vggtgeo.mapping.dense import DenseMap
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
 from vggtgeo.report.map_scene import map_scene, pictured
@@ -37,18 +39,29 @@ _SAMPLE_WIDTH = 300
 """Pixels."""
 
 
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """The data of a result in memory, from which report and depth images are made.
+
+    slam: the last state. dense: the dense map after the last adjustment. windows: one per adjustment of the window.
+    truth: ground truth, camera -> world. warnings: about the input and the weights of networks. title: of the report.
+    valid: bool [H, W], pixels of the undistorted images inside the original one; None if all are.
+    """
+
+    slam: Slam
+    dense: DenseMap
+    windows: tuple[WindowRecord, ...] = ()
+    truth: Trajectory | None = None
+    warnings: tuple[str, ...] = ()
+    title: str = "run"
+    valid: np.ndarray | None = None
+
+
 def write_page(
     path: Path,
-    slam: Slam,
-    *,
-    title: str,
-    truth: Trajectory | None,
-    cloud: PointCloud,
-    depth_maps: Sequence[DepthMap | None],
-    records: Sequence[WindowRecord],
+    record: RunRecord,
     summary: Mapping[str, Any],
     verdict: Verdict,
-    warnings: Sequence[str] = (),
     uncertainty: PoseUncertainty | None = None,
     mesh: Callable[[], Mesh | None] = lambda: None,
 ) -> None:
@@ -56,25 +69,20 @@ def write_page(
 
     Args:
         path: of the file.
-        slam: last state, with at least one frame.
-        title: of the page.
-        truth: ground truth, camera -> world, drawn beside the estimate.
-        cloud: the map.
-        depth_maps: dense depth of each keyframe.
-        records: one per adjustment of the window, in order.
+        record: of the run, with at least one frame.
         summary: content of `summary.json`.
         verdict: how far the result can be trusted; the first part of the page.
-        warnings: about the input; the state's notes follow.
         uncertainty: of the poses, for the 3D view.
         mesh: returns the mesh of the map for the 3D view, which is made last.
 
     """
+    slam, cloud, truth = record.slam, record.dense.cloud, record.truth
     trajectory = frame_trajectory(slam)
-    chosen = _spread(list(zip(slam.keyframes, depth_maps, strict=True)), SAMPLES)
+    chosen = _spread(list(zip(slam.keyframes, record.dense.depth_maps, strict=True)), SAMPLES)
     low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
     text = template("vggtgeo.report", "page.html.j2").render(
         style=style(),
-        title=title,
+        title=record.title,
         facts=_facts(slam, trajectory, cloud, summary),
         simulated=bool(summary.get("simulated")),
         interrupted=bool(summary.get("interrupted")),
@@ -84,10 +92,10 @@ def write_page(
         verdict=verdict,
         verdict_line=VERDICT_LINES[verdict.level],
         timeline=_timeline(verdict),
-        warnings=[*warnings, *slam.notes],
+        warnings=[*record.warnings, *slam.notes],
         trajectory=_draw_trajectory(slam, trajectory, truth, summary.get("truth", {}).get("in_metres", True)),
         has_truth=truth is not None,
-        residuals=figures.residuals_svg(records) if records else None,
+        residuals=figures.residuals_svg(record.windows) if record.windows else None,
         map_above=_map_picture(map_view.from_above, cloud, trajectory),
         map_inside=_map_picture(map_view.walk_in, cloud, trajectory),
         samples=[_sample(keyframe, depth_map, low, high) for keyframe, depth_map in chosen],
@@ -102,16 +110,14 @@ def write_page(
         scale=summary["scale"],
         scale_basis=summary.get("scale_basis"),
         install=INSTALL,
-        view=_view(slam, trajectory, truth, cloud, summary, uncertainty, mesh),
+        view=_view(record, trajectory, summary, uncertainty, mesh),
     )
     write_text(path, text)
 
 
 def _view(
-    slam: Slam,
+    record: RunRecord,
     trajectory: Trajectory,
-    truth: Trajectory | None,
-    cloud: PointCloud,
     summary: Mapping[str, Any],
     uncertainty: PoseUncertainty | None,
     mesh: Callable[[], Mesh | None],
@@ -119,13 +125,14 @@ def _view(
     """Return the 3D view; None if no frame has a pose, or K3D is not installed."""
     if not len(trajectory) or not has_viewer():
         return None
+    slam = record.slam
     scene = map_scene(
-        cloud,
+        record.dense.cloud,
         trajectory,
         pictured([slam.keyframes[number] for number in submaps_by_size(slam)[0]]),
         [float(value) for value in slam.intrinsics],
         mesh=mesh(),
-        truth=truth,
+        truth=record.truth,
         uncertainty=uncertainty,
         metric=slam.metric,
         truth_in_metres=summary.get("truth", {}).get("in_metres", True),

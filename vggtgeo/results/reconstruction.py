@@ -21,8 +21,9 @@ from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.models.onnx.bounds import Refusals
+from vggtgeo.report import RunRecord
 from vggtgeo.results.checkpoints import digest_of_map, load_checkpoint, run_identity
-from vggtgeo.results.result import Result, RunRecord
+from vggtgeo.results.result import Result
 from vggtgeo.results.run_options import RunOptions
 from vggtgeo.results.source import PosePrior, Source, open_source, reduction_summary, with_pose_prior
 from vggtgeo.results.summary import compare_with_truth, summarise

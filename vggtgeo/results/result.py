@@ -23,8 +23,8 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
 from vggtgeo.io.given import check_kind, check_plain, path_of
-from vggtgeo.mapping.dense import DenseMap, dense_map
-from vggtgeo.report import write_page
+from vggtgeo.mapping.dense import dense_map
+from vggtgeo.report import RunRecord, write_page
 from vggtgeo.results.files import (
     read_uncertainty,
     write_depth,
@@ -51,28 +51,9 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.window_recorder import WindowRecord
 
 DepthChoice = bool | Literal["every"]
 """Which depth images to save: none, those of the keyframes, or those of every frame."""
-
-
-@dataclass(frozen=True, eq=False)
-class RunRecord:
-    """The data of a result in memory, from which report and depth images are made.
-
-    slam: the last state. dense: the dense map after the last adjustment. windows: one per adjustment of the window.
-    truth: ground truth, camera -> world. warnings: about the input and the weights of networks. title: of the report.
-    valid: bool [H, W], pixels of the undistorted images inside the original one; None if all are.
-    """
-
-    slam: Slam
-    dense: DenseMap
-    windows: tuple[WindowRecord, ...] = ()
-    truth: Trajectory | None = None
-    warnings: tuple[str, ...] = ()
-    title: str = "run"
-    valid: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,20 +266,8 @@ class Result:
                 metres=record is None or summary.get("truth", {}).get("in_metres", True),
             )
         if record is not None:
-            write_page(
-                place / "report.html",
-                record.slam,
-                title=record.title,
-                truth=record.truth,
-                cloud=self.cloud,
-                depth_maps=record.dense.depth_maps,
-                records=record.windows,
-                summary=summary,
-                verdict=self.verdict,
-                warnings=record.warnings,
-                uncertainty=self.uncertainty,
-                mesh=mesh,
-            )
+            page = place / "report.html"
+            write_page(page, record, summary, self.verdict, self.uncertainty, mesh)
 
     def to_dict(self) -> dict[str, Any]:
         """Return counts, path length, intrinsics and summary as plain values."""
