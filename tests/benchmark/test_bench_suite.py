@@ -28,22 +28,6 @@ def test_every_suite_that_comes_along_can_be_read() -> None:
             assert all(published(table).lines())
 
 
-def test_the_paper_is_what_it_was() -> None:
-    # Proves the plan of the paper's tables: five seeds of the ablations on office and corridor, the full system alone
-    # in the hall, three seeds of the rest. Oracle: counted by hand.
-    jobs = jobs_of(load_suite("paper"), ())
-    count = lambda sequence, setting: sum((job.sequence, job.setting) == (sequence, setting) for job in jobs)
-    assert [count(name, "full") for name in ("office", "hall", "corridor")] == [5, 5, 5]
-    assert [count(name, "A") for name in ("office", "hall", "corridor")] == [5, 0, 5]
-    assert [count(name, "manhattan") for name in ("office", "hall", "corridor")] == [3, 0, 3]
-    assert len(jobs) == 103
-    full = next(job for job in jobs if (job.sequence, job.setting) == ("corridor", "full"))
-    assert full.spec["set"]["keyframes"]["keyframe_distance"] == 0.5
-    assert full.spec["set"]["weights"] == {"confidence": "paper"}
-    assert full.spec["set"]["refinement"] == {"global_adjustment": False}
-    assert full.spec["key_points"] == 600
-
-
 def test_runs_are_settings_upon_the_sequence_upon_the_suite() -> None:
     # Proves the order in which settings of the pipeline are laid over each other, and seeds. Oracle: by hand.
     text = tiny.TEXT.replace("seeds = 3", "seeds = 3\nfirst_seed = 7")

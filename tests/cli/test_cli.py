@@ -1,6 +1,5 @@
 """The program: quick to help, one line for an error, and `solve` from file to file."""
 
-import importlib.metadata
 import json
 import os
 import subprocess
@@ -167,10 +166,3 @@ def arrays_of_start() -> dict[str, np.ndarray]:
     """The start of the problem that `write` writes, as a solution's arrays."""
     arrays = arrays_of(SCENE)
     return {"T": arrays["T_init"].copy(), "k": arrays["k_init"], "d": arrays["d_init"]}
-
-
-def test_the_version_is_that_of_the_package() -> None:
-    # Proves that `--version` names the version, and ends well. Oracle: the package's metadata.
-    result = invoke("--version")
-    assert result.exit_code == 0
-    assert result.stdout == f"vggtgeo {importlib.metadata.version('vggtgeo')}\n"

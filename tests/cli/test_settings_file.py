@@ -11,7 +11,7 @@ from conftest import ROOT
 from typer.testing import CliRunner
 
 from vggtgeo.cli.main import make_app
-from vggtgeo.cli.options import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, JsonOption
+from vggtgeo.cli.options import JsonOption
 from vggtgeo.cli.settings_file import SettingsOption
 from vggtgeo.results.files import write_settings
 
@@ -108,11 +108,3 @@ def test_help_of_every_command_is_quick_and_shows_examples() -> None:
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"
-
-
-def test_the_help_tells_the_exit_codes() -> None:
-    # Proves that a script's author finds the codes. Oracle: the constants of the program.
-    listing = " ".join(CliRunner().invoke(make_app(), ["--help"], env={"COLUMNS": "300"}).output.split())
-    for code, meaning in ((0, "done"), (EXIT_INPUT, "something given is wrong"), (EXIT_INTERRUPTED, "interrupted")):
-        assert f"{code} {meaning}" in listing
-    assert f"{EXIT_INTERNAL} a fault" in listing

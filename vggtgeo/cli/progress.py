@@ -129,7 +129,7 @@ class ProgressBar(Callback):
 
     def _end_stage(self) -> None:
         if self._stage is not None:
-            total = self._progress.tasks[-1].total or 1
+            total = next(task.total for task in self._progress.tasks if task.id == self._stage) or 1
             self._progress.update(self._stage, total=total, completed=total)
             self._stage = None
 
