@@ -273,7 +273,7 @@ def test_a_delta_beyond_the_trajectory_gives_no_pairs() -> None:
     truth = _truth(10)
     report = evaluate_trajectory(truth, truth, delta=50)
     assert report.relative.translation_statistics.count == 0
-    assert report.as_dict()["rpe_translation_m"]["rmse"] is None
+    assert report.to_dict()["rpe_translation_m"]["rmse"] is None
 
 
 def test_two_published_truths_of_a_clip(shared_data: Path) -> None:

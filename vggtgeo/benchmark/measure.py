@@ -128,7 +128,7 @@ def trajectory_errors(
         "warnings": "; ".join([*report.warnings, *verdict.doubts, *explained]),
     }
     if offsets is not None:
-        known = offsets.as_dict()
+        known = offsets.to_dict()
         row |= {"time_offset_s": known["time_offset_s"], "time_offset_sd_s": known["time_offset_s_sd"]}
         row |= {"offsets": ", ".join(offsets.significant), "ate_sim3_without_offsets_m": offsets.ate_left}
     if verdict.reasons:

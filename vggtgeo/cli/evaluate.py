@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vggtgeo.geometry.trajectory import Trajectory
 
 MAX_TIME_DIFFERENCE = 0.01
-"""Seconds; equal to that of `vggtgeo.evaluation` (tested), repeated so that `--help` does not import it."""
+"""Seconds; that of `vggtgeo.evaluation.association`, repeated so that `--help` does not import it."""
 
 _WRITTEN_BY_RUNS = ("trajectory.txt", "keyframes.txt")
 _BENCHMARKS = ("groundtruth.txt", "groundtruth.csv", "data.csv", ".gt.freiburg")
@@ -90,11 +90,11 @@ def evaluate(
             rest, left = evaluate_trajectory(found, true, *rules), comparability(found, true, max_dt, metric)
     if as_json:
         known: dict[str, Any] = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
-        known["offsets"] = None if offsets is None else offsets.as_dict()
+        known["offsets"] = None if offsets is None else offsets.to_dict()
         if rest is not None:
-            known["without_offsets"] = {**rest.as_dict(), "comparable": not left.reasons}
+            known["without_offsets"] = {**rest.to_dict(), "comparable": not left.reasons}
         notices = {"warnings": [*report.warnings, *map(str, warned)], "comparable": not verdict.reasons}
-        typer.echo(json.dumps({**report.as_dict(), **known, **notices}, indent=2))
+        typer.echo(json.dumps({**report.to_dict(), **known, **notices}, indent=2))
     else:
         print_report(report, scale, metres)
         typer.echo(f"constant offsets: {'too few poses match to estimate them' if offsets is None else offsets}")

@@ -1,20 +1,15 @@
 """Metrics of trajectories, depth and maps: functions on arrays and trajectories, without files or printing."""
 
-from vggtgeo.evaluation.alignment import Alignment as Alignment
 from vggtgeo.evaluation.alignment import Similarity as Similarity
 from vggtgeo.evaluation.alignment import align as align
 from vggtgeo.evaluation.alignment import heading as heading
 from vggtgeo.evaluation.alignment import umeyama as umeyama
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE as MAX_TIME_DIFFERENCE
 from vggtgeo.evaluation.association import associate as associate
 from vggtgeo.evaluation.association import nearest_in_time as nearest_in_time
-from vggtgeo.evaluation.comparability import Comparability as Comparability
 from vggtgeo.evaluation.comparability import comparability as comparability
-from vggtgeo.evaluation.consistency import Consistency as Consistency
 from vggtgeo.evaluation.consistency import consistency as consistency
 from vggtgeo.evaluation.consistency import pose_consistency as pose_consistency
 from vggtgeo.evaluation.maps import CloudError as CloudError
-from vggtgeo.evaluation.maps import DepthError as DepthError
 from vggtgeo.evaluation.maps import cloud_error as cloud_error
 from vggtgeo.evaluation.maps import depth_error as depth_error
 from vggtgeo.evaluation.maps import surface_points as surface_points
@@ -23,8 +18,6 @@ from vggtgeo.evaluation.offsets import estimate_offsets as estimate_offsets
 from vggtgeo.evaluation.offsets import shifted as shifted
 from vggtgeo.evaluation.pose_errors import AbsoluteError as AbsoluteError
 from vggtgeo.evaluation.pose_errors import ErrorStatistics as ErrorStatistics
-from vggtgeo.evaluation.pose_errors import RelativeError as RelativeError
-from vggtgeo.evaluation.pose_errors import Unit as Unit
 from vggtgeo.evaluation.pose_errors import absolute_error as absolute_error
 from vggtgeo.evaluation.pose_errors import relative_error as relative_error
 from vggtgeo.evaluation.pose_errors import rotation_angle as rotation_angle

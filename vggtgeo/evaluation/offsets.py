@@ -74,7 +74,7 @@ class Offsets:
         moved = shifted(estimate, truth, self.time) if has["time offset"] else truth
         return Trajectory(moved.timestamps, moved.poses @ rigid.invert(_pose(turn, lever)))
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON, seconds, metres, degrees; None if the motion does not determine a number."""
         known = lambda values, sds: [float(v) if np.isfinite(sd) else None for v, sd in zip(values, sds, strict=True)]
         parts = {"time_offset_s": ([self.time], [self.time_sd]), "lever_arm_m": (self.lever, self.lever_sd)}

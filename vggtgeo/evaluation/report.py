@@ -72,10 +72,6 @@ class TrajectoryReport:
             found.append(f"no two poses are {self.relative.interval} apart: no RPE, give a smaller `delta`")
         return tuple(found)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return `as_dict()`."""
-        return self.as_dict()
-
     def __str__(self) -> str:
         se3, sim3, pairs = self.se3.statistics.rmse, self.sim3.statistics.rmse, self.relative
         translation, rotation = pairs.translation_statistics.rmse, np.degrees(pairs.rotation_statistics.rmse)
@@ -87,7 +83,7 @@ class TrajectoryReport:
 
     __repr__ = __str__
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON, metres and degrees; None if undefined."""
         pairs = self.relative, self.relative_sim3
         translations = [_plain(asdict(pair.translation_statistics)) for pair in pairs]

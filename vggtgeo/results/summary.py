@@ -89,7 +89,7 @@ def summarise(
         "notes": list(slam.notes),
         **counts,
     }
-    return values if report is None else {**values, "truth": {**report.as_dict(), "in_metres": truth_in_metres}}
+    return values if report is None else {**values, "truth": {**report.to_dict(), "in_metres": truth_in_metres}}
 
 
 def _pose_sigma(slam: Slam) -> dict[str, Any]:
