@@ -212,25 +212,30 @@ def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> 
 
     The ground truth is that of a run on the same sequence and seed (in `runs`), or of the recording.
     """
-    found: list[Row] = []
-    for table in suite.external:
-        places: dict[Path, Job] = {}
-        for job in jobs:
-            file = base / table.file(job.sequence, job.seed)
-            if is_there(file):
-                places.setdefault(file, job)
-        found += [_external_row(suite, table, job, file, runs) for file, job in places.items()]
-    return found
+    return [
+        _external_row(suite, table, job, file, runs)
+        for table in suite.external
+        for file, job in _external_files(table, jobs, base).items()
+        if is_there(file)
+    ]
 
 
 def warn_of_missing(suite: Suite, jobs: Sequence[Job], base: Path) -> None:
     """Warn of each `[[external]]` without any file, before the runs begin."""
     for table in suite.external:
-        files = list(dict.fromkeys(base / table.file(job.sequence, job.seed) for job in jobs))
+        files = list(_external_files(table, jobs, base))
         if files and not any(map(is_there, files)):
             more = f", nor any other of {len(files)} files" if len(files) > 1 else ""
             text = f"external `{table.name}` has no trajectory: `{files[0]}` does not exist{more}"
             warnings.warn(text, InputWarning, stacklevel=2)
+
+
+def _external_files(table: ExternalTable, jobs: Sequence[Job], base: Path) -> dict[Path, Job]:
+    """Return the files of the trajectories, each with its first job."""
+    files: dict[Path, Job] = {}
+    for job in jobs:
+        files.setdefault(base / table.file(job.sequence, job.seed), job)
+    return files
 
 
 def _external_row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -> Row:
