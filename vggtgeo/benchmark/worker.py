@@ -18,12 +18,10 @@ from typing import Any
 from vggtgeo.benchmark.inputs import open_input
 from vggtgeo.benchmark.measure import measure, truth_of_run
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, collected_warnings
 from vggtgeo.io.files import write_json
 from vggtgeo.io.peak_memory import peak_memory_gb
 from vggtgeo.results.reconstruction import reconstruct
-from vggtgeo.results.result import Result
 from vggtgeo.results.run_options import RunOptions
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -54,17 +52,11 @@ def identity(job: Mapping[str, Any]) -> dict[str, Any]:
     """Return the columns of a row that are known from its job."""
     spec = job["spec"]
     return {
-        "suite": job["suite"],
-        "sequence": job["sequence"],
-        "setting": job["setting"],
-        "seed": job["seed"],
-        "fingerprint": job["fingerprint"],
-        "protocol": spec["protocol"],
-        "perception": spec["perception"],
+        **{key: job[key] for key in ("suite", "sequence", "setting", "seed", "fingerprint", "input_hash")},
+        **{key: spec[key] for key in ("protocol", "perception")},
         "simulated": bool(spec["simulate"]),
         "depth_input": not spec["rgb_only"],
         "settings": json.dumps({key: spec[key] for key in _SETTINGS}, sort_keys=True),
-        "input_hash": job["input_hash"],
     }
 
 
@@ -93,7 +85,12 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
         if result.summary["interrupted"]:  # by a signal from outside: a part of the frames is not a result
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGTERM)
-        _save(folder, result, truth_of_run(result, given.truth), spec)
+        if spec["pages"]:
+            result.save(folder)
+        (result.trajectory if spec["poses"] == "all" else result.keyframes).save_tum(folder / "estimate.txt")
+        truth = truth_of_run(result, given.truth)
+        if truth is not None:
+            truth.save_tum(folder / "truth.txt")
     return measure(result, given, spec)
 
 
@@ -112,14 +109,6 @@ def recording(folder: Path, wanted: bool, scratch: Path | None = None) -> Iterat
         yield (RerunCallback(stream),)
         stream.disconnect()
         shutil.move(path, folder / RECORDING)
-
-
-def _save(folder: Path, result: Result, truth: Trajectory | None, spec: Mapping[str, Any]) -> None:
-    if spec["pages"]:
-        result.save(folder)
-    (result.trajectory if spec["poses"] == "all" else result.keyframes).save_tum(folder / "estimate.txt")
-    if truth is not None:
-        truth.save_tum(folder / "truth.txt")
 
 
 def end_with_parent(parent: int) -> None:
