@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from vggtgeo.evaluation import (
-    cloud_error,
-    consistency,
-    depth_error,
-    surface_points,
-)
+from vggtgeo.evaluation import cloud_error, consistency, depth_error, surface_points
 
 
 def test_depth_error_is_taken_where_both_are_valid() -> None:

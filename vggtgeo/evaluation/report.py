@@ -7,12 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vggtgeo.evaluation.alignment import VERTICAL
-from vggtgeo.evaluation.association import (
-    MAX_TIME_DIFFERENCE,
-    associate,
-    nearest_in_time,
-    spans,
-)
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, nearest_in_time, spans
 from vggtgeo.evaluation.pose_errors import AbsoluteError, RelativeError, Unit, absolute_error, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
