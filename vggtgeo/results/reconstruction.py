@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,6 @@ from vggtgeo.io.given import check_kind
 from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import check_dense, dense_map
-from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.report import RunRecord
 from vggtgeo.results.checkpoints import digest_of_map, load_checkpoint, run_identity
 from vggtgeo.results.result import Result
@@ -52,7 +51,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Finding, Verdict
 from vggtgeo.slam.verdict.judge import check_input, check_refusals, check_static_overlay, judge_or_report
-from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecorder
 
 FREE_MAP = (
     "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not used; start "
@@ -152,58 +151,39 @@ def reconstruct(
             **prior_summary(slam, perception.roles),
             **({} if overlay.found is None else {"static_overlay": round(overlay.found.share, 4)}),
         }
-        finished = _FinishedRun(
-            slam=slam,
-            source=source,
-            warned=(*options.warned, *(collected if before is None else before.merge_warnings(collected))),
-            refusals=perception.refusals,
-            title=options.title or source.name,
-            facts=summary_facts,
-            clock=clock,
-            began=began - (0.0 if before is None else before.whole),
-            dense=options.dense,
-        )
-        return _conclude(finished, settings, hooks, windows.records, overlay, evidence)
-
-
-@dataclass(frozen=True, eq=False)
-class _FinishedRun:
-    """A run after its last adjustment."""
-
-    slam: Slam
-    source: Source
-    warned: tuple[Warning | str, ...]
-    refusals: Mapping[str, Refusals]
-    title: str
-    facts: Mapping[str, Any]
-    clock: Clock
-    began: float
-    dense: str
+        warned = (*options.warned, *(collected if before is None else before.merge_warnings(collected)))
+        began -= 0.0 if before is None else before.whole
+        recorders = windows, evidence, overlay
+        return _conclude(slam, source, perception, settings, options, summary_facts, warned, began, hooks, recorders)
 
 
 def _conclude(
-    run: _FinishedRun,
+    slam: Slam,
+    source: Source,
+    perception: Perception,
     settings: SlamSettings,
+    options: RunOptions,
+    facts: Mapping[str, Any],
+    warned: tuple[Warning | str, ...],
+    began: float,
     hooks: RunCallbacks,
-    windows: Iterable[WindowRecord],
-    overlay: StaticOverlaySearch,
-    evidence: EvidenceRecorder,
+    recorders: tuple[WindowRecorder, EvidenceRecorder, StaticOverlaySearch],
 ) -> Result:
     """Build the dense map and, in a thread beside it, the verdict; then the summary."""
-    slam, clock = run.slam, run.clock
-    report = compare_with_truth(slam, run.source.truth)
+    clock, (windows, evidence, overlay) = hooks.clock, recorders
+    report = compare_with_truth(slam, source.truth)
 
     @in_double_precision
     def judge() -> Verdict:
         with clock.measure("verdict (own thread)"):
-            of_input = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals) + overlay.findings()
-            return judge_or_report(slam, evidence.frames, of_input)
+            of_images = check_refusals(perception.refusals) + overlay.findings()
+            return judge_or_report(slam, evidence.frames, check_input(warned, len(slam.frames)) + of_images)
 
     hooks.each("on_stage", "dense map and verdict")
     with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:
         judging = pool.submit(judge)
         with clock.measure("dense map"):
-            built = dense_map(slam, run.dense)
+            built = dense_map(slam, options.dense)
         hooks.each("on_finish", slam, built.cloud)
         verdict = judging.result()
     summary = {
@@ -211,17 +191,18 @@ def _conclude(
             slam,
             verdict,
             settings=changed(settings),
-            seconds={**clock.seconds, "all": time.perf_counter() - run.began},
+            seconds={**clock.seconds, "all": time.perf_counter() - began},
             report=report,
-            truth_in_metres=run.source.truth_in_metres,
+            truth_in_metres=source.truth_in_metres,
             map_points=len(built.cloud),
-            dense=run.dense,
+            dense=options.dense,
         ),
-        **run.facts,
+        **facts,
     }
-    notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
-    valid = (slam.camera.lens or run.source.camera).undistorter().valid
-    record = RunRecord(slam, built, tuple(windows), run.source.truth, notices, run.title, valid)
+    notices = (*([facts["meaningless"]] if "meaningless" in facts else []), *map(str, warned))
+    valid = (slam.camera.lens or source.camera).undistorter().valid
+    title = options.title or source.name
+    record = RunRecord(slam, built, tuple(windows.records), source.truth, notices, title, valid)
     return Result.assemble(record, verdict, summary)
 
 
