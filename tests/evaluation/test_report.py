@@ -127,7 +127,7 @@ def test_errors_against_a_truth_without_metres_are_no_centimetres(run: RecordedR
 
 def test_the_page_is_whole_and_needs_nothing_else(run: RecordedRun, tmp_path: Path) -> None:
     """Elements close, no address leads out of the file, identifiers are unique, and every part is there."""
-    text = _page(run, tmp_path, warnings=["frame 3 is torn & skipped"])
+    text = _page(run, tmp_path, warnings=("frame 3 is torn & skipped",))
     checker = CheckedPage(text)
     assert checker.wrong == []
     assert checker.open == []
