@@ -11,8 +11,8 @@ import tiny_sequences as tiny
 from reported import raises, warns
 from tiny_layouts import matroska
 
+from vggtgeo.cli.options import InputOptions
 from vggtgeo.cli.run import open_input
-from vggtgeo.cli.run_options import InputOptions
 from vggtgeo.datasets import (
     Frame,
     ImageFolder,

@@ -17,7 +17,7 @@ from vggtgeo.mapping.consistency import PosedDepth
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.frame_depth import rendered_depth
-from vggtgeo.results.reread_frames import depth_of_frames
+from vggtgeo.results.scene import depth_of_frames
 from vggtgeo.slam.run import default_roles
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam

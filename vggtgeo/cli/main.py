@@ -21,11 +21,10 @@ from typer.core import TyperGroup
 
 from vggtgeo.cli.bench import bench
 from vggtgeo.cli.data import data
-from vggtgeo.cli.demo import demo
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.cli.models import models
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
-from vggtgeo.cli.run import run
+from vggtgeo.cli.run import demo, run
 from vggtgeo.cli.simulate import simulate, warm_up
 from vggtgeo.cli.solve import solve
 from vggtgeo.cli.view import export, view

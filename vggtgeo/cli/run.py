@@ -1,4 +1,4 @@
-"""`vggtgeo run`: estimate trajectory and map of a sequence.
+"""`vggtgeo run`: estimate trajectory and map of a sequence; `vggtgeo demo`: of a synthetic office.
 
 Heavy modules are imported inside functions, so that `vggtgeo run --help` is fast.
 """
@@ -7,18 +7,26 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from vggtgeo.cli.models import FLAGS
-from vggtgeo.cli.options import with_option_groups
-from vggtgeo.cli.run_options import (
+from vggtgeo.cli.options import (
+    AssignmentsOption,
     InputOptions,
+    JsonOption,
     OutputOption,
     PerceptionOptions,
+    QuietOption,
+    RerunOption,
     ResultOptions,
+    ResumeOption,
     SequenceArgument,
     SwitchOptions,
+    with_option_groups,
 )
 from vggtgeo.cli.settings_file import SettingsOption, pipeline_settings
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning, collected_warnings
@@ -32,6 +40,8 @@ if TYPE_CHECKING:
 
 REFINE = {None: "auto", True: "always", False: "never"}
 """The setting behind `--refine-intrinsics`, `--fix-intrinsics`, or neither."""
+DEMO_SIZE = (480, 360)
+"""Pixels: large enough for a dense map, small enough to render during the run."""
 MAX_FPS = 1e5
 """Above that of any camera; at higher rates the times of frames would be equal after rounding."""
 
@@ -95,6 +105,47 @@ def run(
         RunOptions(given.start, given.end, given.stride, options.seed, options.dense, warned=warned),
         flags=settings.values() if settings else {},
         source=Path(path),
+    )
+
+
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("runs/demo"),
+    settings: SettingsOption = None,
+    scene: Annotated[str, typer.Option(help="Scene: office, hall, corridor, staircase, building, room.")] = "office",
+    frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of frames.")] = 45,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the scene and its noise.")] = 0,
+    assignments: AssignmentsOption = None,
+    rerun: RerunOption = None,
+    resume: ResumeOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run in a synthetic office with exact truth, rendered on the spot."""
+    from vggtgeo.cli.run_sequence import run_and_write
+    from vggtgeo.results.run_options import RunOptions
+    from vggtgeo.simulation import simulate
+    from vggtgeo.slam.settings.slam_settings import Roles
+    from vggtgeo.slam.window.sliding_window import warm_up
+    from vggtgeo.viewing.target import check_target
+
+    if rerun:
+        check_target(rerun)
+    slam_settings = pipeline_settings(settings, assignments or (), {})
+    # While the light of the scene is computed, what every window needs is compiled.
+    with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
+        compiled = pool.submit(warm_up, slam_settings)
+        sequence = simulate(scene, frames, seed, rate=10.0, size=DEMO_SIZE)
+        compiled.result()
+    if not (quiet or as_json):
+        typer.echo(f"simulated scene `{scene}`: all results below are from a simulation")
+    run_and_write(
+        sequence,
+        Roles(),
+        slam_settings,
+        output,
+        ResultOptions(rerun=rerun, resume=resume, quiet=quiet, as_json=as_json),
+        RunOptions(title=f"simulated {scene}", facts={"simulated": True}),
+        flags=settings.values() if settings else {},
     )
 
 

@@ -12,9 +12,8 @@ from typing import Any
 import typer
 from rich.console import Console
 
-from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
+from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, ResultOptions
 from vggtgeo.cli.progress import ProgressBar, print_result
-from vggtgeo.cli.run_options import ResultOptions
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.datasets.views import reduced

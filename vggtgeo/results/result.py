@@ -27,9 +27,8 @@ from vggtgeo.mapping.dense import dense_map
 from vggtgeo.report import RunRecord, write_page
 from vggtgeo.results.files import read_uncertainty, write_depth, write_settings, write_trajectories, write_uncertainty
 from vggtgeo.results.output_checks import unfinished_message
-from vggtgeo.results.reread_frames import depth_of_frames
 from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
-from vggtgeo.results.scene import write_scene
+from vggtgeo.results.scene import depth_of_frames, write_scene
 from vggtgeo.results.summary import add_writing_time, compare_with_truth, load_poses, read_summary, summarise
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
