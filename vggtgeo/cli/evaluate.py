@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from vggtgeo.cli.options import EXIT_FAILED, JsonOption, with_option_groups
+from vggtgeo.cli.options import EXIT_FAILED, JsonOption
 from vggtgeo.io.errors import InputWarning, collected_warnings
 from vggtgeo.io.text_files import whole_text
 
@@ -28,38 +27,22 @@ _BENCHMARKS = ("groundtruth.txt", "groundtruth.csv", "data.csv", ".gt.freiburg")
 """Endings of ground-truth files in metres: TUM RGB-D (and datasets of its layout), EuRoC, ICL-NUIM."""
 
 
-@dataclass(frozen=True)
-class PairOptions:
-    """Pairs of poses whose relative pose error is computed."""
-
-    delta: Annotated[float, typer.Option(min=0, help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0
-    unit: Annotated[
-        Literal["poses", "seconds", "metres"], typer.Option(help="Of --delta: poses, seconds, or metres of true path.")
-    ] = "poses"
-    all_pairs: Annotated[bool, typer.Option(help="Overlapping pairs for RPE, not consecutive ones.")] = False
-
-
-@dataclass(frozen=True)
-class ComparisonOptions:
-    """Frame and clock of the ground truth."""
-
-    vertical: Annotated[
-        Literal["x", "y", "z"], typer.Option(help="Axis of GT that points up or down, for the yaw-only alignment.")
-    ] = "z"
-    time_offset: Annotated[float, typer.Option(help="Seconds to add to the times of GT (its clock is late).")] = 0.0
-    estimate_offset: Annotated[
-        bool, typer.Option(help="Report the errors without the estimated offsets of clock and body, too.")
-    ] = False
-
-
-@with_option_groups
 def evaluate(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM, KITTI), or a run's folder.")],
     truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM, KITTI, EuRoC), or a dataset folder.")],
     max_dt: Annotated[float, typer.Option(min=0, help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
-    *,
-    pairs: PairOptions,
-    comparison: ComparisonOptions,
+    delta: Annotated[float, typer.Option(min=0, help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0,
+    unit: Annotated[
+        Literal["poses", "seconds", "metres"], typer.Option(help="Of --delta: poses, seconds, or metres of true path.")
+    ] = "poses",
+    all_pairs: Annotated[bool, typer.Option(help="Overlapping pairs for RPE, not consecutive ones.")] = False,
+    vertical: Annotated[
+        Literal["x", "y", "z"], typer.Option(help="Axis of GT that points up or down, for the yaw-only alignment.")
+    ] = "z",
+    time_offset: Annotated[float, typer.Option(help="Seconds to add to the times of GT (its clock is late).")] = 0.0,
+    estimate_offset: Annotated[
+        bool, typer.Option(help="Report the errors without the estimated offsets of clock and body, too.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT, and constant offsets between the two.
@@ -73,9 +56,9 @@ def evaluate(
     with collected_warnings() as warned:
         true, metres = load_truth(truth)
         found, scale = load_estimate(estimate, true), load_scale(estimate)
-        if comparison.time_offset:
-            true = shifted(found, true, comparison.time_offset)
-        rules = max_dt, pairs.delta, pairs.all_pairs, pairs.unit, AXES[comparison.vertical]
+        if time_offset:
+            true = shifted(found, true, time_offset)
+        rules = max_dt, delta, all_pairs, unit, AXES[vertical]
         report = evaluate_trajectory(found, true, *rules)
         metric = metres is not False and scale is not None and scale.startswith("metric")
         verdict = comparability(found, true, max_dt, metric)
@@ -85,7 +68,7 @@ def evaluate(
         if offsets is not None and offsets.explains:
             warnings.warn(offsets.message, InputWarning, stacklevel=2)
         rest, left = None, verdict
-        if comparison.estimate_offset and offsets is not None:
+        if estimate_offset and offsets is not None:
             true = offsets.removed(found, true)
             rest, left = evaluate_trajectory(found, true, *rules), comparability(found, true, max_dt, metric)
     if as_json:

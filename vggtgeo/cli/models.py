@@ -6,13 +6,13 @@ Heavy modules are imported inside functions, so that `--help` is fast.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.options import JsonOption, QuietOption, with_option_groups
+from vggtgeo.cli.options import JsonOption, QuietOption
 from vggtgeo.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -133,25 +133,7 @@ def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
     }
 
 
-@dataclass(frozen=True)
-class ExportOptions:
-    """Weights and shape of the exported network."""
-
-    checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None
-    random_weights: Annotated[bool, typer.Option(help="For tests and timing: random weights.")] = False
-    height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None
-    width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None
-    views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None
-    tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None
-    variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None
-    allow_extra_weights: Annotated[
-        bool, typer.Option(help="Leave out weights of the checkpoint that the network has no place for.")
-    ] = False
-    half: Annotated[bool, typer.Option(help="Attention and perceptrons in float16.")] = False
-
-
 @models.command()
-@with_option_groups
 def export(
     name: Annotated[
         str,
@@ -161,7 +143,17 @@ def export(
     ],
     source: Annotated[Path, typer.Option(help="Checkout of the network's published code.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.onnx", help="File to write.")],
-    options: ExportOptions,
+    checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None,
+    random_weights: Annotated[bool, typer.Option(help="For tests and timing: random weights.")] = False,
+    height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None,
+    width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None,
+    views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None,
+    tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None,
+    variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None,
+    allow_extra_weights: Annotated[
+        bool, typer.Option(help="Leave out weights of the checkpoint that the network has no place for.")
+    ] = False,
+    half: Annotated[bool, typer.Option(help="Attention and perceptrons in float16.")] = False,
     tolerance: Annotated[
         float | None,
         typer.Option(help="Largest difference from PyTorch; 0.001, or 0.03 with --half.", show_default=False),
@@ -177,14 +169,14 @@ def export(
         if not quiet:
             typer.echo(f"{stage} ...", err=True)
 
-    if (options.checkpoint is None) != options.random_weights:
-        found = "neither was given" if options.checkpoint is None else "both were given"
+    if (checkpoint is None) != random_weights:
+        found = "neither was given" if checkpoint is None else "both were given"
         raise InputError(f"one of `--checkpoint` FILE and `--random-weights` is needed; {found}")
     try:
         recipe = recipe_of(name)
         request = recipe.request(
-            *(source, options.checkpoint, options.height, options.width, options.views, options.tokens),
-            *(options.variant, options.half, options.allow_extra_weights),
+            *(source, checkpoint, height, width, views, tokens),
+            *(variant, half, allow_extra_weights),
         )
         from vggtgeo.models.exporters.export import export as write
 
