@@ -3,59 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.options import JsonOption, with_option_groups
+from vggtgeo.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from vggtgeo.benchmark.table import Row
 
 
-@dataclass(frozen=True)
-class SelectionOptions:
-    """Which runs of the suite are made."""
-
-    data: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of recordings; may be given several times.", show_default="$VGGTGEO_DATA, data"),
-    ] = None
-    sequences: Annotated[str | None, typer.Option(help="Some sequences of the suite, with commas.")] = None
-    settings: Annotated[str | None, typer.Option(help="Some settings of the suite, with commas.")] = None
-    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the suite's.")] = None
-    first_seed: Annotated[int | None, typer.Option(min=0, help="First seed.")] = None
-    frames: Annotated[int | None, typer.Option(min=1, help="Of each sequence, at most.")] = None
-
-
-@dataclass(frozen=True)
-class LimitOptions:
-    """Processes, their limits, and what each run writes."""
-
-    workers: Annotated[int, typer.Option(min=1, help="Processes; the processors are shared out.")] = 1
-    timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None
-    memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None
-    retry: Annotated[bool, typer.Option(help="Run again what ended without a result.")] = False
-    recordings: Annotated[
-        bool | None, typer.Option(help="A file run.rrd of each run, for Rerun.", show_default="the suite's")
-    ] = None
-
-
-@dataclass(frozen=True)
-class ClusterOptions:
-    """Where the runs are made."""
-
-    engine: Annotated[
-        Literal["processes", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
-    ] = "processes"
-    address: Annotated[str, typer.Option(help="Of the Ray cluster; local starts one.")] = "auto"
-    cpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 1.0
-    gpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 0.0
-
-
-@with_option_groups
 def bench(
     suite: Annotated[
         str, typer.Argument(metavar="SUITE", help="A TOML file, or a suite that comes along; `list` lists those.")
@@ -64,10 +22,28 @@ def bench(
         Path | None,
         typer.Option("-o", "--output", help="Folder; finished runs in it are kept.", show_default="runs/SUITE"),
     ] = None,
-    *,
-    runs: SelectionOptions,
-    limits: LimitOptions,
-    ray: ClusterOptions,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of recordings; may be given several times.", show_default="$VGGTGEO_DATA, data"),
+    ] = None,
+    sequences: Annotated[str | None, typer.Option(help="Some sequences of the suite, with commas.")] = None,
+    settings: Annotated[str | None, typer.Option(help="Some settings of the suite, with commas.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the suite's.")] = None,
+    first_seed: Annotated[int | None, typer.Option(min=0, help="First seed.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Of each sequence, at most.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; the processors are shared out.")] = 1,
+    timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
+    memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
+    retry: Annotated[bool, typer.Option(help="Run again what ended without a result.")] = False,
+    recordings: Annotated[
+        bool | None, typer.Option(help="A file run.rrd of each run, for Rerun.", show_default="the suite's")
+    ] = None,
+    engine: Annotated[
+        Literal["processes", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
+    ] = "processes",
+    address: Annotated[str, typer.Option(help="Of the Ray cluster; local starts one.")] = "auto",
+    cpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 1.0,
+    gpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 0.0,
     quiet: Annotated[bool, typer.Option(help="Print the tables only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -102,10 +78,19 @@ def bench(
         report = run_suite(
             suite,
             folder,
-            **{**vars(runs), "sequences": _list(runs.sequences), "settings": _list(runs.settings)},
-            **vars(limits),
+            data=data,
+            sequences=_list(sequences),
+            settings=_list(settings),
+            seeds=seeds,
+            first_seed=first_seed,
+            frames=frames,
+            workers=workers,
+            timeout_minutes=timeout_minutes,
+            memory_gb=memory_gb,
+            retry=retry,
+            recordings=recordings,
             progress=advance,
-            cluster=Cluster(ray.address, ray.cpus, ray.gpus) if ray.engine == "ray" else None,
+            cluster=Cluster(address, cpus, gpus) if engine == "ray" else None,
         )
     typer.echo(json.dumps(report.to_dict()) if as_json else report.markdown())
     if not (quiet or as_json):
