@@ -44,7 +44,8 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
         for name in cells.sequences_of(suite, good)
     }
     panels = {name: keys for name, keys in panels.items() if keys}
-    label = lambda name, key: f"{suite.title_of(key)}{_part(select(good, name, key))}"
+    coverage = lambda own: "" if cells.is_covered(own) else cells.at_coverage(own)  # if too small for a comparison
+    label = lambda name, key: f"{suite.title_of(key)}{coverage(select(good, name, key))}"
     rows_of = {name: [_wrapped(label(name, key), _LABEL) for key in keys] for name, keys in panels.items()}
     heights = [_height(labels) + _MARGIN for labels in rows_of.values()]
     figure = NotebookFigure(figsize=(width, sum(heights) + 0.5 if panels else 1.5), layout="constrained")
@@ -57,11 +58,6 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
         axes.set_title(_wrapped(name, _TITLE), loc="left", fontsize=10, color=INK)
     drawn[-1].set_xlabel(f"{column.head}; dots: runs, bars: means with 95 % intervals", fontsize=9, color=INK)
     return figure
-
-
-def _part(rows: Sequence[Row]) -> str:
-    """Return the coverage as text if it is too small for a comparison."""
-    return "" if cells.is_covered(rows) else cells.at_coverage(rows)
 
 
 def _wrapped(text: str, width: int) -> str:

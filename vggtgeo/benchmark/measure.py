@@ -174,9 +174,10 @@ def pooled_depth_errors(fused: _Depths, before: _Depths, exact: ExactFrames, sca
     `depth_prior_rmse_m` is that of `before`. Exact depth is reduced to the size of the depth by nearest neighbour
     (`camera.max_pixels`).
     """
+    resized = lambda truth, like: cv2.resize(truth, like.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     found, prior = (
         [
-            depth_error((np.float32(scale) * depth).astype(np.float64), _as_large(exact.depth(frame), depth.shape))
+            depth_error((np.float32(scale) * depth).astype(np.float64), resized(exact.depth(frame), depth))
             for frame, depth in pairs
             if depth is not None and np.isfinite(depth).any()
         ]
@@ -193,10 +194,6 @@ def pooled_depth_errors(fused: _Depths, before: _Depths, exact: ExactFrames, sca
         "depth_below_1_25": pooled([one.inliers for one in found]),
         "depth_prior_rmse_m": math.sqrt(np.average(known[:, 0], weights=known[:, 1])) if len(known) else None,
     }
-
-
-def _as_large(truth: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    return np.asarray(cv2.resize(truth, shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT), np.float64)
 
 
 def map_errors(result: Result, given: Input, alignment: Similarity, spec: Mapping[str, Any]) -> dict[str, Any]:

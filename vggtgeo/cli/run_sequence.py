@@ -116,14 +116,11 @@ def _print_note(console: Console, text: str) -> None:
 
 def _save_map(result: Result, file: Path | None) -> str:
     """Save the map if asked for; return an error message, empty on success."""
-    if file is None:
-        return ""
     try:
-        result.save_map(file)
-    except OSError as error:
-        return f"the map `{file}` could not be saved: {error.strerror or error}"
-    except InputError as error:
-        return f"the map `{file}` could not be saved: {error}"
+        if file is not None:
+            result.save_map(file)
+    except (OSError, InputError) as error:
+        return f"the map `{file}` could not be saved: {getattr(error, 'strerror', None) or error}"
     return ""
 
 

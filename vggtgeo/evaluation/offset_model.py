@@ -238,7 +238,7 @@ class OffsetModel:
             for time in {0.0, *times}
             for start in self._starts(time, free)
         ]
-        unknowns = min(starts, key=lambda one: self._log_sigma(self._residuals(one)))
+        unknowns = min(starts, key=lambda one: sum(np.log(part.sigma) for part in self._white(self._residuals(one))))
         noise = self._noise(unknowns, free)
         for _ in range(_ROUNDS):
             unknowns, before = self._solved(unknowns, free, noise), noise
@@ -275,9 +275,6 @@ class OffsetModel:
         position = ((moved - true[:, :3, 3]) ** 2).sum(axis=1).mean()
         rotation = _turn_of_steps(found[:, :3, :3], true[:, :3, :3])[1]
         return float(np.log(position + self._min_sigma[0] ** 2) + np.log(rotation + self._min_sigma[1] ** 2))
-
-    def _log_sigma(self, residuals: np.ndarray) -> float:
-        return sum(np.log(one.sigma) for one in self._white(residuals))
 
     def _starts(self, time: float, free: np.ndarray) -> Iterator[Unknowns]:
         """Return initial values from positions alone, and from rotations: the latter are better for a straight path or

@@ -68,11 +68,13 @@ class Offsets:
 
     def removed(self, estimate: Trajectory, truth: Trajectory) -> Trajectory:
         """Return the ground truth without the significant offsets: of the camera itself, by the estimate's clock."""
-        has = {name: name in self.significant for name in _PARTS}
-        lever = self.lever if has["lever arm"] else np.zeros(3)
-        turn = self.turn if has["rotation"] else np.eye(3)
-        moved = shifted(estimate, truth, self.time) if has["time offset"] else truth
-        return Trajectory(moved.timestamps, moved.poses @ rigid.invert(_pose(turn, lever)))
+        body = np.eye(4)
+        if "lever arm" in self.significant:
+            body[:3, 3] = self.lever
+        if "rotation" in self.significant:
+            body[:3, :3] = self.turn
+        moved = shifted(estimate, truth, self.time) if "time offset" in self.significant else truth
+        return Trajectory(moved.timestamps, moved.poses @ rigid.invert(body))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON, seconds, metres, degrees; None if the motion does not determine a number."""
@@ -146,7 +148,8 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
     kept, names = _reduced(model, model.fit(free, start), tried)
     alone = model.fit(free & (np.arange(UNKNOWNS) < TIME.start))
     shown = {name: kept if name in names else model.refit(kept, _with(kept.free, name)) for name in _PARTS}
-    sds = {name: _deviations(fit)[_PARTS[name]] for name, fit in shown.items()}
+    deviations = lambda fit: np.where(fit.determined, np.sqrt(np.maximum(np.diag(fit.covariance), 0.0)), np.inf)
+    sds = {name: deviations(fit)[_PARTS[name]] for name, fit in shown.items()}
     found = Offsets(
         time=shown["time offset"].unknowns.time,
         time_sd=float(sds["time offset"][0]),
@@ -210,16 +213,6 @@ def _chance(fit: Fit, part: slice) -> float:
     # A pseudoinverse: exact paths without turns determine an offset in fewer directions than it has numbers.
     statistic = value[known] @ np.linalg.pinv(covariance, hermitian=True) @ value[known] / known.sum()
     return float(fisher.sf(statistic, known.sum(), fit.degrees))
-
-
-def _deviations(fit: Fit) -> np.ndarray:
-    return np.where(fit.determined, np.sqrt(np.maximum(np.diag(fit.covariance), 0.0)), np.inf)
-
-
-def _pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose
 
 
 def _numbers(values: Iterable[float], sds: Iterable[float], unit: str = "") -> str:

@@ -80,6 +80,8 @@ def write_page(
     trajectory = frame_trajectory(slam)
     chosen = _spread(list(zip(slam.keyframes, record.dense.depth_maps, strict=True)), SAMPLES)
     low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
+    in_metres, keyframes = summary.get("truth", {}).get("in_metres", True), keyframe_trajectory(slam)
+    drawn = figures.trajectory_svg(trajectory, truth, keyframes, not slam.metric, in_metres) if len(trajectory) else ""
     text = template("vggtgeo.report", "page.html.j2").render(
         style=style(),
         title=record.title,
@@ -93,7 +95,7 @@ def write_page(
         verdict_line=VERDICT_LINES[verdict.level],
         timeline=_timeline(verdict),
         warnings=[*record.warnings, *slam.notes],
-        trajectory=_draw_trajectory(slam, trajectory, truth, summary.get("truth", {}).get("in_metres", True)),
+        trajectory=drawn,
         has_truth=truth is not None,
         residuals=figures.residuals_svg(record.windows) if record.windows else None,
         map_above=_map_picture(map_view.from_above, cloud, trajectory),
@@ -138,13 +140,6 @@ def _view(
         truth_in_metres=summary.get("truth", {}).get("in_metres", True),
     )
     return view_html(scene)
-
-
-def _draw_trajectory(slam: Slam, trajectory: Trajectory, truth: Trajectory | None, metres: bool) -> str:
-    """Return the figure as SVG; empty if no frame has a pose. metres: whether the truth is in metres."""
-    if not len(trajectory):
-        return ""
-    return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric, metres)
 
 
 def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
