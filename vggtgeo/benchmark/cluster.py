@@ -109,20 +109,15 @@ def _store_result(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[s
     return store.complete(job, **ending)
 
 
-def _check_answers(address: str) -> None:
-    """Raise OSError if `host:port` does not answer: Ray itself would try for minutes."""
-    host, colon, port = address.rpartition(":")
-    if colon and port.isdigit() and "://" not in address:
-        socket.create_connection((host, int(port)), timeout=5.0).close()
-
-
 def _connect(cluster: Cluster) -> Any:
     try:
         import ray
     except ImportError:
         raise InputError(f"a cluster needs Ray; {install_hint('cluster')}") from None
+    host, colon, port = cluster.address.rpartition(":")
     try:
-        _check_answers(cluster.address)
+        if colon and port.isdigit() and "://" not in host:  # Ray itself would try for minutes
+            socket.create_connection((host, int(port)), timeout=5.0).close()
         ray.init(address=cluster.address, log_to_driver=False)
     except (OSError, ValueError) as error:
         text = str(error).splitlines()[0]

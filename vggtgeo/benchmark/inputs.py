@@ -191,20 +191,19 @@ def degraded(walk: RenderedWalk, name: str, seed: int) -> DegradedWalk:
 def simulated_roles(oracle: SimulatedOracle, spec: Mapping[str, Any], seed: int) -> Roles:
     """Return the five stubs with their standard error models; depth errors are scaled by the setting's factor."""
     moge, factor = SimulatedMoge(oracle, seed), spec["depth_errors"]
+    starts: dict[str, InitialGeometry] = {
+        "constant-velocity": ConstantVelocity(),
+        "pnp": PnpGeometry(),
+        "window": WindowLocator(SimulatedVggt(oracle, seed), PnpGeometry()),
+    }
     return Roles(
         points=SimulatedMast3r(oracle, seed, count=spec["key_points"]),
         lines=SimulatedLetr(oracle, seed),
         depth=replace(moge, error=factor * moge.error, wobble=factor * moge.wobble),
         confidence=SimulatedDino(oracle, seed),
-        geometry=_start(spec["start_of_pose"], SimulatedVggt(oracle, seed)),
+        geometry=starts[spec["start_of_pose"]],
         alignment=None,  # not in the paper, and it would hide the effect of the initial pose in the ablation
     )
-
-
-def _start(name: str, vggt: SimulatedVggt) -> InitialGeometry:
-    if name == "constant-velocity":
-        return ConstantVelocity()
-    return PnpGeometry() if name == "pnp" else WindowLocator(vggt, PnpGeometry())
 
 
 def _without(sequence: Sequence, spec: Mapping[str, Any]) -> Sequence:

@@ -29,7 +29,12 @@ def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> N
         about=suite.about.strip().replace("`", ""),
         notice=markdown.notice(suite, rows).replace("`", ""),
         facts=_facts(suite, there),
-        tables=_accuracy_tables(suite, there),
+        tables=[
+            {"head": column.head, "columns": heads, "rows": lines}
+            for column in (cells.SE3, cells.SIM3)
+            for heads, lines in [cells.matrix(suite, there, column)]
+            if any(cell.text for _, line in lines for cell in line)
+        ],
         base=suite.title_of(suite.base),
         compared=[column.head for column in cells.COMPARED],
         differences=cells.differences(suite, good),
@@ -64,15 +69,6 @@ def _facts(suite: Suite, rows: Sequence[Row]) -> list[tuple[str, str]]:
         (str(len(cells.settings_of(suite, good))), "settings"),
         *((str(levels.count(level)), f"called {level}") for level in ("good", "degraded", "failed") if level in levels),
         (f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s", "of runs"),
-    ]
-
-
-def _accuracy_tables(suite: Suite, rows: Sequence[Row]) -> list[dict[str, Any]]:
-    both = {column: cells.matrix(suite, rows, column) for column in (cells.SE3, cells.SIM3)}
-    return [
-        {"head": column.head, "columns": heads, "rows": lines}
-        for column, (heads, lines) in both.items()
-        if any(cell.text for _, line in lines for cell in line)
     ]
 
 

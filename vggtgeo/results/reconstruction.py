@@ -26,7 +26,7 @@ from vggtgeo.results.result import Result
 from vggtgeo.results.run_options import RunOptions
 from vggtgeo.results.source import PosePrior, Source, open_source, reduction_summary, with_pose_prior
 from vggtgeo.results.summary import compare_with_truth, summarise
-from vggtgeo.results.tracking_loop import RunCallbacks, Tracked, TrackingLoop
+from vggtgeo.results.tracking_loop import RunCallbacks, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
@@ -140,12 +140,14 @@ def reconstruct(
             first = _calibrate(source, selection, perception, settings, hooks, stop)
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
         with loop.checkpoint_writer(options.checkpoints, identity) as writer:
-            tracked = loop.track(writer)
-            slam, interrupted = _finish_unless_interrupted(tracked, perception.roles, settings, hooks, stop)
+            slam, interrupted, rate = loop.track(writer)
+            hooks.each("on_adjust", slam)
+            if not interrupted:
+                slam, interrupted = _finish(slam, perception.roles, settings, hooks, stop)
         summary_facts = {
             **perception.facts(),
             **options.facts,
-            "frames_per_second": round(tracked.frames_per_second, 2),
+            "frames_per_second": round(rate, 2),
             "interrupted": interrupted,
             **reduction_summary(source, slam),
             **prior_summary(slam, perception.roles),
@@ -281,20 +283,17 @@ def _perception(
     return replace(found, roles=found.roles.seeded(seed)) if seed else found
 
 
-def _finish_unless_interrupted(
-    tracked: Tracked, roles: Roles, settings: SlamSettings, hooks: RunCallbacks, stop: Interruption
+def _finish(
+    slam: Slam, roles: Roles, settings: SlamSettings, hooks: RunCallbacks, stop: Interruption
 ) -> tuple[Slam, bool]:
-    """Run the last adjustment, unless Ctrl-C ended the run; return the state, and whether it did."""
-    hooks.each("on_adjust", tracked.slam)
-    if tracked.interrupted:
-        return tracked.slam, True
+    """Run the last adjustment; return the state, and whether Ctrl-C ended it."""
     hooks.each("on_stage", "last adjustment")
     try:
         with stop.at_once():
-            return finish(tracked.slam, roles, settings, hooks.clock), False
+            return finish(slam, roles, settings, hooks.clock), False
     except KeyboardInterrupt:
         hooks.each("on_message", "interrupted: keeping the result without the last adjustment")
-        return tracked.slam, True
+        return slam, True
 
 
 class StaticOverlaySearch(Callback):
