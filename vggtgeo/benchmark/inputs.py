@@ -29,6 +29,7 @@ from vggtgeo.models.classical import ConstantVelocity, PnpGeometry
 from vggtgeo.models.roles import InitialGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
 from vggtgeo.models.window_locator import WindowLocator
+from vggtgeo.report.map_scene import spread
 from vggtgeo.simulation import SimulatedOracle, simulate
 from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
 from vggtgeo.slam.run import default_roles
@@ -278,9 +279,8 @@ def exact_cloud(frames: ExactFrames) -> np.ndarray:
     """Return world points of the visible surfaces, float64 [n, 3]: every fourth pixel of at most 30 frames."""
     step = 4
     fx, fy, cx, cy = frames.camera.intrinsics
-    count = len(frames)
     clouds = []
-    for index in np.unique(np.linspace(0, count - 1, min(count, 30)).round().astype(int)):
+    for index in spread(len(frames), 30):
         depth, pose = frames.depth(int(index))[::step, ::step], frames.pose(int(index))
         v, u = np.nonzero(np.isfinite(depth) & np.isfinite(pose).all())
         z = depth[v, u]

@@ -27,6 +27,7 @@ from vggtgeo.evaluation.alignment import AXES, Axis
 from vggtgeo.evaluation.pose_errors import Unit
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.report.map_scene import spread
 from vggtgeo.results.result import Result
 
 DELTAS: tuple[tuple[str, float, Unit], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0, "metres"))
@@ -158,8 +159,7 @@ def depth_errors(result: Result, given: Input, alignment: Similarity) -> dict[st
     if given.exact is None or result.record is None:
         return {}
     pairs = list(zip(result.record.slam.keyframes, result.record.dense.depth_maps, strict=True))
-    rows = np.unique(np.linspace(0, len(pairs) - 1, _DEPTH_MAPS).round().astype(int))
-    chosen = [pairs[row] for row in rows]
+    chosen = [pairs[row] for row in spread(len(pairs), _DEPTH_MAPS)]
     fused = [(keyframe.frame, None if depth_map is None else depth_map.depth) for keyframe, depth_map in chosen]
     before = [(keyframe.frame, keyframe.depth) for keyframe, _ in chosen]
     return pooled_depth_errors(fused, before, given.exact, alignment.scale)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from vggtgeo.evaluation import align, associate
@@ -65,9 +65,13 @@ class MapScene:
         return json.dumps(self.header, separators=(",", ":")).replace("<", "\\u003c")
 
 
+def spread(count: int, most: int) -> Int[np.ndarray, " n"]:
+    """Return at most `most` of the rows 0 to `count` - 1, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+
+
 def pictured(keyframes: Sequence[Keyframe]) -> list[Pictured]:
     """Return at most `MAX_KEYFRAMES` keyframes, evenly spread, with small images."""
-    rows = np.unique(np.linspace(0, len(keyframes) - 1, min(MAX_KEYFRAMES, len(keyframes))).round().astype(int))
     return [
         Pictured(
             f"frame {one.frame}",
@@ -75,7 +79,7 @@ def pictured(keyframes: Sequence[Keyframe]) -> list[Pictured]:
             one.timestamp,
             jpeg(one.image, _IMAGE_WIDTH, _IMAGE_QUALITY),
         )
-        for one in (keyframes[row] for row in rows)
+        for one in (keyframes[row] for row in spread(len(keyframes), MAX_KEYFRAMES))
     ]
 
 
@@ -192,8 +196,7 @@ def _spacing(points: np.ndarray) -> float:
 
 
 def _thinned(positions: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    rows = np.unique(np.linspace(0, len(positions) - 1, min(MAX_POSES, len(positions))).round().astype(int))
-    return positions[rows].astype(np.float32)
+    return positions[spread(len(positions), MAX_POSES)].astype(np.float32)
 
 
 def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> Trajectory | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from vggtgeo.io.files import write_text
 from vggtgeo.mapping.dense import DenseMap
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
-from vggtgeo.report.map_scene import map_scene, pictured
+from vggtgeo.report.map_scene import map_scene, pictured, spread
 from vggtgeo.report.viewer import INSTALL, has_viewer, style, template, view_html
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -27,7 +27,6 @@ from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.window_recorder import WindowRecord
 
-_Value = TypeVar("_Value")
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""
 VERDICT_LINES = {
@@ -78,7 +77,7 @@ def write_page(
     """
     slam, cloud, truth = record.slam, record.dense.cloud, record.truth
     trajectory = frame_trajectory(slam)
-    chosen = _spread(list(zip(slam.keyframes, record.dense.depth_maps, strict=True)), SAMPLES)
+    chosen = [(slam.keyframes[row], record.dense.depth_maps[row]) for row in spread(len(slam.keyframes), SAMPLES)]
     low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
     in_metres, keyframes = summary.get("truth", {}).get("in_metres", True), keyframe_trajectory(slam)
     drawn = figures.trajectory_svg(trajectory, truth, keyframes, not slam.metric, in_metres) if len(trajectory) else ""
@@ -202,11 +201,6 @@ def _stages(seconds: Mapping[str, float]) -> list[tuple[str, float, float]]:
     shown = {name: value for name, value in seconds.items() if name != "all" and value >= 0.005}
     longest = max(shown.values(), default=1.0)
     return [(name, value, value / longest) for name, value in sorted(shown.items(), key=lambda item: -item[1])]
-
-
-def _spread(values: Sequence[_Value], count: int) -> list[_Value]:
-    rows = np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int))
-    return [values[row] for row in rows]
 
 
 def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
