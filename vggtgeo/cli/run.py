@@ -60,8 +60,6 @@ def run(
     """Estimate trajectory and map of the sequence at PATH."""
     from vggtgeo.datasets.frame import check_selection
     from vggtgeo.datasets.opening import check_there
-    from vggtgeo.io.network_files import as_input_errors
-    from vggtgeo.models.onnx.providers import choose_provider
     from vggtgeo.results.output_checks import check_can_be_written, check_output, is_in_results
     from vggtgeo.viewing.target import check_target
 
@@ -85,6 +83,9 @@ def run(
     if len(sequence):  # zero for a live camera
         check_selection(sequence.name, len(sequence), given.start, given.end, given.stride)
     if perception.provider == "cuda":
+        from vggtgeo.io.network_files import as_input_errors
+        from vggtgeo.models.onnx.providers import choose_provider
+
         with as_input_errors():
             choose_provider("cuda")  # is there a GPU?
     if options.save_depth and options.dense == "none":
