@@ -13,7 +13,6 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -175,28 +174,20 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
-    """Return whether memory or threads ran out: NumPy, Python, JAX and the loader raise different errors."""
+    """Return whether memory or threads ran out: NumPy, Python and JAX raise different errors."""
     words = ("RESOURCE_EXHAUSTED", "can't start new thread")
-    if isinstance(error, ImportError):
-        return "failed to map segment" in str(error) or "cannot allocate memory" in str(error).lower()
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(words))
 
 
 def _usage_message(error: Any, command: str) -> str:
-    """Return the error in the command line, and a hint to the help of the command."""
-    message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
-    command = error.ctx.command_path if error.ctx is not None else command
-    file = _settings_file(error)
-    return f"{f'`{file}`: ' if file else ''}{message} (see `{command} --help`)"
-
-
-def _settings_file(error: Any) -> Path | None:
-    """Return the settings file of the invalid value; None if it was given as a flag."""
-    if error.ctx is None or getattr(error, "param", None) is None:
-        return None
-    source = error.ctx.get_parameter_source(error.param.name)
-    in_file = source is not None and source.name == "DEFAULT_MAP"
-    return error.ctx.params["settings"].file if in_file else None
+    """Return the error in the command line or in a settings file, and a hint to the help of the command."""
+    message, context, parameter = error.format_message().rstrip("."), error.ctx, getattr(error, "param", None)
+    if context is not None:
+        command = context.command_path
+        source = None if parameter is None else context.get_parameter_source(parameter.name)
+        if source is not None and source.name == "DEFAULT_MAP":
+            message = f"`{context.params['settings'].file}`: {message}"
+    return f"{message} (see `{command} --help`)"
 
 
 def _version(asked: bool) -> bool:
