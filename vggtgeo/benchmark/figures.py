@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -115,10 +116,10 @@ class Path3:
 
 def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[Path3]:
     """Return the first run of each setting on a sequence with a trajectory that can be aligned with the truth."""
-    found = []
+    found: list[Path3] = []
     for setting in cells.settings_of(suite, rows):
         drawn = (_path(suite, row, folder) for row in select(rows, sequence, setting))
-        found += [one for one in drawn if one is not None][:1]
+        found += islice((one for one in drawn if one is not None), 1)
     return found[:_MAX_LINES]
 
 
