@@ -81,11 +81,9 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
 
 
 def _absent(path: str, roots: Sequence[Path]) -> str:
-    if Path(path).expanduser().is_absolute():
-        return f"`{path}` does not exist"
-    if not roots:
-        return f"`{path}` not found, no folder of recordings is known: give `--data FOLDER`"
-    return f"`{path}` not found in {', '.join(f'`{root}`' for root in roots)}, nor in subfolders two levels deep"
+    if roots and not Path(path).expanduser().is_absolute():
+        return f"`{path}` not found in {', '.join(f'`{root}`' for root in roots)}, nor in subfolders two levels deep"
+    return f"`{path}` does not exist; give the folder of recordings with `--data FOLDER`"
 
 
 def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: Path | None) -> dict[str, Any]:

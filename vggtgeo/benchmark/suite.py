@@ -168,7 +168,7 @@ class SequenceTable(CheckedTable):
         _one_of("vertical", self.vertical, tuple(AXES))
         if self.key_points < 1:
             raise InputError(f"`key_points` is {self.key_points}; it must be at least 1")
-        _check_protocol(self.protocol)
+        _one_of("protocol", self.protocol, ("", *PROTOCOLS))
         updated(SlamSettings(), self.set)
 
 
@@ -258,7 +258,7 @@ class Suite(CheckedTable):
     external: tuple[ExternalTable, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_protocol(self.protocol)
+        _one_of("protocol", self.protocol, tuple(PROTOCOLS))
         for name in ("seeds", "timeout_minutes", "memory_gb"):
             if not getattr(self, name) > 0:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
@@ -380,11 +380,6 @@ def _chosen(what: str, wanted: tuple[str, ...], tables: tuple[Any, ...]) -> tupl
 def _check_name(name: object) -> None:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InputError(f"`name` must consist of letters, digits, `-`, `_` and `+`, got {name!r}")
-
-
-def _check_protocol(name: str) -> None:
-    if name and name not in PROTOCOLS:
-        raise InputError(f"`protocol` is {name!r}; it must be one of {', '.join(PROTOCOLS)}")
 
 
 def _check_different(what: str, names: list[str]) -> None:

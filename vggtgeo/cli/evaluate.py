@@ -144,7 +144,8 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
     if scale is not None:
         console.print(f"scale of the estimate: {scale}", soft_wrap=True)
     if not metres:
-        console.print(_NO_UNIT[metres], soft_wrap=True)
+        unit = "not known from its file" if metres is None else "not the metre"
+        console.print(f"lengths are in the unit of GT, which is {unit}", soft_wrap=True)
     # In a narrow terminal wrap numbers instead of truncating them: 4.4413e-17 is not "4.44…".
     table = Table(*(Column(name, overflow="fold") for name in ("", "RMSE", "mean", "median", "max")))
     length: Callable[[float], str] = (lambda value: f"{100 * value:.3f} cm") if metres else "{:.5g}".format
@@ -169,7 +170,3 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
 
 
 _METRIC_ONLY = ("ATE, SE(3)", "ATE, yaw only", "ATE, not aligned", "RPE translation")
-_NO_UNIT = {
-    None: "lengths are in the unit of GT, which is not known from its file",
-    False: "lengths are in the unit of GT, which is not the metre",
-}
