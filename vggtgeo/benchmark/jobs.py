@@ -60,13 +60,13 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
     """Return all runs of a suite, sequence by sequence, with recordings from the folders `data`."""
     roots = tuple(data)
     # An archive unpacked into a folder of its own name has the recording one level deeper.
-    first_readable = lambda places: sorted(places, key=lambda place: not is_readable(place))
-    places = {one.name: first_readable(find_sequences(one.path, roots) if one.path else []) for one in suite.sequence}
+    unreadable = lambda place: not is_readable(place)
     found = []
     for sequence in suite.sequence:
-        place = next(iter(places[sequence.name]), None)
-        if len(places[sequence.name]) > 1:
-            text = f"`{sequence.path}` exists {len(places[sequence.name])} times below `data`; `{place}` is taken"
+        places = sorted(find_sequences(sequence.path, roots) if sequence.path else [], key=unreadable)
+        place = next(iter(places), None)
+        if len(places) > 1:
+            text = f"`{sequence.path}` exists {len(places)} times below `data`; `{place}` is taken"
             warnings.warn(text, InputWarning, stacklevel=2)
         absent = _absent(sequence.path, roots) if place is None else ""
         digest = "" if place is None else input_hash(place)

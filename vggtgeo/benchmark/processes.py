@@ -177,8 +177,6 @@ def shares(workers: int) -> list[tuple[int, ...]]:
     """Return the processors of each of `workers` processes, in equal shares; empty shares if there are too few."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     each = len(cores) // workers
-    if not each:
-        return [()] * workers
     return [tuple(cores[number * each : (number + 1) * each]) for number in range(workers)]
 
 

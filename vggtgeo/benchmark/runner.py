@@ -136,7 +136,8 @@ def bench(
 
     """
     chosen = suite if isinstance(suite, Suite) else load_suite(path_of("suite", suite))
-    chosen = restrict(chosen, _names("sequences", sequences), _names("settings", settings), seeds, first_seed, frames)
+    names, variants = (None if given is None else tuple(given) for given in (sequences, settings))
+    chosen = restrict(chosen, names, variants, seeds, first_seed, frames)
     overrides: dict[str, Any] = {"recordings": recordings, "timeout_minutes": timeout_minutes, "memory_gb": memory_gb}
     chosen = replace(chosen, **{name: value for name, value in overrides.items() if value is not None})
     folder = path_of("output", output)
@@ -199,12 +200,6 @@ def all_rows(
     else:
         run_jobs(missing, store, limits, min(workers, max(len(missing), 1)), note, **options)
     return [rows[job.name] for job in jobs]
-
-
-def _names(what: str, names: Iterable[str] | None) -> tuple[str, ...] | None:
-    if isinstance(names, str):  # a text would be iterated by characters
-        raise InputError(f"`{what}` must be a list of names, as [{names!r}], got {names!r}")
-    return None if names is None else tuple(names)
 
 
 def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> list[Row]:

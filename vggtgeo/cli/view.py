@@ -25,8 +25,6 @@ def view(
     as_json: JsonOption = False,
 ) -> None:
     """Show the run in DIR: path, map, and depth where it was saved."""
-    if not folder.is_dir():
-        check_can_be_shown(folder)
     if page:
         _open_page(folder, as_json)
         return

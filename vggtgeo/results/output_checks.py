@@ -70,8 +70,6 @@ def check_is_run(folder: Path) -> None:
 
 def check_can_be_shown(folder: Path) -> None:
     """Raise InputError unless `folder` has the trajectory and the map of a run."""
-    if not folder.is_dir():
-        raise InputError(f"`{folder}` is not a folder; give the folder that `vggtgeo run -o` wrote")
     for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
         if not (folder / name).is_file():
             raise InputError(
