@@ -89,7 +89,7 @@ a value of the wrong type."""
 def _validated(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
     """Return the values by parameter name; a negated switch is rewritten: `no-global = true` is `global = false`."""
     keys, negated = _keys(context), _keys(context, negated=True)
-    names, types = {**negated, **keys}, _types(context)
+    names, hints = {**negated, **keys}, typing.get_type_hints(context.command.callback)
     found: dict[str, Any] = {}
     for key, value in given.items():
         if key not in names:
@@ -97,7 +97,8 @@ def _validated(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any
             raise InputError(f"`{path}`: `{key}` is not a setting of this command; the nearest is `{near}`")
         if names[key] in found:
             raise InputError(f"`{path}`: `{key}` and its opposite are the same setting; give one of them")
-        wanted, accepted = _KINDS.get(types[names[key]], ("text in quotes", (str,)))
+        kinds = (hints[names[key]], *typing.get_args(hints[names[key]]))  # the second without `| None`
+        wanted, accepted = next((_KINDS[kind] for kind in kinds if kind in _KINDS), ("text in quotes", (str,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
             raise InputError(f"`{path}`: `{key}` is {value!r:.60}; it must be {wanted}")
         plain = os.path.expanduser(value) if isinstance(value, str) else value
@@ -114,12 +115,6 @@ def _keys(context: Any, negated: bool = False) -> dict[str, str]:
             if names:
                 keys[max(names, key=len).lstrip("-")] = parameter.name
     return keys
-
-
-def _types(context: Any) -> dict[str, Any]:
-    """Return the annotated type of each parameter, without `| None`."""
-    hints = typing.get_type_hints(context.command.callback)
-    return {name: next((t for t in typing.get_args(hint) if t in _KINDS), hint) for name, hint in hints.items()}
 
 
 def pipeline_settings(

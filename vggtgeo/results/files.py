@@ -45,15 +45,11 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
         uncertainty = frame_uncertainty(slam, rank)
         if uncertainty is not None:
             write_uncertainty(folder / submap_file("uncertainty", rank), uncertainty)
-    _write_map_times(folder / "map-times.txt", slam)
-
-
-def _write_map_times(path: Path, slam: Slam) -> None:
     known = [keyframe for keyframe in slam.keyframes if keyframe.recorded is not None]
     if known:
         head = "# time in keyframes.txt, and in the run that recorded the keyframe, by the clock of that run; s\n"
         rows = "".join(f"{keyframe.timestamp:.9f} {keyframe.recorded:.9f}\n" for keyframe in known)
-        write_text(path, head + rows)
+        write_text(folder / "map-times.txt", head + rows)
 
 
 def write_uncertainty(path: Path, sigma: PoseUncertainty) -> None:
