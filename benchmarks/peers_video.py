@@ -30,8 +30,8 @@ from vggtgeo.models.classical import SiftMatcher, place_vector
 
 from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.evaluation.absolute import absolute_error
 from vggtgeo.evaluation.association import associate
+from vggtgeo.evaluation.pose_errors import absolute_error
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run

@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.evaluation.absolute import absolute_error
 from vggtgeo.evaluation.association import associate
+from vggtgeo.evaluation.pose_errors import absolute_error
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses

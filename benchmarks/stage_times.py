@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import vggtgeo as vg
-from vggtgeo.cli.demo import SIZE
+from vggtgeo.cli.run import DEMO_SIZE
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.jax_environment import jax_environment
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def _summary(clip: str, kind: str, end: int | None) -> dict[str, Any]:
-    sequence = vg.simulate("office", 45, rate=10.0, size=SIZE) if clip == "demo" else vg.read(clip)
+    sequence = vg.simulate("office", 45, rate=10.0, size=DEMO_SIZE) if clip == "demo" else vg.read(clip)
     camera = Camera.guess(sequence.camera.width, sequence.camera.height) if kind == "u" else sequence.camera
     view = SequenceView(sequence, camera, kind == "d" and sequence.has_depth)
     result = vg.reconstruct(view, options=vg.RunOptions(end=end, dense="auto" if clip == "demo" else "none"))

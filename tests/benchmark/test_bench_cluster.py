@@ -2,10 +2,8 @@
 
 import json
 import os
-import subprocess
 import sys
 import threading
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -15,9 +13,9 @@ from conftest import ROOT
 from reported import raises
 
 from vggtgeo.benchmark.cluster import Cluster, run_remotely
+from vggtgeo.benchmark.jobs import Store
 from vggtgeo.benchmark.processes import Limits, claim_cores
 from vggtgeo.benchmark.runner import all_rows
-from vggtgeo.benchmark.store import Store
 
 LIMITS = Limits(60.0, 2.0)
 SCRIPT = """
@@ -60,37 +58,6 @@ def test_runs_of_a_node_have_processors_of_their_own(tmp_path: Path) -> None:
             assert too_many == ()
     with claim_cores(len(there)) as again:
         assert again == tuple(there)
-
-
-@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")
-@pytest.mark.slow  # starts two clusters of Ray, one after the other
-def test_a_driver_that_dies_goes_on_where_it_was(tmp_path: Path) -> None:
-    # Proves that after SIGKILL of a driver on a cluster a second call does the rest only, and that no finished run is
-    # lost or done twice. Oracle: the times at which the finished rows were written; a batch in processes.
-    pytest.importorskip("ray", reason="Ray is not installed")
-    code = (
-        f"import sys; sys.path[:0] = [{str(ROOT / 'tests' / 'helpers')!r}, {str(ROOT)!r}]\n"
-        "import tiny_suites as tiny\nfrom pathlib import Path\nfrom test_bench_cluster import LIMITS, command\n"
-        "from vggtgeo.benchmark.cluster import Cluster\nfrom vggtgeo.benchmark.runner import all_rows\n"
-        "from vggtgeo.benchmark.store import Store\n"
-        f"store = Store(Path({str(tmp_path / 'wild')!r}), 't', 's')\n"
-        "all_rows(tiny.jobs(), store, LIMITS, cluster=Cluster('local'), command=command)\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "tests" / "helpers"), str(ROOT), *sys.path])}
-    driver = subprocess.Popen([sys.executable, "-c", code], env=environment)
-    while len(list(tmp_path.glob("wild/runs/*/row.json"))) < 4:
-        assert driver.poll() is None
-        time.sleep(0.02)
-    driver.kill()
-    driver.wait()
-    written = {path: path.stat().st_mtime_ns for path in tmp_path.glob("wild/runs/*/row.json")}
-    assert 4 <= len(written) < 12
-    subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=120)
-    assert {path: path.stat().st_mtime_ns for path in written} == written
-    rows = all_rows(tiny.jobs(), Store(tmp_path / "wild", "t", "s"), LIMITS, command=command)
-    calm = all_rows(tiny.jobs(), Store(tmp_path / "calm", "t", "s"), LIMITS, workers=2, command=command)
-    numbers = lambda rows: [(row["status"], row["fingerprint"], row["ate_se3_m"]) for row in rows]
-    assert numbers(rows) == numbers(calm)
 
 
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # Ray forks; its own processes import no JAX before

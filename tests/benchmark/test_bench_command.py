@@ -42,6 +42,8 @@ def test_the_command_runs_a_suite_and_prints_its_tables(tmp_path: Path, monkeypa
     outcome = CliRunner().invoke(make_app(), arguments)
     assert outcome.exit_code == 0, outcome.output
     assert outcome.stdout.strip() == (tmp_path / "out/tables.md").read_text().strip()
+    assert (tmp_path / "out/runs.csv").read_text().count("walk") == 2
+    assert (tmp_path / "out/report.html").is_file()
     assert "walk, bare, seed 0: ATE 2.40 cm after SE(3), 4/4 frames, good (simulated)" in outcome.stderr
     assert "| full system | **1.40** | **1.40** | **1.40** |" in outcome.stdout
     listed = CliRunner().invoke(make_app(), ["bench", "list"])

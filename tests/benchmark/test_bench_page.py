@@ -1,11 +1,11 @@
 """The page of a batch and its drawings: everything in one file, nothing loaded from elsewhere."""
 
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import tiny_suites as tiny
 from bench_rows import EXTERNAL, ROWS, row
+from checked_page import CheckedPage
 
 from vggtgeo.benchmark.figures import paths
 from vggtgeo.benchmark.page import write_page
@@ -24,33 +24,6 @@ def test_the_path_that_is_drawn_is_one_that_can_be(tmp_path: Path) -> None:
     assert len(drawn.errors) == 5
 
 
-class _Page(HTMLParser):
-    """Counts elements, and notes what the page would load."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.loaded: list[str] = []
-        self.links: list[str] = []
-        self.text = ""
-
-    def handle_starttag(self, tag: str, attributes: list) -> None:
-        values = dict(attributes)
-        if tag not in ("meta", "link", "br", "img"):
-            self.open.append(tag)
-        self.loaded += [values[name] for name in ("src",) if values.get(name)]
-        self.links += [values["href"]] if tag == "a" else []
-
-    def handle_startendtag(self, tag: str, attributes: list) -> None:
-        pass
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-
 def test_the_page_holds_everything_and_loads_nothing(tmp_path: Path) -> None:
     # Proves that the page is one well-formed file with tables, drawings, verdicts, links to runs that are there, and
     # the text of a message escaped. Oracle: a parser.
@@ -64,10 +37,9 @@ def test_the_page_holds_everything_and_loads_nothing(tmp_path: Path) -> None:
     timed = [{**one, "seconds_tracking": 2.0, "seconds_window": 1.0, "peak_memory_gb": 0.5} for one in ROWS]
     write_page(tmp_path / "report.html", suite, [*timed, crash], tmp_path)
     text = (tmp_path / "report.html").read_text()
-    page = _Page()
-    page.feed(text)
+    page = CheckedPage(text)
     assert page.open == []
-    assert page.loaded == []
+    assert page.wrong == []
     assert "runs/walk.full.0/report.html" in page.links
     assert all((tmp_path / link).is_file() for link in page.links)
     assert "<b>bad</b>" in page.text

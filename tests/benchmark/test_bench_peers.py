@@ -10,10 +10,9 @@ from reported import raises
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.benchmark import markdown
-from vggtgeo.benchmark.external import external_rows
 from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.published import published
-from vggtgeo.benchmark.runner import subtract_baseline
+from vggtgeo.benchmark.runner import external_rows, subtract_baseline
 from vggtgeo.benchmark.suite import Suite
 from vggtgeo.benchmark.table import Row, paired
 from vggtgeo.geometry.trajectory import Trajectory

@@ -13,7 +13,6 @@ from conftest import ROOT
 
 from vggtgeo.benchmark import markdown
 from vggtgeo.benchmark.page import write_page
-from vggtgeo.benchmark.runner import BenchReport
 from vggtgeo.benchmark.table import as_csv, columns, write_parquet
 
 
@@ -99,13 +98,3 @@ def test_the_tables_say_what_makes_a_row_doubtful() -> None:
     assert "| walk | full | 0 | the scale is 7 |" in text
     assert "1 run, 1 more without their recording, 1 of other systems." in text
     assert "## Warnings" not in markdown.page(tiny.suite(), ROWS)
-
-
-def test_the_report_of_a_batch(tmp_path: Path) -> None:
-    # Proves what `vggtgeo.bench` hands back, and its files.
-    report = BenchReport(tiny.suite(), tuple(ROWS), tmp_path)
-    report.write(tmp_path)
-    assert {file.name for file in tmp_path.iterdir()} >= {"report.html", "tables.md", "runs.csv"}
-    assert (tmp_path / "tables.md").read_text() == report.markdown()
-    assert report.to_dict()["rows"][0]["sequence"] == "walk"
-    assert "12 of 12 runs" in repr(report)

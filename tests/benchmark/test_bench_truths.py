@@ -155,8 +155,6 @@ def test_nees_tells_whether_stated_deviations_are_those_of_the_errors(factor: fl
     place, rotation = pose_consistency(Trajectory(times, off), truth, sigma, turned, scale)
     assert place.mean / 3 == pytest.approx(factor**2, rel=0.15)
     assert rotation.mean / 3 == pytest.approx(factor**2, rel=0.15)
-    with raises("`place_sigma`"):
-        pose_consistency(truth, truth, sigma[1:], turned[1:])
 
 
 def test_a_run_that_states_deviations_has_its_nees_in_the_row(tmp_path: Path) -> None:

@@ -31,10 +31,10 @@ def _good(folder: Path, count: int = 6) -> Path:
 def test_the_list_names_readers_and_suites_that_are_there() -> None:
     # Proves that every entry leads somewhere: a reader that exists, a suite that exists. Oracle: their tables.
     for entry in catalogue():
-        assert set(entry.kind.split(", ")) <= set(KINDS), entry
-        assert not entry.suite or entry.suite in shipped(), entry
-        assert entry.layout
-        assert entry.licence
+        assert set(entry["kind"].split(", ")) <= set(KINDS), entry
+        assert not entry["suite"] or entry["suite"] in shipped(), entry
+        assert entry["layout"]
+        assert entry["licence"]
     outcome = CliRunner().invoke(make_app(), ["data", "list"])
     assert outcome.exit_code == 0, outcome.output
     assert "TUM RGB-D (--kind tum)" in outcome.stdout

@@ -47,7 +47,7 @@ def test_json_has_the_metrics(tmp_path: Path) -> None:
     offsets = estimate_offsets(*_load(files), max_dt=0.02)
     assert offsets is not None
     assert json.loads(result.output) == json.loads(
-        json.dumps({**expected.as_dict(), "truth_in_metres": None, "offsets": offsets.as_dict(), "comparable": True})
+        json.dumps({**expected.to_dict(), "truth_in_metres": None, "offsets": offsets.to_dict(), "comparable": True})
     )
 
 

@@ -14,7 +14,6 @@ import pytest
 import tiny_networks as tiny
 from hub_server import Hub, serve
 from huggingface_hub.utils import disable_progress_bars
-from reported import raises
 from typer.testing import CliRunner
 from vggtgeo.models.onnx import contracts, verification
 from vggtgeo.models.onnx.registry import NETWORKS, HubFile, Network
@@ -184,27 +183,6 @@ def test_a_file_arrives_whole_and_only_once(tmp_path: Path, entry: Network) -> N
         asked = len(hub.requests)
         assert fetch_network(entry, tmp_path, hub.address) == path
         assert len(hub.requests) == asked
-
-
-def test_a_broken_download_goes_on_where_it_stopped(
-    tmp_path: Path, entry: Network, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Proves that bytes that arrived are not asked for again, within a call and by the next one. Oracle: the ranges
-    # that the server saw; it cuts off six times, and the client gives up after five without progress.
-    monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 50_000)
-    monkeypatch.setattr("time.sleep", lambda _: None)
-    with serve(Hub(CONTENT, breaks=[160_000, 0, 0, 0, 0, 0])) as hub:
-        with raises("someone/something/model.onnx"):
-            fetch_network(entry, tmp_path, hub.address)
-        assert not (tmp_path / "moge2-small.onnx").exists()
-        first = [asked for method, asked in hub.requests if method == "GET"]
-        assert first[0] is None
-        assert set(first[1:]) == {"bytes=150000-"}
-        hub.requests.clear()
-        path = fetch_network(entry, tmp_path, hub.address)
-        assert path.read_bytes() == CONTENT
-        assert [asked for method, asked in hub.requests if method == "GET"] == ["bytes=150000-"]
-    assert [file.name for file in tmp_path.iterdir() if file.is_file()] == ["moge2-small.onnx"]
 
 
 def test_a_file_is_carried_to_a_machine_without_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

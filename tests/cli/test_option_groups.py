@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -43,20 +42,3 @@ def test_fields_are_options(flags: list[str], expected: tuple[object, ...]) -> N
     done = CliRunner().invoke(app, ["a", *flags])
     assert done.exit_code == 0, done.output
     assert done.stdout.strip() == repr(expected)
-
-
-def test_bounds_of_a_field_hold() -> None:
-    """A value outside the bounds of a field is a usage error that names the option; oracle: the bound."""
-    app = typer.Typer()
-    app.command()(with_option_groups(command))
-    done = CliRunner().invoke(app, ["a", "--width", "0"])
-    assert done.exit_code == 2
-    assert "--width" in done.output
-
-
-def test_order_and_python_calls(capsys: pytest.CaptureFixture[str]) -> None:
-    """Options stand in the order of parameters and fields, and a call from Python takes them by name; oracle: both."""
-    grouped = with_option_groups(command)
-    assert list(inspect.signature(grouped).parameters) == ["name", "output", "width", "tall", "rate"]
-    grouped("b", width=2, rate=5.0)
-    assert capsys.readouterr().out.strip() == repr(("b", "out", Shape(2), Times(5.0)))

@@ -13,8 +13,8 @@ from PIL import ExifTags, Image
 from reported import raises, warns
 from tiny_layouts import matroska
 
+from vggtgeo.cli.options import InputOptions
 from vggtgeo.cli.run import open_input
-from vggtgeo.cli.run_options import InputOptions
 from vggtgeo.datasets import (
     Frame,
     ImageFolder,

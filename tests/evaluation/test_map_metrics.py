@@ -3,32 +3,25 @@
 import numpy as np
 import pytest
 
-from vggtgeo.evaluation import (
-    cloud_error,
-    consistency,
-    depth_error,
-    surface_points,
-)
-from vggtgeo.io.errors import InputError
+from vggtgeo.evaluation import cloud_error, consistency, depth_error, surface_points
 
 
 def test_depth_error_is_taken_where_both_are_valid() -> None:
-    # Proves RMSE, mean, relative error, inliers, count and coverage. Oracle: four pixels by hand.
+    # Proves RMSE, relative error, inliers and count. Oracle: four pixels by hand.
     truth = np.array([[1.0, 2.0, 4.0, np.nan], [5.0, 2.0, np.nan, 1.0]])
     depth = np.array([[1.1, 2.0, 2.0, 3.0], [np.nan, 2.0, np.nan, 1.0]])
     found = depth_error(depth, truth)
     errors = np.array([0.1, 0.0, 2.0, 0.0, 0.0])
     assert found.rmse == pytest.approx(np.sqrt(np.mean(errors**2)))
-    assert found.mean == pytest.approx(errors.mean())
     assert found.relative == pytest.approx((0.1 + 0.5) / 5)
-    assert (found.inliers, found.count, found.coverage) == (0.8, 5, 5 / 6)
+    assert (found.inliers, found.count) == (0.8, 5)
 
 
 def test_depth_error_of_nothing_is_nan() -> None:
-    # Proves that maps without a common pixel give NaN and a coverage of zero, no crash and no zero error.
+    # Proves that maps without a common pixel give NaN, no crash and no zero error.
     found = depth_error(np.full((2, 2), np.nan), np.ones((2, 2)))
     assert np.isnan(found.rmse)
-    assert (found.count, found.coverage) == (0, 0.0)
+    assert found.count == 0
 
 
 @pytest.mark.parametrize("threshold", [0.05, 0.3, 10.0])
@@ -99,5 +92,3 @@ def test_nees_of_right_covariances_keeps_to_its_band() -> None:
     assert too_sure.mean > too_sure.high
     assert too_sure.mean == pytest.approx(4 * found.mean)
     assert consistency(0.5 * errors, covariances).mean < found.low
-    with pytest.raises(InputError, match="`covariances`"):
-        consistency(errors, -covariances)

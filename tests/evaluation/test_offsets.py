@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.evaluation import Offsets, estimate_offsets, shifted
-from vggtgeo.evaluation.drift_noise import DriftNoise
+from vggtgeo.evaluation.offset_model import DriftNoise
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputWarning
 
@@ -140,7 +140,7 @@ def test_what_the_motion_leaves_open_is_not_determined() -> None:
     constant = _offsets(*_pair(0, late=0.1, turning=0.0, moving=0.0))
     assert np.isinf(constant.time_sd), str(constant)
     assert "not determined" in str(constant)
-    assert constant.as_dict()["time_offset_s"] is None
+    assert constant.to_dict()["time_offset_s"] is None
 
 
 def test_offsets_of_few_or_still_poses_are_none() -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import equinox as eqx
 import numpy as np
 import pytest
+from checked_page import CheckedPage
 from recorded_run import FRAMES, RecordedRun, recorded_run
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
@@ -20,16 +20,14 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.mapping.dense import dense_depths
-from vggtgeo.report import write_page
+from vggtgeo.mapping.dense import DenseMap, dense_depths
+from vggtgeo.report import RunRecord, write_page
 from vggtgeo.report.viewer import has_viewer
 from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
 from vggtgeo.slam.window.sliding_window import MAX_ITERATIONS
-
-VOID = {"meta", "img", "link", "br", "hr", "input"}
 
 
 def test_residual_sizes_of_known_noise() -> None:
@@ -60,12 +58,14 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     path = frame_trajectory(slam)
     report = evaluate_trajectory(path, truth) if len(path) else None
     facts = {"simulated": True, "frames_per_second": 9.9, "interrupted": False}
-    verdict = options.setdefault("verdict", Verdict("good"))
+    verdict = options.get("verdict", Verdict("good"))
     settings, seconds = {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}
     summary = summarise(slam, verdict, settings=settings, seconds=seconds, report=report, **facts)
-    given = {"title": "a <room>", "truth": truth, "cloud": run.cloud, "records": run.recorder.records}
-    given["depth_maps"] = dense_depths(slam.keyframes, slam.intrinsics, "auto" if _deep(slam) else "none")
-    write_page(folder / "report.html", slam, **{**given, "summary": summary, **options})
+    maps = tuple(dense_depths(slam.keyframes, slam.intrinsics, "auto" if _deep(slam) else "none"))
+    dense = DenseMap(maps, slam.keyframes, maps, slam.intrinsics, options.get("cloud", run.cloud), 0.02)
+    given = {"windows": tuple(run.recorder.records), "truth": truth, "warnings": (), "title": "a <room>"}
+    given = {name: options.get(name, value) for name, value in given.items()}
+    write_page(folder / "report.html", RunRecord(slam, dense, **given), options.get("summary", summary), verdict)
     return (folder / "report.html").read_text()
 
 
@@ -125,36 +125,13 @@ def test_errors_against_a_truth_without_metres_are_no_centimetres(run: RecordedR
     assert errors_line(metric["truth"], free=False).endswith(f"SE(3), {100 * error:.2f} cm after Sim(3) alignment")
 
 
-class _Checker(HTMLParser):
-    """Notes elements that are not closed in order, addresses that lead elsewhere, and identifiers given twice."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.wrong: list[str] = []
-        self.ids: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in VOID:
-            self.open.append(tag)
-        for name, value in attrs:
-            if name == "id":
-                self.ids.append(value or "")
-            if name in ("src", "href", "xlink:href") and not (value or "").startswith(("data:", "#")):
-                self.wrong.append(f"{tag} {name}={value}")
-
-    def handle_endtag(self, tag: str) -> None:
-        if not self.open or self.open.pop() != tag:
-            self.wrong.append(f"</{tag}>")
-
-
 def test_the_page_is_whole_and_needs_nothing_else(run: RecordedRun, tmp_path: Path) -> None:
     """Elements close, no address leads out of the file, identifiers are unique, and every part is there."""
-    text = _page(run, tmp_path, warnings=["frame 3 is torn & skipped"])
-    checker = _Checker()
-    checker.feed(text)
+    text = _page(run, tmp_path, warnings=("frame 3 is torn & skipped",))
+    checker = CheckedPage(text)
     assert checker.wrong == []
     assert checker.open == []
+    assert all(link.startswith("#") for link in checker.links)
     assert len(checker.ids) == len(set(checker.ids))
     assert "@import" not in text
     assert ("<script" in text) == has_viewer()
@@ -195,7 +172,7 @@ def test_the_page_without_depth_and_without_windows(run: RecordedRun, tmp_path: 
     blank = [replace(k, images=images) for k, images in zip(run.slam.keyframes, without, strict=True)]
     slam = replace(run.slam, map=replace(run.slam.map, keyframes=tuple(blank), metric=False))
     empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    text = _page(run, tmp_path, slam, cloud=empty, records=[], truth=None)
+    text = _page(run, tmp_path, slam, cloud=empty, windows=(), truth=None)
     for words in ("No window was adjusted", "The sequence has no depth", "too few points", "lengths have no unit"):
         assert words in text, words
 

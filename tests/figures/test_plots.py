@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import vggtgeo as vg
 from vggtgeo.figures import plots
-from vggtgeo.figures.style import BLUE, ORANGE
+from vggtgeo.figures.plots import BLUE, ORANGE
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 

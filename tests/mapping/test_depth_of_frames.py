@@ -12,7 +12,7 @@ from recorded_run import RecordedRun, recorded_run
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.mapping.depth_map import DepthMap, PosedDepth
 from vggtgeo.mapping.frame_depth import rendered_depth
-from vggtgeo.results.reread_frames import depth_of_frames
+from vggtgeo.results.scene import depth_of_frames
 from vggtgeo.slam.state import Slam
 
 CAMERA = np.array([200.0, 200.0, 79.5, 59.5])

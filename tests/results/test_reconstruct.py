@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 import vggtgeo as vg
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import LeftOutWarning
+from vggtgeo.results.output_checks import EXPORTS
 from vggtgeo.results.summary import RESERVED_KEYS
-from vggtgeo.results.unfinished import EXPORTS
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.settings.table import changed
 

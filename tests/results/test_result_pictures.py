@@ -1,4 +1,4 @@
-"""Covariances and observability as numbers and pictures; residuals and steps in the order of the user's lists."""
+"""Covariances and observability as numbers and pictures; steps of a state."""
 
 from __future__ import annotations
 
@@ -67,24 +67,6 @@ def test_observability_as_numbers_words_and_picture(solved: dict[str, Any]) -> N
     assert repr(report) == "Observability(12 coordinates free, 10 held, weak: none)"
     heights = [bar.get_height() for bar in vg.plot(report).axes[1].patches]
     assert heights[0] == pytest.approx(100 * scale["points"])
-
-
-def test_residuals_come_in_the_order_of_the_matches(solved: dict[str, Any]) -> None:
-    """Edges and landmarks given in any order: each match's residual is its own; oracle: at the truth of a window
-    without noise, the error that was put into one match.
-    """
-    window = vg.simulate_window(3, points=5, lines=1, noise=0.0, depth_error=0.0, seed=2)
-    seen = window.observations
-    target = seen.point_target.copy()
-    target[7] += [3.0, -2.0]
-    turned = np.arange(len(seen.edges))[::-1]  # the last edge first
-    options = {**vars(seen), "edges": seen.edges[turned], "point_target": target}
-    given = vg.Observations(**{**options, "point_edge": turned[seen.point_edge], "line_edge": turned[seen.line_edge]})
-    problem, truth, index = vg.pack(given, window.poses, window.intrinsics, window.inverse_depth)
-    residual = index.gather_points(jax.jit(vg.residuals_at)(problem, truth)["points"], given)
-    expected = np.zeros_like(target)
-    expected[7] = [-3.0, 2.0]
-    np.testing.assert_allclose(residual, expected, atol=1e-9)
 
 
 def test_a_step_moves_each_coordinate(solved: dict[str, Any]) -> None:

@@ -23,10 +23,9 @@ from vggtgeo.io.interruption import end_on_signals
 from vggtgeo.io.locks import LockedError, locked
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.results.files import write_depth
+from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import RESERVE, open_run_folder
-from vggtgeo.results.unfinished import unfinished_message
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="signals of another kind"),
@@ -83,6 +82,7 @@ def check_one_run(out: Path, frames: int) -> None:
     for file in out.rglob("*"):
         if file.is_file() and file.name != "notes.txt":
             assert file.read_bytes() != b"of the run before", file
+    assert (out / "notes.txt").read_text() == "the user's own"
     assert sorted(path.name for path in out.iterdir() if path.name not in ("notes.txt", "trajectory.png")) == [
         "images",
         "keyframes.txt",
@@ -93,15 +93,6 @@ def check_one_run(out: Path, frames: int) -> None:
         "summary.json",
         "trajectory.txt",
     ]
-
-
-def test_a_new_run_replaces_the_old_one_as_a_whole(frames: Path, tmp_path: Path) -> None:
-    """Depth images and recording of the run before are gone, the user's own file is not; oracle: the folder."""
-    out = tmp_path / "out"
-    old_run(out)
-    assert call(frames, out).exit_code == 3
-    check_one_run(out, FRAMES)
-    assert (out / "notes.txt").read_text() == "the user's own"
 
 
 STAGES = (
@@ -260,11 +251,9 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     """Counts are 1/5000 m, what is too far for 16 bits is none, the folder says its unit, and without depth there is no
     folder but a warning; oracle: the depth that was given.
     """
-    keyframe = object.__new__(Keyframe)  # of which one field counts
-    object.__setattr__(keyframe, "frame", 7)
     metres, one = np.array([[1.0, np.nan], [13.2, 0.5]], np.float32), np.ones((2, 2), np.float32)
     depth = DepthMap(metres, one, one)
-    write_depth(tmp_path, [keyframe, keyframe], [depth, None], metric=False)
+    write_depth(tmp_path, [(7, depth), (8, None)], metric=False)
     assert sorted(path.name for path in (tmp_path / "depth").iterdir()) == [
         "000007.confidence.png",
         "000007.depth.png",
@@ -274,5 +263,5 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     assert found.tolist() == [[5000, 0], [0, 2500]]
     assert "scale of this run is free" in (tmp_path / "depth/README.txt").read_text()
     with warns("depth"):
-        write_depth(tmp_path / "none", [keyframe], [None])
+        write_depth(tmp_path / "none", [(7, None)])
     assert not (tmp_path / "none").exists()

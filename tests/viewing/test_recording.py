@@ -248,7 +248,7 @@ def test_a_run_folder_becomes_a_recording(run: RecordedRun, tmp_path: Path) -> N
     write_trajectories(tmp_path, run.slam)
     depths = dense_depths(run.slam.keyframes, run.slam.intrinsics)
     run.cloud.save_ply(tmp_path / "map.ply")
-    write_depth(tmp_path, run.slam.keyframes, depths)
+    write_depth(tmp_path, zip([keyframe.frame for keyframe in run.slam.keyframes], depths, strict=True))
     result = CliRunner().invoke(make_app(), ["view", str(tmp_path), "--rerun", str(tmp_path / "out" / "v.rrd")])
     assert result.exit_code == 0, result.output
     found = entities_of(tmp_path / "out" / "v.rrd")

@@ -2,16 +2,16 @@
 
 | file | job |
 |---|---|
-| `suite` | the TOML file and its validation; `protocols`: evaluation protocols of other systems |
-| `jobs` | the runs of a suite, each with everything its result depends on |
+| `suite` | the TOML file, its validation, evaluation protocols of other systems |
+| `jobs` | the runs of a suite, each with everything its result depends on; finished runs as folders |
 | `inputs`, `worker`, `measure` | one run: its input, the run itself, its row of numbers |
-| `processes`, `scheduling` | a process with limits; many of them, serial or parallel |
+| `processes` | many runs, serial or parallel, each in a process with limits |
 | `cluster` | the same on a Ray cluster |
-| `store`, `provenance` | finished runs as folders, reused by a second call; versions, machine, input digests |
-| `table`, `statistics`, `cells` | CSV and Parquet; means, intervals, paired differences |
-| `external`, `published` | trajectories of other systems; figures published by others, shown separately |
+| `provenance` | versions, machine, digests of inputs |
+| `table`, `cells` | CSV and Parquet; means, intervals, paired differences; ranks |
+| `published` | figures published by others, shown separately |
 | `markdown`, `figures`, `page` | tables, figures, the HTML report |
-| `runner` | all of it: `vggtgeo.bench` |
+| `runner` | all of it, with trajectories of other systems: `vggtgeo.bench` |
 
 The package is not called `bench`, as `vggtgeo.bench` is the function.
 """

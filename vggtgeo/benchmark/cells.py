@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.benchmark.suite import PROTOCOLS, Suite
+from vggtgeo.benchmark.suite import Suite
 from vggtgeo.benchmark.table import Row, Summary, number, paired, select, values
 
 
@@ -76,14 +76,6 @@ class Cell:
     median: str = ""
 
 
-def number_cell(summary: Summary, digits: int) -> str:
-    """Return mean and standard deviation as text; the number itself if there is one, empty if there is none."""
-    if not summary.count:
-        return ""
-    mean = f"{summary.mean:.{digits}f}"
-    return mean if np.isnan(summary.deviation) else f"{mean} ± {summary.deviation:.{digits}f}"
-
-
 MIN_FOR_MEDIAN = 3
 """Numbers: the median of two is their mean."""
 
@@ -93,14 +85,6 @@ def median_text(summary: Summary, column: Column) -> str:
     column.
     """
     return f"{summary.median:.{column.digits}f}" if column.better and summary.count >= MIN_FOR_MEDIAN else ""
-
-
-def interval_cell(summary: Summary, digits: int) -> str:
-    """Return a mean difference with its 95 % interval, without interval for a single pair."""
-    if not summary.count:
-        return ""
-    mean = f"{summary.mean:+.{digits}f}"
-    return f"{mean} (one pair)" if np.isnan(summary.half) else f"{mean} ± {summary.half:.{digits}f}"
 
 
 FREE = "free"
@@ -122,11 +106,6 @@ def finished(rows: Iterable[Row]) -> list[Row]:
     return [row for row in rows if row["status"] == "ok"]
 
 
-def is_whole(rows: Sequence[Row], column: Column) -> bool:
-    """Return whether every run has a number: without failed runs, a mean favours settings that fail on hard ones."""
-    return bool(rows) and summary_of(rows, column).count == len(rows)
-
-
 MIN_COVERAGE = 0.9
 """Share of the ground truth's duration; with less, the error is of another, mostly easier, part of the sequence."""
 
@@ -137,8 +116,12 @@ def is_covered(rows: Sequence[Row]) -> bool:
 
 
 def is_ranked(rows: Sequence[Row], column: Column) -> bool:
-    """Return whether the mean may be ranked."""
-    return is_whole(rows, column) and (column.name == "coverage" or is_covered(rows))
+    """Return whether the mean may be ranked: every run has a number, and none covers too little.
+
+    Without failed runs, a mean favours settings that fail on hard ones.
+    """
+    is_whole = bool(rows) and summary_of(rows, column).count == len(rows)
+    return is_whole and (column.name == "coverage" or is_covered(rows))
 
 
 def at_coverage(rows: Sequence[Row]) -> str:
@@ -148,12 +131,18 @@ def at_coverage(rows: Sequence[Row]) -> str:
 
 
 def text_of(rows: Sequence[Row], column: Column) -> str:
-    """Return `summary_of` as text, with the number of runs if some have no value; empty if none has."""
+    """Return mean and standard deviation (if there are several numbers) as text, with the number of runs if some have
+    no value; empty if none has.
+    """
     good = finished(rows)
     if good and not comparable(good, column):
         return FREE
-    text = number_cell(summary_of(rows, column), column.digits)
-    return text if not text or is_whole(rows, column) else f"{text} ({summary_of(rows, column).count} of {len(rows)})"
+    summary = summary_of(rows, column)
+    if not summary.count:
+        return ""
+    text = f"{summary.mean:.{column.digits}f}"
+    text += "" if np.isnan(summary.deviation) else f" ± {summary.deviation:.{column.digits}f}"
+    return text if summary.count == len(rows) else f"{text} ({summary.count} of {len(rows)})"
 
 
 def measured(groups: Sequence[Sequence[Row]], columns: Iterable[Column]) -> list[Column]:
@@ -176,8 +165,8 @@ def cell_of(rows: Sequence[Row], column: Column) -> Cell:
 
 def _text_or_ending(rows: Sequence[Row], column: Column) -> str:
     """Return the text of a cell; without any number, how the runs failed."""
-    lost = [row for row in rows if row["status"] != "ok" or row.get("verdict") == "failed"]
     text = text_of(rows, column)
+    lost = [row for row in rows if row["status"] != "ok" or row.get("verdict") == "failed"]
     return f"{text}{at_coverage(rows)}" if text and text != FREE else text or verdicts(lost)
 
 
@@ -186,10 +175,9 @@ def ranked(groups: Sequence[Sequence[Row]], column: Column, beside_count: bool =
 
     beside_count: whether the table has columns for the number of runs and the coverage, so that cells omit them.
     """
-    whole = [summary_of(own, column) if is_ranked(own, column) else Summary.of(np.array([])) for own in groups]
+    means = [summary_of(own, column).mean if is_ranked(own, column) else np.nan for own in groups]
     texts = [text_of(finished(own), column) if beside_count else _text_or_ending(own, column) for own in groups]
-    medians = [median_text(summary_of(own, column), column) for own in groups]
-    return placed([summary.mean for summary in whole], texts, column, medians)
+    return placed(means, column, texts, [median_text(summary_of(own, column), column) for own in groups])
 
 
 def runs_text(rows: Sequence[Row]) -> str:
@@ -198,7 +186,7 @@ def runs_text(rows: Sequence[Row]) -> str:
     return str(good) if good == len(rows) else f"{good} of {len(rows)}"
 
 
-def placed(numbers: Sequence[float], texts: Sequence[str], column: Column, medians: Sequence[str]) -> list[Cell]:
+def placed(numbers: Sequence[float], column: Column, texts: Sequence[str], medians: Sequence[str]) -> list[Cell]:
     """Return cells with the best and the second best ranked, if there are two or more different numbers."""
     known = sorted({round(one, column.digits) for one in numbers if np.isfinite(one)}, reverse=column.better > 0)
     compared = column.better and len(known) >= 2
@@ -219,48 +207,36 @@ def sequences_of(suite: Suite, rows: Sequence[Row]) -> list[str]:
     return [table.name for table in suite.sequence if table.name in there]
 
 
-def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> list[tuple[str, list[Cell]]]:
-    """Return a row per setting: a cell per sequence, then mean (with the mean of the medians over seeds) and median
-    over the sequences on which all settings are ranked (see `_common`). rows: include those without a result.
+def matrix(suite: Suite, rows: Sequence[Row], column: Column) -> tuple[list[str], list[tuple[str, list[Cell]]]]:
+    """Return the heads, and a row per setting: a cell per sequence, then mean (with the mean of the medians over seeds)
+    and median over the sequences on which all settings that are ranked at all are ranked. rows: include those without a
+    result.
     """
     settings, sequences = settings_of(suite, rows), sequences_of(suite, rows)
     groups = {name: [select(rows, name, setting) for setting in settings] for name in sequences}
-    by_column = [ranked(groups[name], column) for name in sequences]
-    common = _common(suite, rows, column)
+    ranks = {name: [is_ranked(own, column) for own in groups[name]] for name in sequences}
+    used = [any(ranks[name][row] for name in sequences) for row in range(len(settings))]
+    common = [name for name in sequences if ranks[name] == used]
+    heads, by_column = [*sequences], [ranked(groups[name], column) for name in sequences]
     if len(common) > 1:
-        lists = [
-            [summary_of(groups[name][row], column) for name in common if is_ranked(groups[name][row], column)]
-            for row in range(len(settings))
-        ]
+        of = "" if len(common) == len(sequences) else f" of {len(common)}"
+        lists = [[summary_of(groups[name][row], column) for name in common if has] for row, has in enumerate(used)]
         pooled = [Summary.of(np.array([one.mean for one in own])) for own in lists]
+        text = lambda number: f"{number:.{column.digits}f}" if np.isfinite(number) else ""
         # Means of medians, as in publications, if each sequence has enough seeds.
-        seeds = [min((one.count for one in own), default=0) >= MIN_FOR_MEDIAN for own in lists]
-        medians = [f"{np.mean([one.median for one in own]):.{column.digits}f}" if own else "" for own in lists]
-        shown = [text if enough else "" for text, enough in zip(medians, seeds, strict=True)]
-        by_column.append(_placed_alone([one.mean for one in pooled], column, shown))
+        enough = [min((one.count for one in own), default=0) >= MIN_FOR_MEDIAN for own in lists]
+        medians = [
+            np.mean([one.median for one in own]) if many else np.nan for own, many in zip(lists, enough, strict=True)
+        ]
+        means = [one.mean for one in pooled]
+        by_column.append(placed(means, column, list(map(text, means)), list(map(text, medians))))
+        heads.append(f"mean{of}")
         if len(common) >= MIN_FOR_MEDIAN:
-            by_column.append(_placed_alone([one.median for one in pooled], column, [""] * len(pooled)))
-    return [(suite.title_of(setting), [cells[row] for cells in by_column]) for row, setting in enumerate(settings)]
-
-
-def _placed_alone(numbers: Sequence[float], column: Column, medians: Sequence[str]) -> list[Cell]:
-    return placed(numbers, [f"{one:.{column.digits}f}" if np.isfinite(one) else "" for one in numbers], column, medians)
-
-
-def _common(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """Return the sequences on which every setting that is ranked at all is ranked."""
-    names = sequences_of(suite, rows)
-    groups = [[select(rows, name, setting) for name in names] for setting in settings_of(suite, rows)]
-    ranks = [[is_ranked(own, column) for own in line] for line in groups]
-    return [name for place, name in enumerate(names) if all(line[place] for line in ranks if any(line))]
-
-
-def matrix_heads(suite: Suite, rows: Sequence[Row], column: Column) -> list[str]:
-    """Return the heads of `matrix`."""
-    sequences, common = sequences_of(suite, rows), _common(suite, rows, column)
-    of = "" if len(common) == len(sequences) else f" of {len(common)}"
-    pooled = [f"mean{of}"] * (len(common) > 1) + [f"median{of}"] * (len(common) >= MIN_FOR_MEDIAN)
-    return [*sequences, *pooled]
+            heads.append(f"median{of}")
+            numbers = [one.median for one in pooled]
+            by_column.append(placed(numbers, column, list(map(text, numbers)), [""] * len(pooled)))
+    lines = [(suite.title_of(setting), [cells[row] for cells in by_column]) for row, setting in enumerate(settings)]
+    return heads, lines
 
 
 @dataclass(frozen=True)
@@ -300,8 +276,12 @@ def differences(suite: Suite, rows: Sequence[Row]) -> list[Difference]:
 
 
 def _difference(summary: Summary, column: Column) -> Cell:
-    better = summary.mean * column.better > 0
-    return Cell(interval_cell(summary, column.digits), (1 if better else 2) if summary.count and summary.differs else 0)
+    """Return a mean difference with its 95 % interval, without interval for a single pair."""
+    if not summary.count:
+        return Cell("")
+    interval = "(one pair)" if np.isnan(summary.half) else f"± {summary.half:.{column.digits}f}"
+    place = (1 if summary.mean * column.better > 0 else 2) if summary.differs else 0
+    return Cell(f"{summary.mean:+.{column.digits}f} {interval}", place)
 
 
 def verdicts(rows: Sequence[Row]) -> str:
@@ -317,7 +297,7 @@ def tracked(rows: Sequence[Row]) -> str:
     return f"{sum(row['tracked'] for row in known)}/{sum(row['frames'] for row in known)}" if known else ""
 
 
-def protocol_text(rows: Sequence[Row]) -> str:
-    """Return the protocols with their descriptions."""
-    names = dict.fromkeys(str(row["protocol"]) for row in rows)
-    return "; ".join(f"{name}: {PROTOCOLS[name].about}" for name in names)
+def provenance(rows: Sequence[Row], names: Iterable[str]) -> list[tuple[str, str]]:
+    """Return a name and the different values of each column of `names` that has any."""
+    found = {name: [str(value) for value in dict.fromkeys(row.get(name) for row in rows) if value] for name in names}
+    return [(name.replace("_", " "), ", ".join(values)) for name, values in found.items() if values]

@@ -1,6 +1,6 @@
 """Run a suite on a Ray cluster (extra `cluster`): each run is a task with processors and, optionally, a GPU.
 
-A task starts the same process with the same limits as `scheduling`, and returns its row and its small files, which the
+A task starts the same process with the same limits as `processes`, and returns its row and its small files, which the
 driver writes into the store. Ray restarts tasks whose worker or node is lost; each result is stored once. Recordings
 must have the same path on every node. If the driver dies, call it again.
 """
@@ -17,11 +17,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.benchmark.jobs import Job
-from vggtgeo.benchmark.processes import Limits, claim_cores, run_limited
+from vggtgeo.benchmark.jobs import Job, Store
+from vggtgeo.benchmark.processes import (
+    Command,
+    Finished,
+    Limits,
+    claim_cores,
+    describe_ending,
+    run_limited,
+    worker_command,
+)
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.scheduling import Command, Finished, check_space, describe_ending, worker_command
-from vggtgeo.benchmark.store import Store
 from vggtgeo.benchmark.worker import JOB, LOG, ROW
 from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path
@@ -51,7 +57,7 @@ def run_jobs_on_cluster(
 ) -> None:
     """Run `jobs` on the cluster, and store their rows as they finish.
 
-    InputError if Ray is not installed, no cluster answers at the address, or the disk of a node is full.
+    InputError if Ray is not installed, or no cluster answers at the address.
     """
     if not jobs:
         return
@@ -97,22 +103,10 @@ def _store_result(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[s
         lines = str(error).strip().splitlines()
         message = f"the cluster lost the task: {lines[0] if lines else error!r}"
         return store.complete(job, status="crash", message=message, **{**provenance(), "machine": "a lost node"})
-    for name, content in contents.items():
-        if name not in (JOB, ROW):
-            with atomic_path(place / name) as temporary:
-                temporary.write_bytes(content)
-    if ROW in contents:
-        with atomic_path(place / ROW) as temporary:
-            temporary.write_bytes(contents[ROW])
-    check_space(place, ending)
+    for name in sorted(contents.keys() - {JOB}, key=lambda name: name == ROW):  # the row last: it marks a finished run
+        with atomic_path(place / name) as temporary:
+            temporary.write_bytes(contents[name])
     return store.complete(job, **ending)
-
-
-def _check_answers(address: str) -> None:
-    """Raise OSError if `host:port` does not answer: Ray itself would try for minutes."""
-    host, colon, port = address.rpartition(":")
-    if colon and port.isdigit() and "://" not in address:
-        socket.create_connection((host, int(port)), timeout=5.0).close()
 
 
 def _connect(cluster: Cluster) -> Any:
@@ -120,8 +114,10 @@ def _connect(cluster: Cluster) -> Any:
         import ray
     except ImportError:
         raise InputError(f"a cluster needs Ray; {install_hint('cluster')}") from None
+    host, colon, port = cluster.address.rpartition(":")
     try:
-        _check_answers(cluster.address)
+        if colon and port.isdigit() and "://" not in host:  # Ray itself would try for minutes
+            socket.create_connection((host, int(port)), timeout=5.0).close()
         ray.init(address=cluster.address, log_to_driver=False)
     except (OSError, ValueError) as error:
         text = str(error).splitlines()[0]

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from vggtgeo.benchmark import cells
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row, Summary, select, values
+from vggtgeo.benchmark.table import Row, Summary, run_name, select, values
 from vggtgeo.datasets.pose_files import load_trajectory
-from vggtgeo.evaluation import align, associate
-from vggtgeo.figures.plots import NotebookFigure, view_axes
-from vggtgeo.figures.style import BLUE, INK, ORANGE, RULE, line_colour, style
+from vggtgeo.evaluation import absolute_error, associate
+from vggtgeo.figures.plots import BLUE, INK, ORANGE, RULE, NotebookFigure, line_colour, style, view_axes
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -45,11 +45,11 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
         for name in cells.sequences_of(suite, good)
     }
     panels = {name: keys for name, keys in panels.items() if keys}
-    label = lambda name, key: f"{suite.title_of(key)}{_part(select(good, name, key))}"
+    coverage = lambda own: "" if cells.is_covered(own) else cells.at_coverage(own)  # if too small for a comparison
+    label = lambda name, key: f"{suite.title_of(key)}{coverage(select(good, name, key))}"
     rows_of = {name: [_wrapped(label(name, key), _LABEL) for key in keys] for name, keys in panels.items()}
     heights = [_height(labels) + _MARGIN for labels in rows_of.values()]
     figure = NotebookFigure(figsize=(width, sum(heights) + 0.5 if panels else 1.5), layout="constrained")
-    FigureCanvasAgg(figure)
     if not panels:
         return figure
     drawn = figure.subplots(len(panels), 1, height_ratios=heights, squeeze=False)[:, 0]
@@ -61,14 +61,9 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
     return figure
 
 
-def _part(rows: Sequence[Row]) -> str:
-    """Return the coverage as text if it is too small for a comparison."""
-    return "" if cells.is_covered(rows) else cells.at_coverage(rows)
-
-
-def _wrapped(text: str, width: int, most: int = 3) -> str:
-    """Wrap into at most `most` lines of at most `width` letters."""
-    return "\n".join(wrap(text.replace("`", ""), width, max_lines=most, placeholder=" ..."))
+def _wrapped(text: str, width: int) -> str:
+    """Wrap into at most three lines of at most `width` letters."""
+    return "\n".join(wrap(text.replace("`", ""), width, max_lines=3, placeholder=" ..."))
 
 
 def _height(labels: Sequence[str]) -> float:
@@ -109,49 +104,45 @@ def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Seq
     style(axes, axis="x", which="both")
 
 
+@dataclass(frozen=True, eq=False)
 class Path3:
     """An estimate after alignment, the truth it is compared with, and the error of each pose, metres."""
 
-    def __init__(self, title: str, estimate: Trajectory, truth: Trajectory, with_scale: bool) -> None:
-        matched, reference = associate(estimate, truth)
-        alignment = align(matched, reference, "sim3" if with_scale else "se3")
-        self.title, self.truth = title, truth
-        self.estimate = alignment.trajectory(matched)
-        self.errors = np.linalg.norm(self.estimate.positions - reference.positions, axis=1)
+    title: str
+    estimate: Trajectory
+    truth: Trajectory
+    errors: np.ndarray
 
 
 def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[Path3]:
     """Return the first run of each setting on a sequence with a trajectory that can be aligned with the truth."""
-    found = []
+    found: list[Path3] = []
     for setting in cells.settings_of(suite, rows):
         drawn = (_path(suite, row, folder) for row in select(rows, sequence, setting))
-        found += [one for one in [next((one for one in drawn if one is not None), None)] if one is not None]
+        found += islice((one for one in drawn if one is not None), 1)
     return found[:_MAX_LINES]
 
 
 def _path(suite: Suite, row: Row, folder: Path) -> Path3 | None:
     """Return the trajectory of a run; None if it has none, or too few of its poses have a truth to be aligned."""
-    place = folder / "runs" / f"{row['sequence']}.{row['setting']}.{row['seed']}"
-    title = suite.title_of(str(row["setting"])).replace("`", "")
+    runs, name = folder / "runs", run_name(row)
+    own, others = runs / name / "truth.txt", sorted(runs.glob(f"{row['sequence']}.*.{row['seed']}/truth.txt"))
     try:
-        truth = Trajectory.load_tum(_truth_file(place, folder, str(row["sequence"]), row["seed"]))
-        external = row.get("external")
-        estimate = load_trajectory(str(external), truth) if external else Trajectory.load_tum(place / "estimate.txt")
-        one = Path3(title, estimate, truth, row.get("metric") is False)
+        truth = Trajectory.load_tum(own if own.is_file() or not others else others[0])
+        estimate = load_trajectory(row.get("external") or runs / name / "estimate.txt", truth)
+        matched, reference = associate(estimate, truth)
+        error = absolute_error(matched, reference, "sim3" if row.get("metric") is False else "se3")
     except InputError:
         return None
-    return one if len(one.errors) >= MIN_POSES else None
+    if len(matched) < MIN_POSES:
+        return None
+    title = suite.title_of(str(row["setting"])).replace("`", "")
+    return Path3(title, error.alignment.trajectory(matched), truth, error.errors)
 
 
-def _truth_file(place: Path, folder: Path, sequence: str, seed: object) -> Path:
-    own = place / "truth.txt"
-    return own if own.is_file() else next(iter(sorted((folder / "runs").glob(f"{sequence}.*.{seed}/truth.txt"))), own)
-
-
-def paths_figure(given: Sequence[Path3], width: float = 5.0) -> NotebookFigure:
+def paths_figure(given: Sequence[Path3]) -> NotebookFigure:
     """Draw the paths from above, with the truth, and the error along the time."""
-    figure = NotebookFigure(figsize=(width, 1.25 * width), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = NotebookFigure(figsize=(5.0, 6.25), layout="constrained")
     above, along = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
     view, origin = view_axes(given[0].truth, level_world=True), given[0].truth.positions[0]
     flat = lambda trajectory: ((trajectory.positions - origin) @ view.T)[:, :2].T
@@ -188,7 +179,6 @@ def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> Notebo
         name for name in sorted(names, key=lambda name: -totals[name]) if totals[name] > 0.01 * sum(totals.values())
     ]
     figure = NotebookFigure(figsize=(width, _height([name for name, _ in groups]) + 1.6), layout="constrained")
-    FigureCanvasAgg(figure)
     time, memory = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
     left = np.zeros(len(groups))
     for number, name in enumerate(stages):

@@ -9,10 +9,11 @@ import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
+from vggtgeo.benchmark.suite import WalkTable
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence, without_depth
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import is_there
@@ -23,10 +24,12 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
+from vggtgeo.io.locks import locked
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry
 from vggtgeo.models.roles import InitialGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
 from vggtgeo.models.window_locator import WindowLocator
+from vggtgeo.report.map_scene import spread
 from vggtgeo.simulation import SimulatedOracle, simulate
 from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
 from vggtgeo.slam.run import default_roles
@@ -75,7 +78,7 @@ class Input:
 
     sequence: Sequence
     perception: Perception
-    exact: ExactFrames | None = None
+    exact: SimulatedOracle | RecordedFrames | None = None
     scan: TanksAndTemples | None = None
     simulated: bool = False
     references: Mapping[str, Trajectory] = field(default_factory=dict)
@@ -102,21 +105,18 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
             scan.scanned_points()
         references = {name: Trajectory.load_tum(Path(spec["path"]) / file) for name, file in spec["references"].items()}
         return Input(sequence, _perceived(spec, sequence.has_depth), exact, scan, references=references)
-    rendered = _rendered(spec["simulate"], seed, scratch)
+    rendered, is_plain = _rendered(spec["simulate"], seed, scratch), spec["degrade"] == "base"
     if spec["perception"] == "simulated":
-        if spec["degrade"] != "base":
+        if not is_plain:
             raise InputError(
                 f"`degrade` is {spec['degrade']!r}, but simulated roles use the undegraded images; leave it out, or "
                 "use other roles"
             )
-        return Input(
-            rendered, Perception(simulated_roles(rendered.oracle, spec, seed), {}), rendered.oracle, simulated=True
-        )
-    if spec["degrade"] == "base":
-        sequence = _without(rendered, spec)
-        return Input(sequence, _perceived(spec, sequence.has_depth), rendered.oracle, simulated=True)
-    sequence = _without(degraded(rendered, spec["degrade"], seed), spec)
-    return Input(sequence, _perceived(spec, sequence.has_depth), simulated=True)
+        roles = Perception(simulated_roles(rendered.oracle, spec, seed), {})
+        return Input(rendered, roles, rendered.oracle, simulated=True)
+    sequence = _without(rendered if is_plain else degraded(rendered, spec["degrade"], seed), spec)
+    perceived = _perceived(spec, sequence.has_depth)
+    return Input(sequence, perceived, rendered.oracle if is_plain else None, simulated=True)
 
 
 def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
@@ -126,24 +126,25 @@ def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
 
 def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> RenderedWalk:
     """Return the walk of a suite's table `simulate`, from the scratch folder or rendered (0.25 s a frame)."""
-    kept = None if scratch is None else scratch / walk_name(table, seed)
-    if kept is not None and kept.is_file():
-        with kept.open("rb") as stream:
-            walk: RenderedWalk = pickle.load(stream)  # safe: written below, in a folder private to this user
-        return walk
-    options = {**table}
-    scene, frames = options.pop("scene", "office"), options.pop("frames", 60)
-    size = tuple(options.pop("size", (640, 480)))
-    try:
-        oracle = SimulatedOracle(simulate(scene, frames, seed, size, **options), kept=frames)
-    except TypeError as error:
-        raise InputError(f"`simulate` in the suite: {error}") from None
-    recording = Recording(list(oracle.frames()), oracle.camera, oracle.ground_truth())
-    walk = RenderedWalk(oracle.name, recording, oracle)
-    if kept is not None:
-        with atomic_open(kept, "wb") as stream:
-            pickle.dump(walk, stream, pickle.HIGHEST_PROTOCOL)
+    if scratch is None:
+        return _render(table, seed)
+    kept = scratch / walk_name(table, seed)
+    with locked(kept.with_suffix(".lock"), timeout=-1):  # of the runs on one walk, one renders it
+        if not kept.is_file():
+            with atomic_open(kept, "wb") as stream:
+                pickle.dump(_render(table, seed), stream, pickle.HIGHEST_PROTOCOL)
+    with kept.open("rb") as stream:
+        walk: RenderedWalk = pickle.load(stream)  # safe: written above, in a folder private to this user
     return walk
+
+
+def _render(table: Mapping[str, Any], seed: int) -> RenderedWalk:
+    asked = WalkTable(**table)
+    size = asked.size[0], asked.size[1]
+    rendered = simulate(asked.scene, asked.frames, seed, size, rate=asked.rate, speed=asked.speed)
+    oracle = SimulatedOracle(rendered, kept=asked.frames)
+    recording = Recording(list(oracle.frames()), oracle.camera, oracle.ground_truth())
+    return RenderedWalk(oracle.name, recording, oracle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,20 +192,19 @@ def degraded(walk: RenderedWalk, name: str, seed: int) -> DegradedWalk:
 def simulated_roles(oracle: SimulatedOracle, spec: Mapping[str, Any], seed: int) -> Roles:
     """Return the five stubs with their standard error models; depth errors are scaled by the setting's factor."""
     moge, factor = SimulatedMoge(oracle, seed), spec["depth_errors"]
+    starts: dict[str, InitialGeometry] = {
+        "constant-velocity": ConstantVelocity(),
+        "pnp": PnpGeometry(),
+        "window": WindowLocator(SimulatedVggt(oracle, seed), PnpGeometry()),
+    }
     return Roles(
         points=SimulatedMast3r(oracle, seed, count=spec["key_points"]),
         lines=SimulatedLetr(oracle, seed),
         depth=replace(moge, error=factor * moge.error, wobble=factor * moge.wobble),
         confidence=SimulatedDino(oracle, seed),
-        geometry=_start(spec["start_of_pose"], SimulatedVggt(oracle, seed)),
+        geometry=starts[spec["start_of_pose"]],
         alignment=None,  # not in the paper, and it would hide the effect of the initial pose in the ablation
     )
-
-
-def _start(name: str, vggt: SimulatedVggt) -> InitialGeometry:
-    if name == "constant-velocity":
-        return ConstantVelocity()
-    return PnpGeometry() if name == "pnp" else WindowLocator(vggt, PnpGeometry())
 
 
 def _without(sequence: Sequence, spec: Mapping[str, Any]) -> Sequence:
@@ -227,26 +227,6 @@ def _perceived(spec: Mapping[str, Any], has_depth: bool) -> Perception:
 
 _DELAY = 0.005
 """Largest time between a frame and its true pose, seconds: rendered ones are simultaneous."""
-
-
-@runtime_checkable
-class ExactFrames(Protocol):
-    """Exact depth and poses by the frame's index in the sequence."""
-
-    @property
-    def camera(self) -> Camera:
-        """Pinhole camera."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def depth(self, index: int) -> np.ndarray:
-        """Return the true depth, float64 [H, W], metres, NaN = unknown."""
-        ...
-
-    def pose(self, index: int) -> np.ndarray:
-        """Return the true pose, world -> camera, float64 [4, 4]; NaN if unknown."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,12 +271,16 @@ class RecordedFrames:
         return rigid.invert(self.truth.poses[rows])[0] if len(rows) else np.full((4, 4), np.nan)
 
 
-def exact_cloud(frames: ExactFrames, max_frames: int = 30, step: int = 4) -> np.ndarray:
-    """Return world points of the visible surfaces, float64 [n, 3]: every `step`-th pixel of `max_frames` frames."""
+ExactFrames = SimulatedOracle | RecordedFrames
+"""Exact depth and poses by the frame's index in the sequence."""
+
+
+def exact_cloud(frames: ExactFrames) -> np.ndarray:
+    """Return world points of the visible surfaces, float64 [n, 3]: every fourth pixel of at most 30 frames."""
+    step = 4
     fx, fy, cx, cy = frames.camera.intrinsics
-    count = len(frames)
     clouds = []
-    for index in np.unique(np.linspace(0, count - 1, min(count, max_frames)).round().astype(int)):
+    for index in spread(len(frames), 30):
         depth, pose = frames.depth(int(index))[::step, ::step], frames.pose(int(index))
         v, u = np.nonzero(np.isfinite(depth) & np.isfinite(pose).all())
         z = depth[v, u]

@@ -1,20 +1,26 @@
-"""Expand a suite into runs, each with everything its result depends on, as plain values."""
+"""Expand a suite into runs, each with everything its result depends on, and keep finished ones as folders."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.inputs import find_sequences
+from vggtgeo.benchmark.measure import NOT_COMPARABLE
 from vggtgeo.benchmark.provenance import input_hash
 from vggtgeo.benchmark.suite import PROTOCOLS, SequenceTable, SettingTable, Suite
+from vggtgeo.benchmark.table import Row
+from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.datasets.opening import is_readable
-from vggtgeo.io.errors import InputWarning
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.files import write_json
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import changed, updated
 
@@ -54,13 +60,13 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
     """Return all runs of a suite, sequence by sequence, with recordings from the folders `data`."""
     roots = tuple(data)
     # An archive unpacked into a folder of its own name has the recording one level deeper.
-    first_readable = lambda places: sorted(places, key=lambda place: not is_readable(place))
-    places = {one.name: first_readable(find_sequences(one.path, roots) if one.path else []) for one in suite.sequence}
+    unreadable = lambda place: not is_readable(place)
     found = []
     for sequence in suite.sequence:
-        place = next(iter(places[sequence.name]), None)
-        if len(places[sequence.name]) > 1:
-            text = f"`{sequence.path}` exists {len(places[sequence.name])} times below `data`; `{place}` is taken"
+        places = sorted(find_sequences(sequence.path, roots) if sequence.path else [], key=unreadable)
+        place = next(iter(places), None)
+        if len(places) > 1:
+            text = f"`{sequence.path}` exists {len(places)} times below `data`; `{place}` is taken"
             warnings.warn(text, InputWarning, stacklevel=2)
         absent = _absent(sequence.path, roots) if place is None else ""
         digest = "" if place is None else input_hash(place)
@@ -75,11 +81,9 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
 
 
 def _absent(path: str, roots: Sequence[Path]) -> str:
-    if Path(path).expanduser().is_absolute():
-        return f"`{path}` does not exist"
-    if not roots:
-        return f"`{path}` not found, no folder of recordings is known: give `--data FOLDER`"
-    return f"`{path}` not found in {', '.join(f'`{root}`' for root in roots)}, nor in subfolders two levels deep"
+    if roots and not Path(path).expanduser().is_absolute():
+        return f"`{path}` not found in {', '.join(f'`{root}`' for root in roots)}, nor in subfolders two levels deep"
+    return f"`{path}` does not exist; give the folder of recordings with `--data FOLDER`"
 
 
 def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: Path | None) -> dict[str, Any]:
@@ -87,28 +91,84 @@ def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: P
     settings = SlamSettings()
     for tables in (suite.set, sequence.set, setting.set):
         settings = updated(settings, tables)
-    roles = {key: value for key, value in asdict(setting).items() if key in _ROLES}
     return {
-        **roles,
+        **{key: getattr(setting, key) for key in _OF_SETTING},
+        **{key: getattr(sequence, key) for key in _OF_SEQUENCE},
         "path": None if place is None else str(place),
-        "kind": sequence.kind,
         "simulate": dict(sequence.simulate),
-        "degrade": sequence.degrade,
         "protocol": protocol,
         "stride": PROTOCOLS[protocol].stride,
         "poses": PROTOCOLS[protocol].poses,
-        "start": sequence.start,
-        "end": sequence.end,
         "rgb_only": sequence.rgb_only or setting.rgb_only,
-        "key_points": sequence.key_points,
         "references": dict(sequence.references),
-        "threshold": sequence.threshold,
-        "vertical": sequence.vertical,
-        "exact_depth": sequence.exact_depth,
         "set": {group: dict(values) for group, values in changed(settings).items()},
         "pages": suite.pages,
         "recordings": suite.recordings,
     }
 
 
-_ROLES = ("calibrated", "perception", "features", "start_of_pose", "depth_errors")
+_OF_SETTING = ("calibrated", "perception", "features", "start_of_pose", "depth_errors")
+_OF_SEQUENCE = ("kind", "degrade", "start", "end", "key_points", "threshold", "vertical", "exact_depth")
+
+
+@dataclass(frozen=True)
+class Store:
+    """Runs of a suite in `folder`/runs. source: digest of the code that computes; see `Job.fingerprint`."""
+
+    folder: Path
+    suite: str
+    source: str
+
+    def place(self, job: Job) -> Path:
+        """Return the folder of a run."""
+        return self.folder / "runs" / job.name
+
+    def load(self, job: Job, retry: bool = False) -> Row | None:
+        """Return the row of a finished run; None if it is missing, or of other settings, inputs or code.
+
+        retry: also None for a run that ended without a result. InputError for a damaged file.
+        """
+        path = self.place(job) / ROW
+        if not path.is_file():
+            return None
+        try:
+            row = json.loads(whole_text(path, errors="strict"))
+            same, status = row["fingerprint"] == job.fingerprint(self.source), row["status"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"`{path}` is damaged ({error}); delete it and call again") from None
+        return row if same and not (retry and status not in ("ok", NOT_COMPARABLE)) else None
+
+    def begin(self, job: Job) -> Path:
+        """Make an empty folder with the description of the run."""
+        place = self.place(job)
+        shutil.rmtree(place, ignore_errors=True)
+        write_json(place / JOB, self.describe(job))
+        return place
+
+    def complete(self, job: Job, **columns: Any) -> Row:
+        """Write and return the run's row with `columns`; if the run wrote none, a row with its status."""
+        path = self.place(job) / ROW
+        row = json.loads(whole_text(path, errors="strict")) if path.is_file() else identity(self.describe(job))
+        if "status" in row:
+            row = {**{name: value for name, value in columns.items() if name != "message"}, **row}
+        else:
+            row = {**row, **columns}
+        write_json(path, row)
+        return row
+
+    def absent(self, job: Job) -> Row:
+        """Return the row of a run whose recording is missing; not stored, so that the next call looks again."""
+        return {**identity(self.describe(job)), "status": "absent", "message": job.absent}
+
+    def describe(self, job: Job) -> dict[str, Any]:
+        """Return the description of a run, the content of `job.json`."""
+        return {
+            "name": job.name,
+            "suite": self.suite,
+            "sequence": job.sequence,
+            "setting": job.setting,
+            "seed": job.seed,
+            "spec": dict(job.spec),
+            "input_hash": job.input_hash,
+            "fingerprint": job.fingerprint(self.source),
+        }

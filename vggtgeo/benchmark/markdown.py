@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 from vggtgeo.benchmark import cells
 from vggtgeo.benchmark.cells import Cell
 from vggtgeo.benchmark.published import PublishedTable, published
-from vggtgeo.benchmark.suite import Suite
+from vggtgeo.benchmark.suite import PROTOCOLS, Suite
 from vggtgeo.benchmark.table import Row, select
 
 
@@ -28,10 +29,12 @@ def page(suite: Suite, rows: Sequence[Row]) -> str:
         parts += ["## Without a result", failures(rows)]
     for name in suite.published:
         parts += [published_table(published(name))]
-    parts += ["## Provenance", provenance(rows)] if any(row.get("version") for row in rows) else []
+    if any(row.get("version") for row in rows):
+        parts += ["## Provenance", table(["", ""], cells.provenance(rows, _PROVENANCE))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
+_PROVENANCE = ("version", "commit", "source", "machine", "version_jax", "version_numpy", "version_python")
 _COVERED = (
     f", at the share of the truth's duration that is covered: below {100 * cells.MIN_COVERAGE:.0f} % an error is not "
     "ranked."
@@ -54,7 +57,9 @@ def notice(suite: Suite, rows: Sequence[Row]) -> str:
     seeds = f"Seeds from {suite.first_seed}; mean ± standard deviation over seeds"
     most = max((len(select(rows, row["sequence"], row["setting"])) for row in rows), default=0)
     seeds += " / median." if most >= cells.MIN_FOR_MEDIAN else "."
-    return f"{kind}{stubs}Suite `{suite.name}`, {_count(rows)}. {seeds} Protocol {cells.protocol_text(rows)}."
+    names = dict.fromkeys(str(row["protocol"]) for row in rows)
+    protocols = "; ".join(f"{name}: {PROTOCOLS[name].about}" for name in names)
+    return f"{kind}{stubs}Suite `{suite.name}`, {_count(rows)}. {seeds} Protocol {protocols}."
 
 
 def _count(rows: Sequence[Row]) -> str:
@@ -62,16 +67,15 @@ def _count(rows: Sequence[Row]) -> str:
     others = sum("external" in row for row in rows)
     absent = sum(row["status"] == "absent" for row in rows)
     runs = len(rows) - others - absent
-    parts = [f"{runs} runs" if runs != 1 else "1 run"]
-    parts += [f"{absent} more without their recording"] * bool(absent)
-    parts += [f"{others} of other systems"] * bool(others)
-    return ", ".join(parts)
+    text = f"{runs} runs" if runs != 1 else "1 run"
+    text += f", {absent} more without their recording" if absent else ""
+    return text + (f", {others} of other systems" if others else "")
 
 
 def accuracy(suite: Suite, rows: Sequence[Row], column: cells.Column) -> str:
     """Return a table with a row per setting and a column per sequence."""
-    body = [[title, *map(_marked, line)] for title, line in cells.matrix(suite, rows, column)]
-    return table(["setting", *cells.matrix_heads(suite, rows, column)], body)
+    heads, lines = cells.matrix(suite, rows, column)
+    return table(["setting", *heads], [[title, *map(_marked, line)] for title, line in lines])
 
 
 def differences(suite: Suite, rows: Sequence[Row]) -> str:
@@ -93,31 +97,25 @@ def details(suite: Suite, rows: Sequence[Row]) -> list[str]:
         if cells.finished(own := select(rows, sequence, setting))
     ]
     groups = [own for _, own in runs]
-    parts = ["### Poses", _poses(runs, _references(rows))]
+    parts = []
     for title, columns in cells.GROUPS.items():
-        shown = [] if title == "Poses" else cells.measured(groups, columns)
-        if shown:
-            lines = [
-                [*names, *(_marked(cells.cell_of(own, column)) for column in shown)]
-                for names, own in runs
-                if cells.measured([own], shown)
+        poses = title == "Poses"
+        shown = cells.measured(groups, (*columns, *_references(rows)) if poses else columns)
+        lines = [
+            [
+                *names,
+                *([cells.tracked(own)] if poses else []),
+                *(_marked(cells.cell_of(own, column)) for column in shown),
+                *([cells.verdicts(own)] if poses else []),
             ]
-            heads = [*_NAMES, *(column.head for column in shown)]
-            parts += [f"### {cells.heading(title, groups)}", table(heads, lines)]
+            for names, own in runs
+            if poses or cells.measured([own], shown)
+        ]
+        heads = [column.head for column in shown]
+        heads = ["tracked", *heads, "verdict"] if poses else heads
+        if lines:
+            parts += [f"### {cells.heading(title, groups)}", table(["sequence", "setting", "runs", *heads], lines)]
     return parts
-
-
-_NAMES = ("sequence", "setting", "runs")
-
-
-def _poses(runs: Sequence[tuple[Sequence[str], Sequence[Row]]], references: Sequence[cells.Column]) -> str:
-    """Return the table of the poses, with the verdicts."""
-    shown = cells.measured([own for _, own in runs], (*cells.GROUPS["Poses"], *references))
-    lines = [
-        [*names, cells.tracked(own), *(_marked(cells.cell_of(own, column)) for column in shown), cells.verdicts(own)]
-        for names, own in runs
-    ]
-    return table([*_NAMES, "tracked", *(column.head for column in shown), "verdict"], lines)
 
 
 def doubts(rows: Sequence[Row]) -> str:
@@ -129,14 +127,9 @@ def doubts(rows: Sequence[Row]) -> str:
 def failures(rows: Sequence[Row]) -> str:
     """Return the table of runs without a result and their reasons; runs without data in one line."""
     absent = sorted({str(row["sequence"]) for row in rows if row["status"] == "absent"})
-    broken = [row for row in rows if row["status"] not in ("ok", "absent")]
-    parts = []
-    if broken:
-        lines = [
-            [str(row[name]) for name in ("sequence", "setting", "seed", "status")] + [str(row.get("message", ""))]
-            for row in broken
-        ]
-        parts.append(table(["sequence", "setting", "seed", "status", "message"], lines))
+    names = ("sequence", "setting", "seed", "status", "message")
+    lines = [[str(row.get(name, "")) for name in names] for row in rows if row["status"] not in ("ok", "absent")]
+    parts = [table(names, lines)] if lines else []
     if absent:
         parts.append(f"Missing recordings: {', '.join(absent)} (`vggtgeo data list` shows where to get them).")
     return "\n\n".join(parts)
@@ -152,16 +145,6 @@ def published_table(given: PublishedTable) -> str:
     )
 
 
-def provenance(rows: Sequence[Row]) -> str:
-    """Return the table of versions and machines."""
-    lines = []
-    for name in ("version", "commit", "source", "machine", "version_jax", "version_numpy", "version_python"):
-        found = [str(value) for value in dict.fromkeys(row.get(name) for row in rows) if value]
-        if found:
-            lines.append([name.replace("_", " "), ", ".join(found)])
-    return table(["", ""], lines)
-
-
 def table(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     row = lambda cells: "| " + " | ".join(text.replace("|", "\\|").replace("\n", " ") for text in cells) + " |"
@@ -169,12 +152,9 @@ def table(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
 
 
 def _references(rows: Sequence[Row]) -> list[cells.Column]:
-    names = dict.fromkeys(name for row in rows for name in row if _is_reference(name))
+    """Return the columns of the errors against the other ground truths of the sequences."""
+    names = dict.fromkeys(name for row in rows for name in row if re.fullmatch("ate_sim3_.+_m", name))
     return [cells.Column(f"{name[9:-2]} Sim(3) cm", name, 100.0) for name in names]
-
-
-def _is_reference(name: str) -> bool:
-    return name.startswith("ate_sim3_") and name.endswith("_m") and name != "ate_sim3_m"
 
 
 def _marked(cell: Cell) -> str:

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from vggtgeo.benchmark.inputs import ExactFrames, Input, exact_cloud
+from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.evaluation import (
     CloudError,
     Similarity,
-    TrajectoryReport,
     cloud_error,
     comparability,
     depth_error,
@@ -24,11 +24,13 @@ from vggtgeo.evaluation import (
     surface_points,
 )
 from vggtgeo.evaluation.alignment import AXES, Axis
+from vggtgeo.evaluation.pose_errors import Unit
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.report.map_scene import spread
 from vggtgeo.results.result import Result
 
-DELTAS: tuple[tuple[str, float, str], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0, "metres"))
+DELTAS: tuple[tuple[str, float, Unit], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0, "metres"))
 """Of RTE and RRE: column suffix, delta and its unit."""
 NOT_COMPARABLE = "not comparable"
 """Status of a row whose errors are meaningless, for the reasons in its message."""
@@ -91,16 +93,11 @@ def mean_nees(result: Result, truth: Trajectory, scale: float) -> dict[str, Any]
 
 
 def truth_of_run(result: Result, truth: Trajectory | None) -> Trajectory | None:
-    """Return the ground truth between the first and the last frame of the run; None if there is none."""
+    """Return the ground truth between the first and the last frame of the run (all if there is none); None without."""
     if truth is None or result.record is None:
         return truth
-    frames = result.record.slam.frames
-    return between(truth, frames[0].timestamp, frames[-1].timestamp)
-
-
-def between(truth: Trajectory, first: float, last: float) -> Trajectory:
-    """Return the poses from `first` to `last`, seconds; all poses if there is none."""
-    inside = (truth.timestamps >= first - _MARGIN) & (truth.timestamps <= last + _MARGIN)
+    frames, times = result.record.slam.frames, truth.timestamps
+    inside = (times >= frames[0].timestamp - _MARGIN) & (times <= frames[-1].timestamp + _MARGIN)
     return truth.select(inside) if inside.any() else truth
 
 
@@ -132,22 +129,17 @@ def trajectory_errors(
         "warnings": "; ".join([*report.warnings, *verdict.doubts, *explained]),
     }
     if offsets is not None:
-        known = offsets.as_dict()
+        known = offsets.to_dict()
         row |= {"time_offset_s": known["time_offset_s"], "time_offset_sd_s": known["time_offset_s_sd"]}
         row |= {"offsets": ", ".join(offsets.significant), "ate_sim3_without_offsets_m": offsets.ate_left}
     if verdict.reasons:
         row |= {"status": NOT_COMPARABLE, "message": "; ".join([*verdict.reasons, *verdict.doubts, *explained])}
     for name, delta, unit in DELTAS:
-        row |= _relative(evaluate_trajectory(estimate, truth, delta=delta, unit=unit), name, metric)  # type: ignore[arg-type]
+        found = evaluate_trajectory(estimate, truth, delta=delta, unit=unit)
+        pairs = found.relative if metric else found.relative_sim3
+        row[f"rte_{name}_m"] = pairs.translation_statistics.mean
+        row[f"rre_{name}_deg"] = float(np.degrees(pairs.rotation_statistics.mean))
     return row, (report.se3 if metric else report.sim3).alignment
-
-
-def _relative(report: TrajectoryReport, name: str, metric: bool) -> dict[str, Any]:
-    pairs = report.relative if metric else report.relative_sim3
-    return {
-        f"rte_{name}_m": pairs.translation_statistics.mean,
-        f"rre_{name}_deg": float(np.degrees(pairs.rotation_statistics.mean)),
-    }
 
 
 def _plain(value: Any) -> Any:
@@ -166,10 +158,10 @@ def depth_errors(result: Result, given: Input, alignment: Similarity) -> dict[st
     """Return errors of the keyframes' dense depth, and of their depth before the adjustment."""
     if given.exact is None or result.record is None:
         return {}
-    keyframes, maps = result.record.slam.keyframes, result.record.dense.depth_maps
-    chosen = np.unique(np.linspace(0, len(keyframes) - 1, _DEPTH_MAPS).round().astype(int))
-    fused = [(keyframes[row].frame, maps[row].depth if maps[row] is not None else None) for row in chosen]
-    before = [(keyframes[row].frame, keyframes[row].depth) for row in chosen]
+    pairs = list(zip(result.record.slam.keyframes, result.record.dense.depth_maps, strict=True))
+    chosen = [pairs[row] for row in spread(len(pairs), _DEPTH_MAPS)]
+    fused = [(keyframe.frame, None if depth_map is None else depth_map.depth) for keyframe, depth_map in chosen]
+    before = [(keyframe.frame, keyframe.depth) for keyframe, _ in chosen]
     return pooled_depth_errors(fused, before, given.exact, alignment.scale)
 
 
@@ -182,9 +174,10 @@ def pooled_depth_errors(fused: _Depths, before: _Depths, exact: ExactFrames, sca
     `depth_prior_rmse_m` is that of `before`. Exact depth is reduced to the size of the depth by nearest neighbour
     (`camera.max_pixels`).
     """
+    resized = lambda truth, like: cv2.resize(truth, like.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     found, prior = (
         [
-            depth_error((np.float32(scale) * depth).astype(np.float64), _as_large(exact.depth(frame), depth.shape))
+            depth_error((np.float32(scale) * depth).astype(np.float64), resized(exact.depth(frame), depth))
             for frame, depth in pairs
             if depth is not None and np.isfinite(depth).any()
         ]
@@ -203,12 +196,6 @@ def pooled_depth_errors(fused: _Depths, before: _Depths, exact: ExactFrames, sca
     }
 
 
-def _as_large(truth: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    if truth.shape == shape:
-        return truth
-    return np.asarray(cv2.resize(truth, shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT), np.float64)
-
-
 def map_errors(result: Result, given: Input, alignment: Similarity, spec: Mapping[str, Any]) -> dict[str, Any]:
     """Return errors of the cloud, and of the mesh if the run saves it, after the alignment of the trajectory."""
     if not len(result.cloud):
@@ -216,7 +203,7 @@ def map_errors(result: Result, given: Input, alignment: Similarity, spec: Mappin
     threshold = spec["threshold"]
     points = alignment.points(result.cloud.points.astype(np.float64))
     if given.scan is not None:
-        return scan_errors(points, given, threshold)
+        return scan_errors(points, given.scan, threshold)
     if given.exact is None:
         return {}
     truth = _sparse(exact_cloud(given.exact))
@@ -230,16 +217,16 @@ def map_errors(result: Result, given: Input, alignment: Similarity, spec: Mappin
     return row
 
 
-def scan_errors(points: Float[np.ndarray, "n 3"], given: Input, threshold: float) -> dict[str, Any]:
+def scan_errors(points: Float[np.ndarray, "n 3"], scan: TanksAndTemples, threshold: float) -> dict[str, Any]:
     """Return errors of the map (in the scan's frame) against a laser scan; empty without a scan.
 
     Both are cropped to the scan's volume and thinned to half the threshold, as in the benchmark Tanks and Temples, but
     without its refinement of the alignment.
     """
-    truth = None if given.scan is None else given.scan.scanned_points()
-    if given.scan is None or truth is None:
+    truth = scan.scanned_points()
+    if truth is None:
         return {}
-    inside = points[given.scan.judged(points)]
+    inside = points[scan.judged(points)]
     if not len(inside):
         return {"f_score": 0.0, "precision": 0.0, "recall": 0.0, "threshold_m": threshold}
     return _columns(cloud_error(thinned(inside, threshold / 2), thinned(truth, threshold / 2), threshold))

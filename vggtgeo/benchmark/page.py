@@ -9,7 +9,7 @@ from typing import Any
 from vggtgeo.benchmark import cells, figures, markdown
 from vggtgeo.benchmark.published import published
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row, select
+from vggtgeo.benchmark.table import Row, run_name, select
 from vggtgeo.benchmark.worker import LOG, RECORDING
 from vggtgeo.io.files import write_text
 from vggtgeo.report.figures import svg
@@ -21,24 +21,40 @@ def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> N
     good = cells.finished(rows)
     there = [row for row in rows if row["status"] != "absent"]
     has_error = cells.summary_of(good, figures.headline(good)).count > 0
+    versions = sorted({name for row in rows for name in row if name.startswith("version_")})
+    names = ("version", "commit", "source", "machine", *versions)
     text = template("vggtgeo.benchmark", "page.html.j2").render(
         style=style(),
         title=suite.title,
         about=suite.about.strip().replace("`", ""),
         notice=markdown.notice(suite, rows).replace("`", ""),
         facts=_facts(suite, there),
-        tables=_accuracy_tables(suite, there),
+        tables=[
+            {"head": column.head, "columns": heads, "rows": lines}
+            for column in (cells.SE3, cells.SIM3)
+            for heads, lines in [cells.matrix(suite, there, column)]
+            if any(cell.text for _, line in lines for cell in line)
+        ],
         base=suite.title_of(suite.base),
         compared=[column.head for column in cells.COMPARED],
         differences=cells.differences(suite, good),
         ablations=svg(figures.ablation_figure(suite, good, 7.5)) if has_error else None,
-        sequences=[_sequence(suite, there, name, folder) for name in cells.sequences_of(suite, good)],
+        sequences=[
+            {
+                "name": name,
+                "figure": svg(figures.paths_figure(drawn))
+                if (drawn := figures.paths(suite, good, name, folder))
+                else None,
+                "tables": _details(suite, there, name),
+            }
+            for name in cells.sequences_of(suite, good)
+        ],
         cost=svg(figures.cost_figure(suite, good, 7.5)) if any("frames" in row for row in good) else None,
         runs=[_run(suite, row, folder) for row in rows],
         broken=[row for row in rows if row["status"] not in ("ok", "absent")],
         absent=sorted({row["sequence"] for row in rows if row["status"] == "absent"}),
         published=[published(name) for name in suite.published],
-        provenance=_provenance(rows),
+        provenance=[(name.removeprefix("version "), text) for name, text in cells.provenance(rows, names)],
     )
     write_text(path, text)
 
@@ -54,24 +70,6 @@ def _facts(suite: Suite, rows: Sequence[Row]) -> list[tuple[str, str]]:
         *((str(levels.count(level)), f"called {level}") for level in ("good", "degraded", "failed") if level in levels),
         (f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s", "of runs"),
     ]
-
-
-def _accuracy_tables(suite: Suite, rows: Sequence[Row]) -> list[dict[str, Any]]:
-    both = {column: cells.matrix(suite, rows, column) for column in (cells.SE3, cells.SIM3)}
-    return [
-        {"head": column.head, "columns": cells.matrix_heads(suite, rows, column), "rows": lines}
-        for column, lines in both.items()
-        if any(cell.text for _, line in lines for cell in line)
-    ]
-
-
-def _sequence(suite: Suite, rows: Sequence[Row], name: str, folder: Path) -> dict[str, Any]:
-    given = figures.paths(suite, cells.finished(rows), name, folder)
-    return {
-        "name": name,
-        "figure": svg(figures.paths_figure(given)) if given else None,
-        "tables": _details(suite, rows, name),
-    }
 
 
 def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> list[dict[str, Any]]:
@@ -100,7 +98,7 @@ def _details(suite: Suite, rows: Sequence[Row], sequence: str) -> list[dict[str,
 
 
 def _run(suite: Suite, row: Row, folder: Path) -> dict[str, Any]:
-    place = Path("runs") / f"{row['sequence']}.{row['setting']}.{row['seed']}"
+    place = Path("runs") / run_name(row)
     files = {"page": "report.html", "poses": "estimate.txt", "recording": RECORDING, "log": LOG}
     there = {name: (place / file).as_posix() for name, file in files.items() if (folder / place / file).is_file()}
     return {
@@ -108,13 +106,3 @@ def _run(suite: Suite, row: Row, folder: Path) -> dict[str, Any]:
         "setting": suite.title_of(str(row["setting"])),
         "links": there,
     }
-
-
-def _provenance(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    names = sorted({name for row in rows for name in row if name.startswith("version_")})
-    found = []
-    for name in ("version", "commit", "source", "machine", *names):
-        values = [str(value) for value in dict.fromkeys(row.get(name) for row in rows) if value]
-        if values:
-            found.append((name.removeprefix("version_").replace("_", " "), ", ".join(values)))
-    return found

@@ -1,26 +1,41 @@
-"""Run a command in its own process, with limits of time and memory."""
+"""Run jobs serially or in parallel, each in its own process with limits of time and memory."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import queue
+import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import psutil
 
+from vggtgeo.benchmark.inputs import walk_name
+from vggtgeo.benchmark.jobs import Job, Store
+from vggtgeo.benchmark.provenance import provenance
+from vggtgeo.benchmark.table import Row
+from vggtgeo.benchmark.worker import LOG
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.jax_environment import jax_environment
 from vggtgeo.io.locks import LockedError, locked
 from vggtgeo.io.peak_memory import rusage_gb
 
+Command = Callable[[Path, Path], Sequence[str]]
+"""Returns the command line of a run for its folder and the scratch folder."""
+Finished = Callable[[Job, Row], None]
+_TAIL = 2000  # characters at the end of a log that are searched for its last line
 _POLL = 0.02
 _MEMORY_POLL = 0.25
 """Seconds between two polls; measuring the memory of a process and its children takes half a millisecond."""
@@ -78,12 +93,10 @@ def run_limited(
         raise InputError("`vggtgeo bench` needs the process calls of Linux or macOS; on Windows use WSL 2")
     tries = 1
     while True:
-        ending = _once(command, log, limits, cores, stop)
+        ending = replace(_once(command, log, limits, cores, stop), tries=tries)
         killed = ending.status == "ended" and ending.code < 0 and signal.Signals(-ending.code) in _OUTSIDE_SIGNALS
-        if not killed:
-            return Ending(ending.status, ending.code, ending.seconds, ending.peak_gb, tries)
-        if tries > limits.retries:
-            return Ending("killed", ending.code, ending.seconds, ending.peak_gb, tries)
+        if not killed or tries > limits.retries:
+            return replace(ending, status="killed") if killed else ending
         tries += 1
 
 
@@ -164,6 +177,99 @@ def shares(workers: int) -> list[tuple[int, ...]]:
     """Return the processors of each of `workers` processes, in equal shares; empty shares if there are too few."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     each = len(cores) // workers
-    if not each:
-        return [()] * workers
     return [tuple(cores[number * each : (number + 1) * each]) for number in range(workers)]
+
+
+def worker_command(folder: Path, scratch: Path) -> list[str]:
+    """Return the command line of a run."""
+    return [sys.executable, "-m", "vggtgeo.benchmark.worker", str(folder), str(scratch), str(os.getpid())]
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    store: Store,
+    limits: Limits,
+    workers: int = 1,
+    finished: Finished | None = None,
+    command: Command = worker_command,
+) -> None:
+    """Run `jobs`, `workers` at a time, and store their rows; crashes, timeouts and memory limits give rows as well.
+
+    Rendered walks are kept in a scratch folder while other runs need them. After Ctrl-C or an exception
+    of `finished`, all processes are ended; finished runs are stored.
+    """
+    with _scratch(store.folder) as scratch:
+        walks = [walk_name(job.spec["simulate"], job.seed) for job in jobs if job.spec["simulate"]]
+        needed, lock, stop = Counter(walks), threading.Lock(), threading.Event()
+        free: queue.SimpleQueue[tuple[int, ...]] = queue.SimpleQueue()
+        for cores in shares(workers):
+            free.put(cores)
+
+        def work(job: Job) -> None:
+            cores = free.get()
+            try:
+                row = run_one(job, store, limits, cores, command, scratch, stop)
+            finally:
+                free.put(cores)
+            with lock:
+                if job.spec["simulate"]:
+                    name = walk_name(job.spec["simulate"], job.seed)
+                    needed[name] -= 1
+                    if not needed[name]:
+                        (scratch / name).unlink(missing_ok=True)
+                if finished is not None:
+                    finished(job, row)
+
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                for future in as_completed([pool.submit(work, job) for job in jobs]):
+                    future.result()
+            except BaseException:
+                stop.set()
+                pool.shutdown(cancel_futures=True)
+                raise
+
+
+def run_one(
+    job: Job,
+    store: Store,
+    limits: Limits,
+    cores: Sequence[int],
+    command: Command,
+    scratch: Path,
+    stop: threading.Event | None = None,
+) -> Row:
+    """Run one job and return its row."""
+    place = store.begin(job)
+    began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    log = place / LOG
+    ending = describe_ending(run_limited(command(place, scratch), log, limits, cores, stop), log.read_bytes())
+    return store.complete(job, **ending, started=began, cpus=len(cores))
+
+
+def describe_ending(ending: Ending, log: bytes) -> dict[str, Any]:
+    """Return the columns on how and where a process ended; their status is used if the run wrote no row."""
+    message, status = ending.message, "crash" if ending.status in ("ended", "killed") else ending.status
+    if ending.status == "ended" and ending.code > 0:
+        lines = log[-_TAIL:].decode(errors="replace").split("\n")
+        message += f": {next((line.strip() for line in reversed(lines) if line.strip()), '')}"
+    return {
+        "status": status,
+        "message": message,
+        "seconds_wall": ending.seconds,
+        "peak_memory_gb": ending.peak_gb,
+        "tries": ending.tries,
+        **provenance(),
+    }
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """Make a temporary folder in that of the batch; the one of a killed batch is removed first."""
+    place = folder / ".scratch"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(mode=0o700, parents=True)  # rendered walks are pickles: no other user may write them
+    try:
+        yield place
+    finally:
+        shutil.rmtree(place, ignore_errors=True)

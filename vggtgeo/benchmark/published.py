@@ -7,36 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from typing import Any, Self
+from typing import Any
 
 from vggtgeo.io.errors import InputError
-
-LOST = "lost"
-
-
-class Printed(float):
-    """A number that is printed with the digits of its source: 0.050, not 0.05."""
-
-    def __new__(cls, text: object) -> Self:
-        made = super().__new__(cls, str(text))
-        made.text = str(text)
-        return made
-
-    text: str
-
-    def __str__(self) -> str:
-        return self.text
-
-
-Figure = float | str | None
 
 
 @dataclass(frozen=True)
 class PublishedTable:
     """A published table.
 
-    Fields: title, source, protocol, as text; columns, their heads; rows, numbers by system, `LOST` if it lost track,
-    None if not published; unit of the numbers; papers of the systems; uncalibrated, systems without known intrinsics.
+    Fields: title, source, protocol, as text; columns, their heads; rows, numbers by system with the digits of the
+    source, "lost" if it lost track, empty if not published; unit of the numbers; papers of the systems; uncalibrated,
+    systems without known intrinsics.
     """
 
     name: str
@@ -45,26 +27,21 @@ class PublishedTable:
     protocol: str
     unit: str
     columns: tuple[str, ...]
-    rows: Mapping[str, tuple[Figure, ...]]
+    rows: Mapping[str, tuple[str, ...]]
     papers: Mapping[str, str]
     uncalibrated: tuple[str, ...] = ()
 
     @property
     def has_gaps(self) -> bool:
         """Whether some figures are not published."""
-        return any(None in numbers for numbers in self.rows.values())
+        return any("" in numbers for numbers in self.rows.values())
 
     def lines(self) -> list[list[str]]:
         """Return a row of texts per system: name (with a star if uncalibrated), numbers, paper."""
         return [
-            [f"{name}{'*' * (name in self.uncalibrated)}", *map(figure_text, numbers), self.papers[name]]
+            [f"{name}{'*' * (name in self.uncalibrated)}", *(number or "-" for number in numbers), self.papers[name]]
             for name, numbers in self.rows.items()
         ]
-
-
-def figure_text(figure: Figure) -> str:
-    """Return a figure as text for a table."""
-    return "-" if figure is None else str(figure)
 
 
 def _folder() -> Traversable:
@@ -81,13 +58,9 @@ def check_published(name: str) -> None:
 def published(name: str) -> PublishedTable:
     """Load a table from `vggtgeo/benchmark/published`; raise InputError for an unknown name."""
     check_published(name)
-    values = tomllib.loads((_folder() / f"{name}.toml").read_text("utf-8"), parse_float=Printed)
-    columns = tuple(values.pop("columns"))
-    rows = {
-        system: tuple(None if number == "" else LOST if number == LOST else Printed(number) for number in numbers)
-        for system, numbers in values.pop("rows").items()
-    }
+    values = tomllib.loads((_folder() / f"{name}.toml").read_text("utf-8"), parse_float=str)
     papers = tomllib.loads((files("vggtgeo.benchmark") / "systems.toml").read_text("utf-8"))
-    own = {system: papers[system] for system in rows}
+    values["rows"] = {system: tuple(map(str, numbers)) for system, numbers in values["rows"].items()}
+    values["papers"] = {system: papers[system] for system in values["rows"]}
     plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-    return PublishedTable(name, columns=columns, rows=rows, papers=own, **plain)
+    return PublishedTable(name, **plain)

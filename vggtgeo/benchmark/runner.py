@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,23 +15,23 @@ import numpy as np
 from vggtgeo.benchmark import markdown
 from vggtgeo.benchmark.cells import COMPARED, finished, is_covered
 from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
-from vggtgeo.benchmark.external import external_rows, warn_of_missing
 from vggtgeo.benchmark.figures import ablation_figure
 from vggtgeo.benchmark.inputs import data_folders
-from vggtgeo.benchmark.jobs import Job, jobs_of
+from vggtgeo.benchmark.jobs import Job, Store, jobs_of
+from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.page import write_page
-from vggtgeo.benchmark.processes import Limits
-from vggtgeo.benchmark.provenance import source_digest
-from vggtgeo.benchmark.scheduling import run_jobs
-from vggtgeo.benchmark.store import Store
-from vggtgeo.benchmark.suite import Suite, load_suite, restrict
-from vggtgeo.benchmark.table import LESS_BASELINE, Row, as_csv, write_parquet
+from vggtgeo.benchmark.processes import Limits, run_jobs
+from vggtgeo.benchmark.provenance import input_hash, source_digest
+from vggtgeo.benchmark.suite import ExternalTable, Suite, load_suite, restrict
+from vggtgeo.benchmark.table import LESS_BASELINE, Row, as_csv, run_name, write_parquet
+from vggtgeo.datasets import open_sequence
+from vggtgeo.datasets.image_files import is_there
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import evaluate_trajectory, followed
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_text
 from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import locked_folder
@@ -61,10 +62,6 @@ class BenchReport:
         """Return the tables: means and standard deviations, differences to the baseline, failures, provenance."""
         return markdown.page(self.suite, self.rows)
 
-    def csv(self) -> str:
-        """Return all runs as CSV."""
-        return as_csv(self.rows)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the name of the suite and all rows as plain values."""
         return {"suite": self.suite.name, "rows": [dict(row) for row in self.rows]}
@@ -72,7 +69,7 @@ class BenchReport:
     def write(self, folder: Path) -> None:
         """Write the files of `OUTPUTS`."""
         write_text(folder / "tables.md", self.markdown())
-        write_text(folder / "runs.csv", self.csv())
+        write_text(folder / "runs.csv", as_csv(self.rows))
         write_page(folder / "report.html", self.suite, self.rows, self.folder)
         with suppress(InputError):
             write_parquet(folder / "runs.parquet", self.rows)
@@ -139,13 +136,10 @@ def bench(
 
     """
     chosen = suite if isinstance(suite, Suite) else load_suite(path_of("suite", suite))
-    chosen = restrict(chosen, _names("sequences", sequences), _names("settings", settings), seeds, first_seed, frames)
-    chosen = replace(
-        chosen,
-        recordings=chosen.recordings if recordings is None else recordings,
-        timeout_minutes=chosen.timeout_minutes if timeout_minutes is None else timeout_minutes,
-        memory_gb=chosen.memory_gb if memory_gb is None else memory_gb,
-    )
+    names, variants = (None if given is None else tuple(given) for given in (sequences, settings))
+    chosen = restrict(chosen, names, variants, seeds, first_seed, frames)
+    overrides: dict[str, Any] = {"recordings": recordings, "timeout_minutes": timeout_minutes, "memory_gb": memory_gb}
+    chosen = replace(chosen, **{name: value for name, value in overrides.items() if value is not None})
     folder = path_of("output", output)
     _check_output(folder)
     if workers < 1:
@@ -208,10 +202,57 @@ def all_rows(
     return [rows[job.name] for job in jobs]
 
 
-def _names(what: str, names: Iterable[str] | None) -> tuple[str, ...] | None:
-    if isinstance(names, str):  # a text would be iterated by characters
-        raise InputError(f"`{what}` must be a list of names, as [{names!r}], got {names!r}")
-    return None if names is None else tuple(names)
+def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> list[Row]:
+    """Return a row for each existing file of `[[external]]`; `files` is relative to the folder `base`.
+
+    The ground truth is that of a run on the same sequence and seed (in `runs`), or of the recording.
+    """
+    return [
+        _external_row(suite, table, job, file, runs)
+        for table in suite.external
+        for file, job in _external_files(table, jobs, base).items()
+        if is_there(file)
+    ]
+
+
+def warn_of_missing(suite: Suite, jobs: Sequence[Job], base: Path) -> None:
+    """Warn of each `[[external]]` without any file, before the runs begin."""
+    for table in suite.external:
+        files = list(_external_files(table, jobs, base))
+        if files and not any(map(is_there, files)):
+            more = f", nor any other of {len(files)} files" if len(files) > 1 else ""
+            text = f"external `{table.name}` has no trajectory: `{files[0]}` does not exist{more}"
+            warnings.warn(text, InputWarning, stacklevel=2)
+
+
+def _external_files(table: ExternalTable, jobs: Sequence[Job], base: Path) -> dict[Path, Job]:
+    """Return the files of the trajectories, each with its first job."""
+    files: dict[Path, Job] = {}
+    for job in jobs:
+        files.setdefault(base / table.file(job.sequence, job.seed), job)
+    return files
+
+
+def _external_row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -> Row:
+    row = {"suite": suite.name, "sequence": job.sequence, "setting": table.name, "seed": job.seed}
+    row |= {"external": str(file), "input_hash": input_hash(file), "metric": table.metric}
+    row |= {"protocol": job.spec["protocol"], "status": "ok", "simulated": bool(job.spec["simulate"])}
+    try:
+        truth = _truth(job, runs)
+        errors, _ = trajectory_errors(load_trajectory(file, truth), truth, table.metric, vertical=job.spec["vertical"])
+    except InputError as error:
+        return {**row, "status": "error", "message": str(error)}
+    return {**row, **errors}
+
+
+def _truth(job: Job, runs: Path) -> Trajectory:
+    kept = sorted(runs.glob(f"{job.sequence}.*.{job.seed}/truth.txt"))
+    if kept:
+        return Trajectory.load_tum(kept[0])
+    truth = open_sequence(job.spec["path"], job.spec["kind"]).ground_truth() if job.spec["path"] else None
+    if truth is None:
+        raise InputError("the sequence has no ground truth")
+    return truth
 
 
 def subtract_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row]:
@@ -235,7 +276,7 @@ def subtract_baseline(suite: Suite, rows: Sequence[Row], runs: Path) -> list[Row
 
 def _pose_differences(row: Row, base: Row, runs: Path) -> dict[str, Any]:
     """Return the differences of the pose errors; empty if a trajectory is missing."""
-    truth = _place(base, runs) / "truth.txt"
+    truth = runs / run_name(base) / "truth.txt"
     files = _estimate(row, runs), _estimate(base, runs)
     if not all(file.is_file() for file in (truth, *files)):
         return {}
@@ -258,9 +299,5 @@ def _errors(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
     }
 
 
-def _place(row: Row, runs: Path) -> Path:
-    return runs / f"{row['sequence']}.{row['setting']}.{row['seed']}"
-
-
 def _estimate(row: Row, runs: Path) -> Path:
-    return Path(row["external"]) if "external" in row else _place(row, runs) / "estimate.txt"
+    return Path(row["external"]) if "external" in row else runs / run_name(row) / "estimate.txt"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -25,38 +25,18 @@ from vggtgeo.simulation.sequence import check_walk
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import Tables, updated
 
-
-def _of(*kinds: type) -> Callable[[Any], bool]:
-    """Check the exact type: in Python, `isinstance(True, int)`."""
-    return lambda value: type(value) in kinds
-
-
-def _list_of(kind: type) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list | tuple) and all(type(one) is kind for one in value)
-
-
-def _table_of(allowed: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, Mapping) and all(map(allowed, value.values()))
-
-
-_ANY_TABLE = _table_of(lambda _: True)
-
-
-_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "int": (_of(int), "a whole number"),
-    "int | None": (_of(int, type(None)), "a whole number"),
-    "float": (_of(int, float), "a number"),
-    "float | None": (_of(int, float, type(None)), "a number"),
-    "str": (_of(str), "a text"),
-    "str | None": (_of(str, type(None)), "a text"),
-    "bool": (_of(bool), "true or false"),
-    "tuple[str, ...]": (_list_of(str), "a list of texts"),
-    "tuple[int, ...]": (_list_of(int), "a list of whole numbers"),
-    "Mapping[str, Any]": (_ANY_TABLE, "a table"),
-    "Mapping[str, str]": (_table_of(_of(str)), "a table of texts"),
-    "Tables": (_table_of(_ANY_TABLE), "a table of groups of settings, as `[setting.set.line]` makes one"),
+_KINDS: dict[str, tuple[tuple[type, ...], tuple[type, ...], str]] = {
+    "int": ((int,), (), "a whole number"),
+    "float": ((int, float), (), "a number"),
+    "str": ((str,), (), "a text"),
+    "bool": ((bool,), (), "true or false"),
+    "tuple[str, ...]": ((list,), (str,), "a list of texts"),
+    "tuple[int, ...]": ((list,), (int,), "a list of whole numbers"),
+    "Mapping[str, Any]": ((dict,), (), "a table"),
+    "Mapping[str, str]": ((dict,), (str,), "a table of texts"),
+    "Tables": ((dict,), (dict,), "a table of groups of settings, as `[setting.set.line]` makes one"),
 }
-"""Check and description of the allowed values, by the field's annotation."""
+"""Types of a value and of its entries (if any), and their description, by the field's annotation without `| None`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,19 +49,19 @@ class CheckedTable:
         known = {entry.name: entry for entry in dataclasses.fields(cls)}
         if not isinstance(values, Mapping):
             raise InputError(f"{where} is {values!r}; it must be a table")
-        for key in values:
+        for key, value in values.items():
             if key not in known:
                 raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
+            kinds, inner, words = _KINDS.get(str(known[key].type).removesuffix(" | None"), ((), (), ""))
+            entries = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+            # The exact type: in Python, `isinstance(True, int)`.
+            if kinds and not (type(value) in kinds and all(type(one) in inner for one in entries if inner)):
+                raise InputError(f"{where}: `{key}` is {value!r}; it must be {words}")
         missing = [f"`{name}`" for name, entry in known.items() if name not in values and _is_required(entry)]
         if missing:
             raise InputError(f"{where}: {', '.join(missing)} missing")
-        for key, value in values.items():
-            allowed, words = _KINDS.get(str(known[key].type), (lambda _: True, ""))
-            if not allowed(value):
-                raise InputError(f"{where}: `{key}` is {value!r}; it must be {words}")
-        plain = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
         try:
-            return cls(**plain)
+            return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
 
@@ -188,7 +168,7 @@ class SequenceTable(CheckedTable):
         _one_of("vertical", self.vertical, tuple(AXES))
         if self.key_points < 1:
             raise InputError(f"`key_points` is {self.key_points}; it must be at least 1")
-        _check_protocol(self.protocol)
+        _one_of("protocol", self.protocol, ("", *PROTOCOLS))
         updated(SlamSettings(), self.set)
 
 
@@ -278,7 +258,7 @@ class Suite(CheckedTable):
     external: tuple[ExternalTable, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_protocol(self.protocol)
+        _one_of("protocol", self.protocol, tuple(PROTOCOLS))
         for name in ("seeds", "timeout_minutes", "memory_gb"):
             if not getattr(self, name) > 0:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
@@ -320,11 +300,11 @@ def load_suite(name: str | Path) -> Suite:
             text = whole_text(path, errors="strict")
         except ValueError as error:
             raise InputError(
-                f"`{path}` cannot be read: {error}; give a TOML file or one of {_shipped_text()}"
+                f"`{path}` cannot be read: {error}; give a TOML file or one of {', '.join(shipped())}"
             ) from None
         return read_suite(text, path.stem, f"`{path}`")
     if str(name) not in shipped():
-        raise InputError(f"`{name}` is neither a TOML file nor a shipped suite: {_shipped_text()}")
+        raise InputError(f"`{name}` is neither a TOML file nor a shipped suite: {', '.join(shipped())}")
     text = (files("vggtgeo.benchmark") / "suites" / f"{name}.toml").read_text("utf-8")
     return read_suite(text, str(name), f"suite `{name}`")
 
@@ -333,14 +313,14 @@ def read_suite(text: str, name: str, where: str) -> Suite:
     """Parse a suite from TOML text. where: for error messages."""
     try:
         values = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # also for numbers of too many digits, and deep nesting
+    except ValueError as error:
         raise InputError(f"{where} is not valid TOML: {error}") from None
-    kinds: tuple[tuple[str, type[CheckedTable]], ...] = (
-        ("sequence", SequenceTable),
-        ("setting", SettingTable),
-        ("external", ExternalTable),
-    )
-    for key, kind in kinds:
+    kinds: dict[str, type[CheckedTable]] = {
+        "sequence": SequenceTable,
+        "setting": SettingTable,
+        "external": ExternalTable,
+    }
+    for key, kind in kinds.items():
         entries = values.get(key, [])
         if not isinstance(entries, list):
             raise InputError(f"{where}: `{key}` must be a list of tables, `[[{key}]]`")
@@ -357,31 +337,25 @@ def restrict(
     frames: int | None = None,
 ) -> Suite:
     """Return the named part of a suite; None keeps all. frames: maximum of each sequence."""
-    changes: dict[str, Any] = {}
-    if sequences is not None:
-        changes["sequence"] = _chosen("sequences", sequences, suite.sequence)
-    if settings is not None:
-        changes["setting"] = _chosen("settings", settings, suite.setting)
-        if suite.base not in settings:
-            changes["baseline"] = ""
-    there = {table.name for table in changes.get("sequence", suite.sequence)}
+    chosen = suite.sequence if sequences is None else _chosen("sequences", sequences, suite.sequence)
+    there = {table.name for table in chosen}
     kept = tuple(
         dataclasses.replace(
             table,
             sequences=tuple(name for name in table.sequences if name in there),
             seeds=table.seeds if seeds is None else seeds,
         )
-        for table in changes.get("setting", suite.setting)
+        for table in (suite.setting if settings is None else _chosen("settings", settings, suite.setting))
         if not table.sequences or there & set(table.sequences)
     )
-    if suite.base not in {table.name for table in kept}:
-        changes["baseline"] = ""
-    changes |= {"setting": kept, "seeds": seeds or suite.seeds}
-    if first_seed is not None:
-        changes["first_seed"] = first_seed
-    if frames is not None:
-        changes["sequence"] = tuple(_cut(table, frames) for table in changes.get("sequence", suite.sequence))
-    return dataclasses.replace(suite, **changes)
+    return dataclasses.replace(
+        suite,
+        sequence=chosen if frames is None else tuple(_cut(table, frames) for table in chosen),
+        setting=kept,
+        seeds=seeds or suite.seeds,
+        first_seed=suite.first_seed if first_seed is None else first_seed,
+        baseline=suite.base if suite.base in {table.name for table in kept} else "",
+    )
 
 
 def _cut(table: SequenceTable, frames: int) -> SequenceTable:
@@ -408,11 +382,6 @@ def _check_name(name: object) -> None:
         raise InputError(f"`name` must consist of letters, digits, `-`, `_` and `+`, got {name!r}")
 
 
-def _check_protocol(name: str) -> None:
-    if name and name not in PROTOCOLS:
-        raise InputError(f"`protocol` is {name!r}; it must be one of {', '.join(PROTOCOLS)}")
-
-
 def _check_different(what: str, names: list[str]) -> None:
     folders = [name.lower() for name in names]  # names of folders, which are case-insensitive on some systems
     twice = sorted({name for name in names if folders.count(name.lower()) > 1})
@@ -423,7 +392,3 @@ def _check_different(what: str, names: list[str]) -> None:
 def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise InputError(f"`{key}` is {value!r}; it must be one of {', '.join(allowed)}")
-
-
-def _shipped_text() -> str:
-    return ", ".join(shipped())

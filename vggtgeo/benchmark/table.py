@@ -20,7 +20,8 @@ from vggtgeo.io.files import atomic_path
 Row = Mapping[str, Any]
 """A row of the table: plain values by column."""
 
-NUMBERS = (
+FIRST = (
+    *("suite", "sequence", "setting", "seed", "status", "message", "simulated", "protocol", "verdict"),
     *("frames", "tracked", "coverage", "keyframes", "matched", "metric", "path_m"),
     *("ate_se3_m", "ate_sim3_m", "scale", "ate_yaw_m", "ate_unaligned_m", "rte_1s_m", "rre_1s_deg"),
     *("rte_1m_m", "rre_1m_deg", "depth_rmse_m", "depth_abs_rel", "depth_below_1_25"),
@@ -28,9 +29,12 @@ NUMBERS = (
     *("mesh_f_score", "mesh_accuracy_m", "mesh_completeness_m", "nees_place", "nees_rotation", "focal_error"),
     *("frames_per_second", "seconds_wall", "peak_memory_gb"),
 )
-"""Numeric columns."""
-FIRST = ("suite", "sequence", "setting", "seed", "status", "message", "simulated", "protocol", "verdict", *NUMBERS)
 """Columns that come first, in this order; the others follow by name."""
+
+
+def run_name(row: Row) -> str:
+    """Return the name of the run's folder."""
+    return f"{row['sequence']}.{row['setting']}.{row['seed']}"
 
 
 def columns(rows: Iterable[Row]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import shutil
@@ -12,19 +11,17 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.inputs import open_input
 from vggtgeo.benchmark.measure import measure, truth_of_run
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, collected_warnings
 from vggtgeo.io.files import write_json
 from vggtgeo.io.peak_memory import peak_memory_gb
 from vggtgeo.results.reconstruction import reconstruct
-from vggtgeo.results.result import Result
 from vggtgeo.results.run_options import RunOptions
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -34,23 +31,18 @@ from vggtgeo.viewing.target import open_target
 
 JOB, ROW, LOG, RECORDING = "job.json", "row.json", "log.txt", "run.rrd"
 """Files in the folder of a run."""
-NO_SPACE = 75
-"""Exit code of a run that ended because the disk was full: it writes no row, since that is no result of the run."""
 
 
 def run_job(folder: Path, scratch: Path | None = None) -> None:
     """Run the job of `folder`/job.json and write its row, atomically.
 
-    scratch: see `open_input`. An InputError gives a row with the status "error"; other exceptions, and a full disk,
-    propagate.
+    scratch: see `open_input`. An InputError gives a row with the status "error"; other exceptions propagate.
     """
     job = json.loads((folder / JOB).read_text(encoding="utf-8"))
     began = time.perf_counter()
     try:
         row = {"status": "ok", **_run(folder, job["spec"], job["seed"], scratch)}
     except InputError as error:
-        if _is_full(error):
-            raise
         row = {"status": "error", "message": str(error)}
     cost = {"seconds_process": time.perf_counter() - began, "peak_memory_gb": peak_memory_gb()}
     write_json(folder / ROW, {**identity(job), **row, **cost, **provenance()})
@@ -60,17 +52,11 @@ def identity(job: Mapping[str, Any]) -> dict[str, Any]:
     """Return the columns of a row that are known from its job."""
     spec = job["spec"]
     return {
-        "suite": job["suite"],
-        "sequence": job["sequence"],
-        "setting": job["setting"],
-        "seed": job["seed"],
-        "fingerprint": job["fingerprint"],
-        "protocol": spec["protocol"],
-        "perception": spec["perception"],
+        **{key: job[key] for key in ("suite", "sequence", "setting", "seed", "fingerprint", "input_hash")},
+        **{key: spec[key] for key in ("protocol", "perception")},
         "simulated": bool(spec["simulate"]),
         "depth_input": not spec["rgb_only"],
         "settings": json.dumps({key: spec[key] for key in _SETTINGS}, sort_keys=True),
-        "input_hash": job["input_hash"],
     }
 
 
@@ -99,7 +85,12 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
         if result.summary["interrupted"]:  # by a signal from outside: a part of the frames is not a result
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGTERM)
-        _save(folder, result, truth_of_run(result, given.truth), spec)
+        if spec["pages"]:
+            result.save(folder)
+        (result.trajectory if spec["poses"] == "all" else result.keyframes).save_tum(folder / "estimate.txt")
+        truth = truth_of_run(result, given.truth)
+        if truth is not None:
+            truth.save_tum(folder / "truth.txt")
     return measure(result, given, spec)
 
 
@@ -120,45 +111,17 @@ def recording(folder: Path, wanted: bool, scratch: Path | None = None) -> Iterat
         shutil.move(path, folder / RECORDING)
 
 
-def _save(folder: Path, result: Result, truth: Trajectory | None, spec: Mapping[str, Any]) -> None:
-    if spec["pages"]:
-        result.save(folder)
-    (result.trajectory if spec["poses"] == "all" else result.keyframes).save_tum(folder / "estimate.txt")
-    if truth is not None:
-        truth.save_tum(folder / "truth.txt")
-
-
-def end_with_parent(parent: int, seconds: float = 1.0) -> None:
+def end_with_parent(parent: int) -> None:
     """End this process when its `parent` has ended, even if that was during the imports."""
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(seconds)
+            time.sleep(1.0)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-def main(arguments: list[str]) -> None:
-    """Run `python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT`; PARENT is a process id."""
-    folder, scratch, parent = arguments
-    end_with_parent(int(parent))
-    try:
-        run_job(Path(folder), Path(scratch))
-    except (OSError, InputError) as error:
-        if not _is_full(error):
-            raise
-        with suppress(OSError):  # the log may be on the full disk
-            sys.stderr.write(f"{error}\n")
-        sys.exit(NO_SPACE)
-
-
-def _is_full(error: BaseException) -> bool:
-    """Return whether a full disk is the cause of an error."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return True
-    return error.__context__ is not None and _is_full(error.__context__)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+if __name__ == "__main__":  # python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT, the latter a process id
+    end_with_parent(int(sys.argv[3]))
+    run_job(Path(sys.argv[1]), Path(sys.argv[2]))

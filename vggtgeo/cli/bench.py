@@ -3,62 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.options import JsonOption, with_option_groups
+from vggtgeo.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from vggtgeo.benchmark.table import Row
 
 
-@dataclass(frozen=True)
-class SelectionOptions:
-    """Which runs of the suite are made."""
-
-    data: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of recordings; may be given several times.", show_default="$VGGTGEO_DATA, data"),
-    ] = None
-    sequences: Annotated[str | None, typer.Option(help="Some sequences of the suite, with commas.")] = None
-    settings: Annotated[str | None, typer.Option(help="Some settings of the suite, with commas.")] = None
-    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the suite's.")] = None
-    first_seed: Annotated[int | None, typer.Option(min=0, help="First seed.")] = None
-    frames: Annotated[int | None, typer.Option(min=1, help="Of each sequence, at most.")] = None
-
-
-@dataclass(frozen=True)
-class LimitOptions:
-    """Processes, their limits, and what each run writes."""
-
-    workers: Annotated[int, typer.Option(min=1, help="Processes; the processors are shared out.")] = 1
-    timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None
-    memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None
-    retry: Annotated[bool, typer.Option("--retry/--no-retry", help="Run again what ended without a result.")] = False
-    recordings: Annotated[
-        bool | None,
-        typer.Option(
-            "--recordings/--no-recordings", help="A file run.rrd of each run, for Rerun.", show_default="the suite's"
-        ),
-    ] = None
-
-
-@dataclass(frozen=True)
-class ClusterOptions:
-    """Where the runs are made."""
-
-    engine: Annotated[
-        Literal["processes", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
-    ] = "processes"
-    address: Annotated[str, typer.Option(help="Of the Ray cluster; local starts one.")] = "auto"
-    cpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 1.0
-    gpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 0.0
-
-
-@with_option_groups
 def bench(
     suite: Annotated[
         str, typer.Argument(metavar="SUITE", help="A TOML file, or a suite that comes along; `list` lists those.")
@@ -67,17 +22,38 @@ def bench(
         Path | None,
         typer.Option("-o", "--output", help="Folder; finished runs in it are kept.", show_default="runs/SUITE"),
     ] = None,
-    *,
-    runs: SelectionOptions,
-    limits: LimitOptions,
-    ray: ClusterOptions,
-    quiet: Annotated[bool, typer.Option("--quiet/--no-quiet", help="Print the tables only.")] = False,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of recordings; may be given several times.", show_default="$VGGTGEO_DATA, data"),
+    ] = None,
+    sequences: Annotated[str | None, typer.Option(help="Some sequences of the suite, with commas.")] = None,
+    settings: Annotated[str | None, typer.Option(help="Some settings of the suite, with commas.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the suite's.")] = None,
+    first_seed: Annotated[int | None, typer.Option(min=0, help="First seed.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Of each sequence, at most.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; the processors are shared out.")] = 1,
+    timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
+    memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
+    retry: Annotated[bool, typer.Option(help="Run again what ended without a result.")] = False,
+    recordings: Annotated[
+        bool | None, typer.Option(help="A file run.rrd of each run, for Rerun.", show_default="the suite's")
+    ] = None,
+    engine: Annotated[
+        Literal["processes", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
+    ] = "processes",
+    address: Annotated[str, typer.Option(help="Of the Ray cluster; local starts one.")] = "auto",
+    cpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 1.0,
+    gpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 0.0,
+    quiet: Annotated[bool, typer.Option(help="Print the tables only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a suite of sequences, settings and seeds, and write its tables and its page.
 
     Exit code 1: no run has a result.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     from vggtgeo.benchmark.cluster import Cluster
     from vggtgeo.benchmark.runner import OUTPUTS
     from vggtgeo.benchmark.runner import bench as run_suite  # brings JAX, which --help does without
@@ -89,57 +65,38 @@ def bench(
         return
     load_suite(Path(suite))  # report errors in it before the progress bar starts
     folder = output or Path("runs") / Path(suite).stem
-    with _Bar(quiet or as_json) as bar:
+    console = Console(stderr=True, quiet=quiet or as_json)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    # Without a terminal the lines of the runs suffice.
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("runs", total=None)
+
+        def advance(done: int, total: int, row: Row) -> None:
+            bar.update(task, completed=done, total=total)
+            console.print(_line(row), markup=False, highlight=False, soft_wrap=True)
+
         report = run_suite(
             suite,
             folder,
-            data=runs.data,
-            sequences=_list(runs.sequences),
-            settings=_list(runs.settings),
-            seeds=runs.seeds,
-            first_seed=runs.first_seed,
-            frames=runs.frames,
-            workers=limits.workers,
-            timeout_minutes=limits.timeout_minutes,
-            memory_gb=limits.memory_gb,
-            retry=limits.retry,
-            recordings=limits.recordings,
-            progress=bar.advance,
-            cluster=Cluster(ray.address, ray.cpus, ray.gpus) if ray.engine == "ray" else None,
+            data=data,
+            sequences=_list(sequences),
+            settings=_list(settings),
+            seeds=seeds,
+            first_seed=first_seed,
+            frames=frames,
+            workers=workers,
+            timeout_minutes=timeout_minutes,
+            memory_gb=memory_gb,
+            retry=retry,
+            recordings=recordings,
+            progress=advance,
+            cluster=Cluster(address, cpus, gpus) if engine == "ray" else None,
         )
     typer.echo(json.dumps(report.to_dict()) if as_json else report.markdown())
     if not (quiet or as_json):
         typer.echo(f"in {folder}: {' '.join(name for name in OUTPUTS if (folder / name).is_file())}", err=True)
     if not any(row["status"] == "ok" for row in report.rows):
         raise typer.Exit(1)
-
-
-class _Bar:
-    """A progress bar of runs, and a line for each."""
-
-    def __init__(self, silent: bool) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._progress = Progress(*columns, console=Console(stderr=True, quiet=silent))
-        self._task = self._progress.add_task("runs", total=None)
-
-    def __enter__(self) -> _Bar:
-        if self._progress.console.is_terminal:  # else the lines of the runs suffice
-            self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if not self._progress.tasks[0].completed:  # an error follows: remove the bar
-            self._progress.live.transient = True
-        if self._progress.live.is_started:
-            self._progress.stop()
-
-    def advance(self, done: int, total: int, row: Row) -> None:
-        """Show a finished run."""
-        self._progress.update(self._task, completed=done, total=total)
-        self._progress.console.print(_line(row), markup=False, highlight=False, soft_wrap=True)
 
 
 def _line(row: Row) -> str:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.options import JsonOption
+from vggtgeo.cli.options import EXIT_INPUT, JsonOption
 
 data = typer.Typer(
     help="Where to get recordings, and what is wrong with one.", no_args_is_help=True, add_completion=False
@@ -21,19 +20,15 @@ data = typer.Typer(
 @data.command("list")
 def list_command(as_json: JsonOption = False) -> None:
     """List what the readers know: where to get it, its size, licence and layout."""
-    from dataclasses import asdict
-
-    from vggtgeo.cli.data import catalogue
-
     entries = catalogue()
     if as_json:
-        typer.echo(json.dumps([asdict(entry) for entry in entries]))
+        typer.echo(json.dumps(entries))
         return
     for entry in entries:
-        typer.echo(f"{entry.name} (--kind {entry.kind.partition(',')[0]})")
-        suite = f"vggtgeo bench {entry.suite}" if entry.suite else ""
-        lines = ("get", entry.url), ("size", entry.size), ("licence", entry.licence), ("layout", entry.layout)
-        for head, text in (*lines, ("note", entry.note), ("suite", suite)):
+        typer.echo(f"{entry['name']} (--kind {entry['kind'].partition(',')[0]})")
+        suite = f"vggtgeo bench {entry['suite']}" if entry["suite"] else ""
+        heads = {"url": "get", "size": "size", "licence": "licence", "layout": "layout", "note": "note"}
+        for head, text in (*((head, entry[key]) for key, head in heads.items()), ("suite", suite)):
             if text:
                 typer.echo(f"  {head:8s}{text}")
 
@@ -45,7 +40,6 @@ def check_command(
     as_json: JsonOption = False,
 ) -> None:
     """Say what is wrong with the recording at PATH, in sentences; exit code 2 where something is."""
-    from vggtgeo.cli.main import EXIT_INPUT
     from vggtgeo.datasets.check import inspect
 
     found = inspect(path if "://" in path or path.startswith("webcam") else Path(path), kind)
@@ -61,21 +55,10 @@ def check_command(
         raise typer.Exit(EXIT_INPUT)
 
 
-@dataclass(frozen=True)
-class Entry:
-    """name; kind, of the reader; suite of `vggtgeo bench`, "" for none; url; size, rough; licence; layout; note."""
-
-    name: str
-    kind: str
-    suite: str
-    url: str
-    size: str
-    licence: str
-    layout: str
-    note: str
-
-
-def catalogue() -> tuple[Entry, ...]:
-    """Return all entries."""
+def catalogue() -> list[dict[str, str]]:
+    """Return all entries: name; kind, of the reader; suite of `vggtgeo bench`, "" for none; url; size, rough; licence;
+    layout; note.
+    """
     text = (files("vggtgeo.datasets") / "catalogue.toml").read_text("utf-8")
-    return tuple(Entry(**entry) for entry in tomllib.loads(text)["entry"])
+    entries: list[dict[str, str]] = tomllib.loads(text)["entry"]
+    return entries

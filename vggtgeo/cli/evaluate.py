@@ -4,70 +4,45 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from vggtgeo.cli.options import EXIT_FAILED, JsonOption, with_option_groups
-from vggtgeo.io.errors import InputError, InputWarning, collected_warnings
+from vggtgeo.cli.options import EXIT_FAILED, JsonOption
+from vggtgeo.io.errors import InputWarning, collected_warnings
 from vggtgeo.io.text_files import whole_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rich.table import Table
-
-    from vggtgeo.evaluation import ErrorStatistics, TrajectoryReport
+    from vggtgeo.evaluation import TrajectoryReport
     from vggtgeo.geometry.trajectory import Trajectory
 
 MAX_TIME_DIFFERENCE = 0.01
-"""Seconds; equal to that of `vggtgeo.evaluation` (tested), repeated so that `--help` does not import it."""
+"""Seconds; that of `vggtgeo.evaluation.association`, repeated so that `--help` does not import it."""
 
 _WRITTEN_BY_RUNS = ("trajectory.txt", "keyframes.txt")
 _BENCHMARKS = ("groundtruth.txt", "groundtruth.csv", "data.csv", ".gt.freiburg")
 """Endings of ground-truth files in metres: TUM RGB-D (and datasets of its layout), EuRoC, ICL-NUIM."""
 
 
-@dataclass(frozen=True)
-class PairOptions:
-    """Pairs of poses whose relative pose error is computed."""
-
-    delta: Annotated[float, typer.Option(min=0, help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0
-    unit: Annotated[
-        Literal["poses", "seconds", "metres"], typer.Option(help="Of --delta: poses, seconds, or metres of true path.")
-    ] = "poses"
-    all_pairs: Annotated[
-        bool, typer.Option("--all-pairs/--no-all-pairs", help="Overlapping pairs for RPE, not consecutive ones.")
-    ] = False
-
-
-@dataclass(frozen=True)
-class ComparisonOptions:
-    """Frame and clock of the ground truth."""
-
-    vertical: Annotated[
-        Literal["x", "y", "z"], typer.Option(help="Axis of GT that points up or down, for the yaw-only alignment.")
-    ] = "z"
-    time_offset: Annotated[float, typer.Option(help="Seconds to add to the times of GT (its clock is late).")] = 0.0
-    estimate_offset: Annotated[
-        bool,
-        typer.Option(
-            "--estimate-offset/--no-estimate-offset",
-            help="Report the errors without the estimated offsets of clock and body, too.",
-        ),
-    ] = False
-
-
-@with_option_groups
 def evaluate(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM, KITTI), or a run's folder.")],
     truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM, KITTI, EuRoC), or a dataset folder.")],
     max_dt: Annotated[float, typer.Option(min=0, help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
-    *,
-    pairs: PairOptions,
-    comparison: ComparisonOptions,
+    delta: Annotated[float, typer.Option(min=0, help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0,
+    unit: Annotated[
+        Literal["poses", "seconds", "metres"], typer.Option(help="Of --delta: poses, seconds, or metres of true path.")
+    ] = "poses",
+    all_pairs: Annotated[bool, typer.Option(help="Overlapping pairs for RPE, not consecutive ones.")] = False,
+    vertical: Annotated[
+        Literal["x", "y", "z"], typer.Option(help="Axis of GT that points up or down, for the yaw-only alignment.")
+    ] = "z",
+    time_offset: Annotated[float, typer.Option(help="Seconds to add to the times of GT (its clock is late).")] = 0.0,
+    estimate_offset: Annotated[
+        bool, typer.Option(help="Report the errors without the estimated offsets of clock and body, too.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT, and constant offsets between the two.
@@ -76,57 +51,42 @@ def evaluate(
     """
     from vggtgeo.evaluation import comparability, estimate_offsets, evaluate_trajectory, shifted
     from vggtgeo.evaluation.alignment import AXES
+    from vggtgeo.results.reading import load_estimate
 
     with collected_warnings() as warned:
         true, metres = load_truth(truth)
         found, scale = load_estimate(estimate, true), load_scale(estimate)
-        if comparison.time_offset:
-            true = shifted(found, true, comparison.time_offset)
-        rules = max_dt, pairs.delta, pairs.all_pairs, pairs.unit, AXES[comparison.vertical]
+        if time_offset:
+            true = shifted(found, true, time_offset)
+        rules = max_dt, delta, all_pairs, unit, AXES[vertical]
         report = evaluate_trajectory(found, true, *rules)
         metric = metres is not False and scale is not None and scale.startswith("metric")
         verdict = comparability(found, true, max_dt, metric)
         offsets = estimate_offsets(found, true, max_dt)
-        left = verdict
-        if offsets is not None and offsets.significant:
-            true = offsets.removed(found, true)
-            left = comparability(found, true, max_dt, metric)
         for text in (*verdict.reasons, *verdict.doubts):
             warnings.warn(text, InputWarning, stacklevel=2)
         if offsets is not None and offsets.explains:
             warnings.warn(offsets.message, InputWarning, stacklevel=2)
-        rest = None
-        if comparison.estimate_offset and offsets is not None:
-            rest = evaluate_trajectory(found, true, *rules)
+        rest, left = None, verdict
+        if estimate_offset and offsets is not None:
+            true = offsets.removed(found, true)
+            rest, left = evaluate_trajectory(found, true, *rules), comparability(found, true, max_dt, metric)
     if as_json:
         known: dict[str, Any] = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
-        known["offsets"] = None if offsets is None else offsets.as_dict()
+        known["offsets"] = None if offsets is None else offsets.to_dict()
         if rest is not None:
-            known["without_offsets"] = {**rest.as_dict(), "comparable": not left.reasons}
+            known["without_offsets"] = {**rest.to_dict(), "comparable": not left.reasons}
         notices = {"warnings": [*report.warnings, *map(str, warned)], "comparable": not verdict.reasons}
-        typer.echo(json.dumps({**report.as_dict(), **known, **notices}, indent=2))
+        typer.echo(json.dumps({**report.to_dict(), **known, **notices}, indent=2))
     else:
         print_report(report, scale, metres)
         typer.echo(f"constant offsets: {'too few poses match to estimate them' if offsets is None else offsets}")
         if rest is not None and offsets is not None:
             typer.echo(f"without {', '.join(offsets.significant) or 'any, as none is significant'}:")
             print_report(rest, scale, metres)
-    if (left if rest is not None else verdict).reasons:
+    if left.reasons:
         typer.echo("NOT COMPARABLE: these errors are meaningless, see the warnings", err=True)
         raise typer.Exit(EXIT_FAILED)
-
-
-def load_estimate(path: Path, truth: Trajectory | None = None) -> Trajectory:
-    """Load the trajectory of a file, or `trajectory.txt` of a folder. truth: gives the times of poses without times."""
-    from vggtgeo.datasets.pose_files import load_trajectory
-    from vggtgeo.results.summary import warn_if_truncated
-    from vggtgeo.results.unfinished import unfinished_message
-
-    unfinished = unfinished_message(path)
-    if unfinished:
-        warnings.warn(unfinished, InputWarning, stacklevel=2)
-    file = path / "trajectory.txt" if path.is_dir() else path
-    return warn_if_truncated(file, load_trajectory(file, truth))
 
 
 def load_scale(path: Path) -> str | None:
@@ -140,7 +100,7 @@ def load_scale(path: Path) -> str | None:
         return None
     try:
         return str(json.loads(whole_text(file, errors="strict"))["scale"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         text = f"`{file}` is invalid ({describe_error(error)}): scale and verdict of the run are unknown"
         warnings.warn(InputWarning(text), stacklevel=2)
         return None
@@ -148,26 +108,18 @@ def load_scale(path: Path) -> str | None:
 
 def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
     """Load the trajectory of a file, or the ground truth of a dataset folder; return it, and whether its lengths are
-    metres (None if unknown).
+    metres: by a run's summary, or by a benchmark's file name; None if unknown.
     """
     from vggtgeo.datasets import open_sequence
     from vggtgeo.datasets.pose_files import load_trajectory
+    from vggtgeo.results.reading import truth_of
 
-    if not path.is_dir():
-        return load_trajectory(path), _in_metres(path)
-    sequence = open_sequence(path)
-    truth = sequence.ground_truth()
-    if truth is None:
-        raise InputError(f"`{path}` has no ground truth; give a trajectory in the TUM format")
-    return truth, getattr(sequence, "truth_in_metres", True)
-
-
-def _in_metres(file: Path) -> bool | None:
-    """Return whether the poses of a file are in metres: by a run's summary, or by a benchmark's file name."""
-    scale = load_scale(file)
-    if scale is not None:
-        return scale.startswith("metric")
-    return True if file.name.endswith(_BENCHMARKS) else None
+    if path.is_dir():
+        sequence = open_sequence(path)
+        return truth_of(sequence), getattr(sequence, "truth_in_metres", True)
+    scale = load_scale(path)
+    known = True if path.name.endswith(_BENCHMARKS) else None
+    return load_trajectory(path), known if scale is None else scale.startswith("metric")
 
 
 def print_report(report: TrajectoryReport, scale: str | None = None, metres: bool | None = True) -> None:
@@ -189,39 +141,32 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
         f"{report.sim3.alignment.scale:.4f}; RPE over {report.relative.interval}",
         soft_wrap=True,
     )
-    # In a narrow terminal wrap numbers instead of truncating them: 4.4413e-17 is not "4.44…".
-    table = Table(*(Column(name, overflow="fold") for name in ("", "RMSE", "mean", "median", "max")))
-    angles = ErrorStatistics.of(np.degrees(report.relative.rotation))
-    free = scale is not None and scale.startswith("free")
     if scale is not None:
         console.print(f"scale of the estimate: {scale}", soft_wrap=True)
     if not metres:
-        console.print(_NO_UNIT[metres], soft_wrap=True)
-    length = _centimetres if metres else "{:.5g}".format
-    if not free:
-        _add_row(table, "ATE, SE(3)", report.se3.statistics, length)
-    _add_row(table, "ATE, Sim(3)", report.sim3.statistics, length)
-    if not free:
-        _add_row(table, "ATE, yaw only", report.yaw.statistics, length)
-        _add_row(table, "ATE, not aligned", report.unaligned.statistics, length)
-        _add_row(table, "RPE translation", report.relative.translation_statistics, length)
-    _add_row(table, "RPE translation, Sim(3)", report.relative_sim3.translation_statistics, length)
-    _add_row(table, "RPE rotation", angles, "{:.3f} deg".format)
+        unit = "not known from its file" if metres is None else "not the metre"
+        console.print(f"lengths are in the unit of GT, which is {unit}", soft_wrap=True)
+    # In a narrow terminal wrap numbers instead of truncating them: 4.4413e-17 is not "4.44…".
+    table = Table(*(Column(name, overflow="fold") for name in ("", "RMSE", "mean", "median", "max")))
+    length: Callable[[float], str] = (lambda value: f"{100 * value:.3f} cm") if metres else "{:.5g}".format
+    rows = {
+        "ATE, SE(3)": report.se3.statistics,
+        "ATE, Sim(3)": report.sim3.statistics,
+        "ATE, yaw only": report.yaw.statistics,
+        "ATE, not aligned": report.unaligned.statistics,
+        "RPE translation": report.relative.translation_statistics,
+        "RPE translation, Sim(3)": report.relative_sim3.translation_statistics,
+        "RPE rotation": ErrorStatistics.of(np.degrees(report.relative.rotation)),
+    }
+    for name, errors in rows.items():
+        if scale is not None and scale.startswith("free") and name in _METRIC_ONLY:
+            continue
+        shown = "{:.3f} deg".format if name == "RPE rotation" else length
+        values = (errors.rmse, errors.mean, errors.median, errors.maximum)
+        table.add_row(name, *(shown(value) if value == value else "-" for value in values))
     console.print(table)
     for warning in report.warnings:
         console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
 
 
-_NO_UNIT = {
-    None: "lengths are in the unit of GT, which is not known from its file",
-    False: "lengths are in the unit of GT, which is not the metre",
-}
-
-
-def _centimetres(metres: float) -> str:
-    return f"{100 * metres:.3f} cm"
-
-
-def _add_row(table: Table, name: str, errors: ErrorStatistics, shown: Callable[[float], str]) -> None:
-    values = (errors.rmse, errors.mean, errors.median, errors.maximum)
-    table.add_row(name, *(shown(value) if value == value else "-" for value in values))
+_METRIC_ONLY = ("ATE, SE(3)", "ATE, yaw only", "ATE, not aligned", "RPE translation")

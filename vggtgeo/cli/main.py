@@ -1,9 +1,11 @@
-"""The program `vggtgeo`: its commands, imported when called, and its error messages."""
+"""The program `vggtgeo`: its commands and its error messages.
+
+The modules of commands import numerical packages inside their functions, so that `--help` is fast.
+"""
 
 from __future__ import annotations
 
 import gc
-import importlib
 import importlib.metadata
 import io
 import logging
@@ -11,39 +13,31 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any, NamedTuple, NoReturn, TextIO
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
 
-from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
+from vggtgeo.cli.bench import bench
+from vggtgeo.cli.data import data
+from vggtgeo.cli.evaluate import evaluate
+from vggtgeo.cli.models import models
+from vggtgeo.cli.options import EXIT_FAILED, EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
+from vggtgeo.cli.run import demo, run
+from vggtgeo.cli.simulate import simulate, warm_up
+from vggtgeo.cli.solve import solve
+from vggtgeo.cli.view import export, view
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one_line
 from vggtgeo.io.interruption import end_on_signals, ignore_signals
 from vggtgeo.io.jax_environment import jax_environment
 
-EXIT_INPUT = 2
-EXIT_INTERNAL = 1
 GC_THRESHOLD = 50_000
 """New objects between two garbage collections: with Python's default of 700 they take some per cent of a run."""
 
 
-class CommandEntry(NamedTuple):
-    """A command before its import: the function `name` (`-` as `_`) of `module` implements it."""
-
-    name: str
-    module: str
-    summary: str
-    """First line of the function's docstring, repeated so that `--help` does not import it."""
-    examples: tuple[str, ...] = ()
-    """Example calls at the end of the command's help, with a comment after `#`."""
-
-
-COMMANDS = (
-    CommandEntry(
-        "run",
-        "vggtgeo.cli.run",
-        "Estimate trajectory and map of the sequence at PATH.",
+COMMANDS: dict[str, tuple[Callable[..., None] | typer.Typer, tuple[str, ...]]] = {
+    "run": (
+        run,
         (
             "vggtgeo run clip.mp4 -o runs/clip  # RGB alone: the scale is free",
             "vggtgeo run tum/desk -o runs/desk  # RGB-D: metric",
@@ -52,31 +46,17 @@ COMMANDS = (
             "vggtgeo run --settings runs/desk/settings.toml -o runs/again  # the same",
         ),
     ),
-    CommandEntry(
-        "demo",
-        "vggtgeo.cli.demo",
-        "Run in a synthetic office with exact truth, rendered on the spot.",
-        ("vggtgeo demo -o runs/demo --frames 60",),
-    ),
-    CommandEntry(
-        "warm-up",
-        "vggtgeo.cli.warm_up",
-        "Compile what runs with default settings need, into the cache; takes some minutes once.",
-        ("vggtgeo warm-up --size 1280x720",),
-    ),
-    CommandEntry(
-        "evaluate",
-        "vggtgeo.cli.evaluate",
-        "Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT, and constant offsets between the two.",
+    "demo": (demo, ("vggtgeo demo -o runs/demo --frames 60",)),
+    "warm-up": (warm_up, ("vggtgeo warm-up --size 1280x720",)),
+    "evaluate": (
+        evaluate,
         (
             "vggtgeo evaluate runs/desk tum/desk  # a run's folder against a dataset's",
             "vggtgeo evaluate mine.txt truth.txt --json  # two files in the TUM format",
         ),
     ),
-    CommandEntry(
-        "view",
-        "vggtgeo.cli.view",
-        "Show the run in DIR: path, map, and depth where it was saved.",
+    "view": (
+        view,
         (
             "vggtgeo view runs/desk  # a window",
             "vggtgeo view runs/desk --page  # the report with its 3D view, in a browser",
@@ -84,46 +64,25 @@ COMMANDS = (
             "vggtgeo view runs/desk --rerun desk.rrd  # a file, where there is no screen",
         ),
     ),
-    CommandEntry(
-        "export",
-        "vggtgeo.cli.export",
-        "Write the run in DIR for another program.",
+    "export": (
+        export,
         (
             "vggtgeo export runs/desk --to colmap  # pictures, cameras, tracks: what Gaussian splatting wants",
             "vggtgeo export runs/desk --to glb -o desk  # the mesh, for any 3D viewer",
         ),
     ),
-    CommandEntry(
-        "solve",
-        "vggtgeo.cli.solve",
-        "Solve the bundle-adjustment problem in PROBLEM.",
-        ("vggtgeo solve problem.npz -o solution.npz --dtype float32",),
-    ),
-    CommandEntry(
-        "simulate",
-        "vggtgeo.cli.simulate",
-        "Render a hand-held walk through SCENE as a TUM RGB-D folder with exact truth.",
-        ("vggtgeo simulate office -o data/office --frames 300 --blur 0.01",),
-    ),
-    CommandEntry(
-        "models",
-        "vggtgeo.cli.models",
-        "List, check, fetch and export the networks of the roles.",
-        ("vggtgeo models list  # what each is for, its licence, and whether its file is there",),
-    ),
-    CommandEntry(
-        "data",
-        "vggtgeo.cli.data",
-        "Where to get recordings, and what is wrong with one.",
+    "solve": (solve, ("vggtgeo solve problem.npz -o solution.npz --dtype float32",)),
+    "simulate": (simulate, ("vggtgeo simulate office -o data/office --frames 300 --blur 0.01",)),
+    "models": (models, ("vggtgeo models list  # what each is for, its licence, and whether its file is there",)),
+    "data": (
+        data,
         (
             "vggtgeo data list  # benchmarks: where to get them, sizes, licences, layouts",
             "vggtgeo data check /disk/tum/rgbd_dataset_freiburg1_desk  # what is wrong with a folder",
         ),
     ),
-    CommandEntry(
-        "bench",
-        "vggtgeo.cli.bench",
-        "Run a suite of sequences, settings and seeds, and write its tables and its page.",
+    "bench": (
+        bench,
         (
             "vggtgeo bench list  # suites that come along",
             "vggtgeo bench quick --data ~/data  # a first look, in minutes",
@@ -131,7 +90,8 @@ COMMANDS = (
             "vggtgeo bench mine.toml --data /disk/tum --data /disk/7scenes",
         ),
     ),
-)
+}
+"""Commands (or groups of commands) by name, each with example calls for the end of its help."""
 START = (
     "vggtgeo demo  # a simulated office, results in runs/demo",
     "vggtgeo run PATH -o runs/mine  # a video or a folder of images",
@@ -146,8 +106,8 @@ EXIT_CODES = (
 )
 
 
-class _LazyGroup(TyperGroup):
-    """Imports only the command that is called; reports any error in one line."""
+class _Program(TyperGroup):
+    """Reports any error in one line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if any(not word or (word.startswith("-") and word.endswith("=")) for word in args):
@@ -160,11 +120,6 @@ class _LazyGroup(TyperGroup):
             if not _is_usage_error(error):
                 raise
             _leave(error)
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        name, stand_in, rest = super().resolve_command(ctx, args)
-        entry = next((entry for entry in COMMANDS if entry.name == name), None)
-        return name, load_command(entry) if entry else stand_in, rest
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -183,21 +138,9 @@ def _at_home(word: str) -> str:
     return option + equals + os.path.expanduser(value)
 
 
-def load_command(entry: CommandEntry) -> Any:
-    """Import a command: a typer command of its annotated function, or a group."""
-    function = getattr(importlib.import_module(entry.module), entry.name.replace("-", "_"))
-    if isinstance(function, typer.Typer):  # a group of commands
-        function.info.name = entry.name
-        function.info.epilog = _examples(entry.examples)
-        return typer.main.get_command(function)
-    single = typer.Typer(add_completion=False)
-    single.command(entry.name, epilog=_examples(entry.examples))(function)
-    return typer.main.get_command(single)
-
-
-def _examples(calls: tuple[str, ...]) -> str | None:
+def _examples(calls: tuple[str, ...]) -> str:
     """Return text for the end of a help page; blank lines keep typer from joining the lines."""
-    return "\n\n".join(("Examples:", *(f"  {call}" for call in calls))) if calls else None
+    return "\n\n".join(("Examples:", *(f"  {call}" for call in calls)))
 
 
 def _is_call_for_help(error: BaseException) -> bool:
@@ -231,28 +174,21 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
-    """Return whether memory or threads ran out: NumPy, Python, JAX and the loader raise different errors."""
+    """Return whether memory or threads ran out: NumPy, Python and JAX raise different errors."""
     words = ("RESOURCE_EXHAUSTED", "can't start new thread")
-    if isinstance(error, ImportError):
-        return "failed to map segment" in str(error) or "cannot allocate memory" in str(error).lower()
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(words))
 
 
 def _usage_message(error: Any, command: str) -> str:
-    """Return the error in the command line, and a hint to the help of the command."""
+    """Return the error in the command line or in a settings file, and a hint to the help of the command."""
     message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
-    command = error.ctx.command_path if error.ctx is not None else command
-    file = _settings_file(error)
-    return f"{f'`{file}`: ' if file else ''}{message} (see `{command} --help`)"
-
-
-def _settings_file(error: Any) -> Path | None:
-    """Return the settings file of the invalid value; None if it was given as a flag."""
-    if error.ctx is None or getattr(error, "param", None) is None:
-        return None
-    source = error.ctx.get_parameter_source(error.param.name)
-    in_file = source is not None and source.name == "DEFAULT_MAP"
-    return error.ctx.params["settings"].file if in_file else None
+    context, parameter = error.ctx, getattr(error, "param", None)
+    if context is not None:
+        command = context.command_path
+        source = None if parameter is None else context.get_parameter_source(parameter.name)
+        if source is not None and source.name == "DEFAULT_MAP":
+            message = f"`{context.params['settings'].file}`: {message}"
+    return f"{message} (see `{command} --help`)"
 
 
 def _version(asked: bool) -> bool:
@@ -263,14 +199,10 @@ def _version(asked: bool) -> bool:
     return asked
 
 
-def _stand_in() -> None:
-    """Stand in for the command, which `_LazyGroup` puts in its place; never called."""
-
-
 def make_app() -> typer.Typer:
-    """Return the program with all its commands, without importing them."""
+    """Return the program with all its commands."""
     app = typer.Typer(
-        cls=_LazyGroup,
+        cls=_Program,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         epilog=f"{_examples(START)}\n\nExit codes: {EXIT_CODES}",
@@ -286,8 +218,11 @@ def make_app() -> typer.Typer:
     ) -> None:
         """Dense indoor SLAM with a functional, differentiable bundle adjustment."""
 
-    for entry in COMMANDS:
-        app.command(entry.name, help=entry.summary)(_stand_in)
+    for name, (command, examples) in COMMANDS.items():
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name, epilog=_examples(examples))
+        else:
+            app.command(name, epilog=_examples(examples))(command)
     return app
 
 
@@ -317,18 +252,11 @@ def main() -> None:
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
     """Return a function that shows `UserWarning`s in one line, and others as before."""
 
-    def show(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
         if issubclass(category, UserWarning):
             kind = "note" if issubclass(category, NoteWarning | GuessedCameraWarning) else "warning"
-            print(f"{kind}: {one_line(str(message))}", file=file or sys.stderr)
+            print(f"{kind}: {one_line(str(message))}", file=sys.stderr)
         else:
-            show_others(message, category, filename, lineno, file, line)
+            show_others(message, category, *rest, **more)
 
     return show

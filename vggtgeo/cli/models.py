@@ -5,17 +5,14 @@ Heavy modules are imported inside functions, so that `--help` is fast.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import signal
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from vggtgeo.cli.options import JsonOption, QuietOption, with_option_groups
+from vggtgeo.cli.options import JsonOption, QuietOption
 from vggtgeo.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,11 +37,6 @@ FLAGS = {
 models = typer.Typer(
     no_args_is_help=True, add_completion=False, help="List, check, fetch and export the networks of the roles."
 )
-
-
-@models.callback()
-def group() -> None:
-    """List, check, fetch and export the networks of the roles."""
 
 
 @models.command("list")
@@ -141,45 +133,7 @@ def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
     }
 
 
-@contextlib.contextmanager
-def _exit_on_sigterm() -> Iterator[None]:
-    """Turn SIGTERM into an exception, as Ctrl-C, so that temporary folders are removed."""
-
-    def leave(number: int, _: object) -> None:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """Weights and shape of the exported network."""
-
-    checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None
-    random_weights: Annotated[
-        bool,
-        typer.Option("--random-weights/--no-random-weights", help="For tests and timing: random weights."),
-    ] = False
-    height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None
-    width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None
-    views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None
-    tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None
-    variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None
-    allow_extra_weights: Annotated[
-        bool,
-        typer.Option(
-            "--allow-extra-weights/--no-allow-extra-weights",
-            help="Leave out weights of the checkpoint that the network has no place for.",
-        ),
-    ] = False
-    half: Annotated[bool, typer.Option("--half/--no-half", help="Attention and perceptrons in float16.")] = False
-
-
-@with_option_groups
+@models.command()
 def export(
     name: Annotated[
         str,
@@ -189,7 +143,17 @@ def export(
     ],
     source: Annotated[Path, typer.Option(help="Checkout of the network's published code.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.onnx", help="File to write.")],
-    options: ExportOptions,
+    checkpoint: Annotated[Path | None, typer.Option(help="Published weights (.pt, .pth).")] = None,
+    random_weights: Annotated[bool, typer.Option(help="For tests and timing: random weights.")] = False,
+    height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None,
+    width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None,
+    views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None,
+    tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None,
+    variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None,
+    allow_extra_weights: Annotated[
+        bool, typer.Option(help="Leave out weights of the checkpoint that the network has no place for.")
+    ] = False,
+    half: Annotated[bool, typer.Option(help="Attention and perceptrons in float16.")] = False,
     tolerance: Annotated[
         float | None,
         typer.Option(help="Largest difference from PyTorch; 0.001, or 0.03 with --half.", show_default=False),
@@ -205,19 +169,18 @@ def export(
         if not quiet:
             typer.echo(f"{stage} ...", err=True)
 
-    if (options.checkpoint is None) != options.random_weights:
-        found = "neither was given" if options.checkpoint is None else "both were given"
+    if (checkpoint is None) != random_weights:
+        found = "neither was given" if checkpoint is None else "both were given"
         raise InputError(f"one of `--checkpoint` FILE and `--random-weights` is needed; {found}")
     try:
         recipe = recipe_of(name)
         request = recipe.request(
-            *(source, options.checkpoint, options.height, options.width, options.views, options.tokens),
-            *(options.variant, options.half, options.allow_extra_weights),
+            *(source, checkpoint, height, width, views, tokens),
+            *(variant, half, allow_extra_weights),
         )
         from vggtgeo.models.exporters.export import export as write
 
-        with _exit_on_sigterm():
-            report = write(recipe, request, output, show, tolerance)
+        report = write(recipe, request, output, show, tolerance)
     except ExportError as error:
         raise InputError(str(error)) from error
     if as_json:
@@ -229,6 +192,3 @@ def export(
         f"{report.megabytes:.0f} MB, differs from PyTorch by {report.parity:.1e}, "
         f"{report.latency:.2f} s a call on the CPU"
     )
-
-
-models.command("export")(export)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -88,7 +88,9 @@ class ProgressBar(Callback):
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         rate = (len(slam.frames) - self._resumed) / (time.perf_counter() - self._began)
-        state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {_state(slam)}"
+        tracking = "waiting for parallax" if slam.tracker.waiting else "tracking"
+        doing = "lost" if slam.tracker.lost else tracking
+        state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {doing}"
         self._progress.state = state
         self._progress.update(self._task, advance=1)
         if self._lines and self._is_due(len(slam.frames)):
@@ -127,8 +129,7 @@ class ProgressBar(Callback):
 
     def _end_stage(self) -> None:
         if self._stage is not None:
-            task = next(task for task in self._progress.tasks if task.id == self._stage)
-            total = 1 if task.total is None else task.total
+            total = next(task.total for task in self._progress.tasks if task.id == self._stage) or 1
             self._progress.update(self._stage, total=total, completed=total)
             self._stage = None
 
@@ -142,12 +143,6 @@ class ProgressBar(Callback):
 
     def _print(self, line: str) -> None:
         self._progress.console.print(one_line(line), markup=False, highlight=False)
-
-
-def _state(slam: Slam) -> str:
-    if slam.tracker.lost:
-        return "lost"
-    return "waiting for parallax" if slam.tracker.waiting else "tracking"
 
 
 def duration(seconds: float) -> str:
@@ -165,12 +160,8 @@ def verdict_line(verdict: Verdict) -> str:
     if verdict.level == "good" or not good:
         return f"verdict: {verdict.level}"
     longest = sorted(good, key=lambda part: part.start - part.end)[:MAX_NAMED]
-    named = [f"{part.start} to {part.end}" for part in sorted(longest, key=lambda part: part.start)]
-    return f"verdict: {verdict.level} (good: frames {_listed(named)}{', among others' * (len(good) > MAX_NAMED)})"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    named = ", ".join(f"{part.start} to {part.end}" for part in sorted(longest, key=lambda part: part.start))
+    return f"verdict: {verdict.level} (good: frames {named}{', among others' * (len(good) > MAX_NAMED)})"
 
 
 def errors_line(truth: Mapping[str, Any], free: bool) -> str:

@@ -1,27 +1,34 @@
-"""`vggtgeo run`: estimate trajectory and map of a sequence.
+"""`vggtgeo run`: estimate trajectory and map of a sequence; `vggtgeo demo`: of a synthetic office.
 
 Heavy modules are imported inside functions, so that `vggtgeo run --help` is fast.
 """
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from vggtgeo.cli.options import with_option_groups
-from vggtgeo.cli.run_options import (
+import typer
+
+from vggtgeo.cli.models import FLAGS
+from vggtgeo.cli.options import (
+    AssignmentsOption,
     InputOptions,
+    JsonOption,
     OutputOption,
     PerceptionOptions,
-    Provider,
+    QuietOption,
+    RerunOption,
     ResultOptions,
+    ResumeOption,
     SequenceArgument,
     SwitchOptions,
+    with_option_groups,
 )
-from vggtgeo.cli.settings_file import SettingsOption
+from vggtgeo.cli.settings_file import SettingsOption, pipeline_settings
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning, collected_warnings
 
 if TYPE_CHECKING:
@@ -33,6 +40,8 @@ if TYPE_CHECKING:
 
 REFINE = {None: "auto", True: "always", False: "never"}
 """The setting behind `--refine-intrinsics`, `--fix-intrinsics`, or neither."""
+DEMO_SIZE = (480, 360)
+"""Pixels: large enough for a dense map, small enough to render during the run."""
 MAX_FPS = 1e5
 """Above that of any camera; at higher rates the times of frames would be equal after rounding."""
 
@@ -51,52 +60,93 @@ def run(
     """Estimate trajectory and map of the sequence at PATH."""
     from vggtgeo.datasets.frame import check_selection
     from vggtgeo.datasets.opening import check_there
-    from vggtgeo.results.output_checks import check_can_be_written, check_output
+    from vggtgeo.results.output_checks import check_can_be_written, check_output, is_in_results
     from vggtgeo.viewing.target import check_target
 
-    rerun = check_target(options.rerun) if options.rerun else None
-    check_flags(perception.memory_limit_gb, given.fps)
+    rerun = options.rerun and check_target(options.rerun)
+    if perception.memory_limit_gb is not None and not 0 < perception.memory_limit_gb < float("inf"):
+        raise InputError(f"`--memory-limit-gb` must be positive, got {perception.memory_limit_gb:g}")
+    if given.fps is not None and not 0 < given.fps <= MAX_FPS:
+        raise InputError(f"`--fps` must be positive, at most {MAX_FPS:g} frames per second, got {given.fps:g}")
     if given.kind != "camera":
         check_there(path)
     if options.save_map is not None:
         check_map_place(options.save_map, output)
-    if rerun:
-        check_recording_file(rerun, output)
+    if rerun and rerun not in ("spawn", "serve") and is_in_results(output, Path(rerun)):
+        raise InputError(
+            f"`--rerun` is `{rerun}`, in a folder that the run replaces; give another, for example `{output}/run.rrd`"
+        )
     check_output(output, Path(path))
     check_can_be_written(output)
     with collected_warnings() as warned:
         sequence = open_input(path, given)
     if len(sequence):  # zero for a live camera
         check_selection(sequence.name, len(sequence), given.start, given.end, given.stride)
-    check_provider(perception.provider)
+    if perception.provider == "cuda":
+        from vggtgeo.io.network_files import as_input_errors
+        from vggtgeo.models.onnx.providers import choose_provider
+
+        with as_input_errors():
+            choose_provider("cuda")  # is there a GPU?
     if options.save_depth and options.dense == "none":
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
         warnings.warn(text, InputWarning, stacklevel=2)
-    from vggtgeo.cli.pipeline_settings import pipeline_settings
-    from vggtgeo.cli.run_sequence import Output, run_and_write
+    from vggtgeo.cli.run_sequence import run_and_write
     from vggtgeo.results.run_options import RunOptions
-    from vggtgeo.slam.known_map import load_map
     from vggtgeo.slam.run import default_roles
 
     slam_settings = pipeline_settings(settings, options.assignments or (), tables_of_switches(switches, options))
     perceived = make_perception(perception, default_roles(sequence.has_depth), switches)
-    flags = settings.values() if settings else {}
     run_and_write(
         sequence,
         perceived,
         slam_settings,
-        Output(
-            *(output, flags, rerun, "every" if options.save_every_depth else options.save_depth),
-            quiet=options.quiet,
-            as_json=options.as_json,
-            source=Path(path),
-            save_map=options.save_map,
-            resume=options.resume,
-            checkpoint_every=options.checkpoint_every,
-        ),
+        output,
+        options,
         RunOptions(given.start, given.end, given.stride, options.seed, options.dense, warned=warned),
-        known_map=None if options.map_file is None else load_map(options.map_file),
-        pose_prior=options.pose_prior,
+        flags=settings.values() if settings else {},
+        source=Path(path),
+    )
+
+
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")] = Path("runs/demo"),
+    settings: SettingsOption = None,
+    scene: Annotated[str, typer.Option(help="Scene: office, hall, corridor, staircase, building, room.")] = "office",
+    frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of frames.")] = 45,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the scene and its noise.")] = 0,
+    assignments: AssignmentsOption = None,
+    rerun: RerunOption = None,
+    resume: ResumeOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run in a synthetic office with exact truth, rendered on the spot."""
+    from vggtgeo.cli.run_sequence import run_and_write
+    from vggtgeo.results.run_options import RunOptions
+    from vggtgeo.simulation import simulate
+    from vggtgeo.slam.settings.slam_settings import Roles
+    from vggtgeo.slam.window.sliding_window import warm_up
+    from vggtgeo.viewing.target import check_target
+
+    if rerun:
+        check_target(rerun)
+    slam_settings = pipeline_settings(settings, assignments or (), {})
+    # While the light of the scene is computed, what every window needs is compiled.
+    with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
+        compiled = pool.submit(warm_up, slam_settings)
+        sequence = simulate(scene, frames, seed, rate=10.0, size=DEMO_SIZE)
+        compiled.result()
+    if not (quiet or as_json):
+        typer.echo(f"simulated scene `{scene}`: all results below are from a simulation")
+    run_and_write(
+        sequence,
+        Roles(),
+        slam_settings,
+        output,
+        ResultOptions(rerun=rerun, resume=resume, quiet=quiet, as_json=as_json),
+        RunOptions(title=f"simulated {scene}", facts={"simulated": True}),
+        flags=settings.values() if settings else {},
     )
 
 
@@ -119,31 +169,17 @@ def tables_of_switches(switches: SwitchOptions, options: ResultOptions) -> dict[
 
 def check_map_place(file: Path, output: Path) -> None:
     """Raise InputError if the map's file is not writable, or would be replaced by results of the run."""
+    from vggtgeo.io.files import whole_path
+    from vggtgeo.results.output_checks import check_can_be_written, is_result
+
     if file.is_dir():
         raise InputError(f"`--save-map` is `{file}`, which is a folder; give the name of a file")
-    from vggtgeo.io.files import whole_path
-    from vggtgeo.results.output_checks import is_result
-
     if is_result(output, file) or whole_path(file) == whole_path(output):
         raise InputError(
             f"`--save-map` is `{file}`, the name of a result of the run itself, or its folder; give another, such as "
             f"`{output}.map`"
         )
-    there = next(folder for folder in file.absolute().parents if folder.exists())
-    try:
-        tempfile.TemporaryFile(dir=there).close()
-    except OSError as error:
-        raise InputError(f"`--save-map` is `{file}`, which cannot be written: {error.strerror or error}") from None
-
-
-def check_recording_file(target: str, output: Path) -> None:
-    """Raise InputError if the run's results would replace the recording."""
-    from vggtgeo.results.output_checks import is_in_results
-
-    if target not in ("spawn", "serve") and is_in_results(output, Path(target)):
-        raise InputError(
-            f"`--rerun` is `{target}`, in a folder that the run replaces; give another, for example `{output}/run.rrd`"
-        )
+    check_can_be_written(file.parent, "--save-map")
 
 
 def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool) -> dict[str, str]:
@@ -159,25 +195,6 @@ def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool
         if named[role] is not None:
             raise InputError(f"`{named[role]}` was chosen, but `{flag}` disables its role; give one of the two")
     return {role: name for role, name in named.items() if name is not None} | dict.fromkeys(disabled, "classical")
-
-
-def check_flags(memory_limit_gb: float | None, fps: float | None = None) -> None:
-    """Raise InputError for numbers out of range."""
-    if memory_limit_gb is not None and not 0 < memory_limit_gb < float("inf"):
-        raise InputError(f"`--memory-limit-gb` must be positive, got {memory_limit_gb:g}")
-    if fps is not None and not 0 < fps <= MAX_FPS:
-        raise InputError(f"`--fps` must be positive, at most {MAX_FPS:g} frames per second, got {fps:g}")
-
-
-def check_provider(provider: Provider) -> None:
-    """Raise InputError if a GPU is requested and not available."""
-    if provider != "cuda":
-        return
-    from vggtgeo.io.network_files import as_input_errors
-    from vggtgeo.models.onnx.providers import choose_provider
-
-    with as_input_errors():
-        choose_provider(provider)
 
 
 def open_input(path: str | Path, given: InputOptions) -> Sequence:
@@ -203,10 +220,7 @@ def make_perception(chosen: PerceptionOptions, classical: Roles, switches: Switc
     """
     from vggtgeo.slam.settings.presets import perception
 
-    named = {
-        **{"points": chosen.points, "lines": chosen.lines, "line_matches": chosen.line_matcher},
-        **{"confidence": chosen.confidence, "geometry": chosen.init, "depth": chosen.depth},
-    }
+    named = {role: getattr(chosen, flag.lstrip("-").replace("-", "_")) for role, flag in FLAGS.items()}
     mixed = mixture(named, switches.no_lines, switches.no_confidence)
     perceived = perception(
         *(chosen.preset, classical, chosen.models, chosen.cache, chosen.provider, chosen.memory_limit_gb, mixed)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import typer
 from rich.console import Console
 
-from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
+from vggtgeo.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, ResultOptions
 from vggtgeo.cli.progress import ProgressBar, print_result
 from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence, without_depth
@@ -24,12 +24,13 @@ from vggtgeo.io.network_files import as_input_errors
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
+from vggtgeo.results.output_checks import EXPORTS, SUMMARY
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
 from vggtgeo.results.run_options import RunOptions
-from vggtgeo.results.unfinished import EVERY, EXPORTS, SUMMARY
 from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.known_map import load_map
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
@@ -41,85 +42,67 @@ EARLY_SECONDS = 60.0
 """Between two writings of the poses so far, which take less than a second for 20,000 frames."""
 
 
-@dataclass(frozen=True)
-class Output:
-    """Output options of a run on the command line.
-
-    flags: effective settings by flag, for `settings.toml`. rerun: target of a recording, see
-    `vggtgeo/viewing/target.py`. source: the input, into which nothing is written. save_map: file for the map. resume:
-    whether to resume a killed run in the folder; None: there must not be one. checkpoint_every: s, see `Checkpoints`.
-    """
-
-    folder: Path
-    flags: Mapping[str, Any]
-    rerun: str | None = None
-    save_depth: DepthChoice = False
-    quiet: bool = False
-    as_json: bool = False
-    source: Path | None = None
-    save_map: Path | None = None
-    resume: bool | None = False
-    checkpoint_every: float = EVERY
-
-
 def run_and_write(
     sequence: Sequence,
     roles: Roles | Perception,
     settings: SlamSettings,
-    output: Output,
+    output: Path,
+    wanted: ResultOptions,
     options: RunOptions,
     *,
-    known_map: Slam | None = None,
-    pose_prior: str | None = None,
+    flags: Mapping[str, Any],
+    source: Path | None = None,
 ) -> None:
     """Run a sequence with a progress bar, write its folder, print the report, and exit with the code of the verdict.
 
-    options: those of `vggtgeo.reconstruct`, its title and checkpoints completed here.
+    options: those of `vggtgeo.reconstruct`, its title and checkpoints completed here. flags: effective settings by
+    flag, for `settings.toml`. source: the input, into which nothing is written.
 
     Raises:
         typer.Exit: the verdict is "failed", or the run was interrupted.
         InputError: an argument is invalid.
 
     """
-    silent = output.quiet or output.as_json
+    silent = wanted.quiet or wanted.as_json
     title = (options.title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
     console = Console(stderr=False, quiet=silent)
     # From the first frame to the last file, a signal ends the run early; the results so far are written completely.
-    with interruption() as stop, open_run_folder(output.folder, output.source, RESERVE, output.resume) as folder:
-        replaces = (output.folder / SUMMARY).is_file()
+    with interruption() as stop, open_run_folder(output, source, RESERVE, wanted.resume) as folder:
+        replaces = (output / SUMMARY).is_file()
         if replaces:
-            _print_note(console, f"the result in `{output.folder}` is replaced at the end of this run")
-        checkpoints = Checkpoints(folder.checkpoint, bool(output.resume), output.checkpoint_every)
-        if output.resume and not folder.checkpoint.is_file():
-            typer.echo(f"nothing to resume in `{output.folder}`: the run begins at its first frame", err=True)
-        viewed, url = _rerun_callbacks(output, folder, title, settings.window.size)
+            _print_note(console, f"the result in `{output}` is replaced at the end of this run")
+        checkpoints = Checkpoints(folder.checkpoint, bool(wanted.resume), wanted.checkpoint_every)
+        if wanted.resume and not folder.checkpoint.is_file():
+            typer.echo(f"nothing to resume in `{output}`: the run begins at its first frame", err=True)
+        viewed, url = _rerun_callbacks(wanted.rerun, folder, title, settings.window.size)
         with as_input_errors(), ProgressBar(console) as bar:
             result = reconstruct(
                 sequence,
                 roles,
                 settings,
-                known_map=known_map,
-                pose_prior=pose_prior,
-                callbacks=(bar, _EarlyFiles(folder.stage, {**output.flags, **changed(settings)}), *viewed),
+                known_map=None if wanted.map_file is None else load_map(wanted.map_file),
+                pose_prior=wanted.pose_prior,
+                callbacks=(bar, _EarlyFiles(folder.stage, {**flags, **changed(settings)}), *viewed),
                 options=replace(options, title=title, checkpoints=checkpoints),
             )
             bar.on_stage("writing")
-            frames = _reopen(sequence, roles, settings) if output.save_depth == "every" else None
-            summary = result.save_into(folder, depth=output.save_depth, frames=frames, settings=output.flags)
-            unsaved = _save_map(result, output.save_map)  # last: an error must not prevent the other results
+            frames = _reopen(sequence, roles, settings) if wanted.save_every_depth else None
+            depth: DepthChoice = "every" if wanted.save_every_depth else wanted.save_depth
+            summary = result.save_into(folder, depth=depth, frames=frames, settings=flags)
+            unsaved = _save_map(result, wanted.save_map)  # last: an error must not prevent the other results
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: all results are complete and written", err=True)
-    if replaces and (output.folder / EXPORTS).is_dir():
+    if replaces and (output / EXPORTS).is_dir():
         # Exports are not written by a run, and may hold a user's files: they stay.
-        _print_note(console, f"`{output.folder / EXPORTS}` is of an earlier result; `vggtgeo export` renews it")
-    print_result(console, result, summary, output.folder)
-    if output.as_json:
-        typer.echo(json.dumps(json.loads((output.folder / "summary.json").read_text())))
+        _print_note(console, f"`{output / EXPORTS}` is of an earlier result; `vggtgeo export` renews it")
+    print_result(console, result, summary, output)
+    if wanted.as_json:
+        typer.echo(json.dumps(summary))
     if any(callback.cut_short for callback in viewed):
-        unsaved = unsaved or f"the recording `{output.rerun}` is incomplete (see the warning above)"
+        unsaved = unsaved or f"the recording `{wanted.rerun}` is incomplete (see the warning above)"
     if unsaved:
-        raise InputError(f"{unsaved}; all other results are in `{output.folder}`")
-    if output.rerun == "serve":
+        raise InputError(f"{unsaved}; all other results are in `{output}`")
+    if wanted.rerun == "serve":
         serve_until_interrupted(url, silent)
     if result.summary["interrupted"]:
         raise typer.Exit(EXIT_INTERRUPTED)
@@ -133,14 +116,11 @@ def _print_note(console: Console, text: str) -> None:
 
 def _save_map(result: Result, file: Path | None) -> str:
     """Save the map if asked for; return an error message, empty on success."""
-    if file is None:
-        return ""
     try:
-        result.save_map(file)
-    except OSError as error:
-        return f"the map `{file}` could not be saved: {error.strerror or error}"
-    except InputError as error:
-        return f"the map `{file}` could not be saved: {error}"
+        if file is not None:
+            result.save_map(file)
+    except (OSError, InputError) as error:
+        return f"the map `{file}` could not be saved: {getattr(error, 'strerror', None) or error}"
     return ""
 
 
@@ -172,16 +152,15 @@ class _EarlyFiles(Callback):
 
 
 def _rerun_callbacks(
-    output: Output, folder: RunFolder, name: str, window: int
+    target: str | None, folder: RunFolder, name: str, window: int
 ) -> tuple[tuple[RerunCallback, ...], str | None]:
     """Return the callback that logs the run, if any, and the URL of a served recording.
 
     A recording in the run's own folder is written to its stage.
     """
-    if output.rerun is None:
+    if target is None:
         return (), None
-    target = output.rerun
-    if target not in ("spawn", "serve") and whole_path(Path(target).parent) == whole_path(output.folder):
+    if target not in ("spawn", "serve") and whole_path(Path(target).parent) == whole_path(folder.folder):
         target = str(folder.stage / Path(target).name)
     opened = open_target(target, name, folder.stage / STAND_IN)
     if opened.url is not None:

@@ -7,23 +7,25 @@ argument (`path = "..."`). A table has settings of the pipeline (`[keyframes]`, 
 
 from __future__ import annotations
 
-import codecs
 import difflib
 import os
 import tomllib
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vggtgeo.io.errors import InputError
+from vggtgeo.io.text_files import whole_text
+
+if TYPE_CHECKING:
+    from vggtgeo.slam.settings.slam_settings import SlamSettings
+    from vggtgeo.slam.settings.table import Tables
 
 _NOT_SETTINGS = ("settings", "help", "assignments", "resume", "checkpoint_every")
-_MAX_TEXT = 60
-_MAX_BYTES = 1_000_000
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("true or false", (bool,)),
     int: ("a whole number", (int,)),
@@ -56,12 +58,16 @@ def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
     """Use the file's values as defaults of the command's other parameters."""
     if path is None or context.resilient_parsing:
         return SettingsInUse(context)
-    given = _read(path)
+    try:
+        given = tomllib.loads(whole_text(path, errors="strict"))
+    except InputError as error:
+        raise InputError(f"`--settings`: {error}; give a TOML file") from None
+    except ValueError as error:
+        raise InputError(f"`{path}` is not valid TOML: {error}; a line is `key = value`, text in quotes") from None
     has_pipeline = any(parameter.name == "assignments" for parameter in context.command.params)
     tables = {key: value for key, value in given.items() if has_pipeline and isinstance(value, dict)}
     flags = {key: value for key, value in given.items() if key not in tables}
-    positive = _positive(path, flags, context)
-    context.default_map = _validated(path, positive, _keys(context), _types(context))
+    context.default_map = _validated(path, flags, context)
     return SettingsInUse(context, tables, path)
 
 
@@ -80,58 +86,24 @@ SettingsOption = Annotated[
 a value of the wrong type."""
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as file:
-            content = file.read(_MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(
-            f"`--settings` is `{path}`, which cannot be read ({error.strerror}); give a TOML file"
-        ) from None
-    if len(content) > _MAX_BYTES:  # an endless device, or another kind of file
-        raise InputError(f"`--settings` is `{path}`, which has more than {_MAX_BYTES} bytes; give a TOML file")
-    try:
-        # UTF-16 with its mark, as PowerShell writes it.
-        wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        return tomllib.loads(content.decode("utf-16" if wide else "utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
-        raise InputError(f"`{path}` is not valid TOML: {error}; a line is `key = value`, text in quotes") from None
-
-
-def _validated(
-    path: Path,
-    given: dict[str, Any],
-    names: dict[str, str],
-    types: dict[str, Any],
-) -> dict[str, Any]:
-    """Return the values by parameter name."""
+def _validated(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
+    """Return the values by parameter name; a negated switch is rewritten: `no-global = true` is `global = false`."""
+    keys, negated = _keys(context), _keys(context, negated=True)
+    names, hints = {**negated, **keys}, typing.get_type_hints(context.command.callback)
+    found: dict[str, Any] = {}
     for key, value in given.items():
         if key not in names:
-            near = difflib.get_close_matches(key, names, 1, 0.0)[0]
+            near = difflib.get_close_matches(key, keys, 1, 0.0)[0]
             raise InputError(f"`{path}`: `{key}` is not a setting of this command; the nearest is `{near}`")
-        wanted, accepted = _KINDS.get(types[names[key]], ("text in quotes", (str,)))
+        if names[key] in found:
+            raise InputError(f"`{path}`: `{key}` and its opposite are the same setting; give one of them")
+        kinds = (hints[names[key]], *typing.get_args(hints[names[key]]))  # the second without `| None`
+        wanted, accepted = next((_KINDS[kind] for kind in kinds if kind in _KINDS), ("text in quotes", (str,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
-            raise InputError(f"`{path}`: `{key}` is {_short(value)}; it must be {wanted}")
-    return {names[key]: os.path.expanduser(value) if isinstance(value, str) else value for key, value in given.items()}
-
-
-def _short(value: Any) -> str:
-    """Return a value as text, truncated if long."""
-    text = repr(value)
-    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]} ..."
-
-
-def _positive(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
-    """Rewrite negated switches: `no-global = true` becomes `global = false`."""
-    values = dict(given)
-    for key, name in _keys(context, negated=True).items():
-        if key in values:
-            positive = next(k for k, n in _keys(context).items() if n == name)
-            if positive in values:
-                raise InputError(f"`{path}`: `{positive}` and `{key}` are the same setting; give one of them")
-            value = values.pop(key)
-            values[positive] = not value if isinstance(value, bool) else value
-    return values
+            raise InputError(f"`{path}`: `{key}` is {value!r:.60}; it must be {wanted}")
+        plain = os.path.expanduser(value) if isinstance(value, str) else value
+        found[names[key]] = plain if key in keys else not plain
+    return found
 
 
 def _keys(context: Any, negated: bool = False) -> dict[str, str]:
@@ -145,7 +117,37 @@ def _keys(context: Any, negated: bool = False) -> dict[str, str]:
     return keys
 
 
-def _types(context: Any) -> dict[str, Any]:
-    """Return the annotated type of each parameter, without `| None`."""
-    hints = typing.get_type_hints(context.command.callback)
-    return {name: next((t for t in typing.get_args(hint) if t in _KINDS), hint) for name, hint in hints.items()}
+def pipeline_settings(
+    in_use: SettingsInUse | None, assignments: Iterable[str], switches: Mapping[str, Tables]
+) -> SlamSettings:
+    """Return the defaults, overridden by switches of the file, its tables, switches of the command line, and `--set`.
+
+    switches: settings of each switch of a command, by the name of its parameter.
+
+    Raises:
+        InputError: an unknown setting, or an invalid value.
+
+    """
+    from vggtgeo.slam.settings.slam_settings import SlamSettings
+    from vggtgeo.slam.settings.table import parsed, updated
+
+    given = {name for name in switches if in_use is not None and in_use.on_command_line(name)}
+    layers = [
+        *(tables for name, tables in switches.items() if name not in given),
+        in_use.tables if in_use is not None else {},
+        *(tables for name, tables in switches.items() if name in given),
+        *map(parsed, assignments),
+    ]
+    together: dict[str, dict[str, Any]] = {}
+    for tables in layers:
+        for group, values in tables.items():
+            together[group] = {**together.get(group, {}), **values}
+    try:
+        return updated(SlamSettings(), together)
+    except InputError:
+        if in_use is not None and in_use.tables:
+            try:  # is the error in the file itself?
+                updated(SlamSettings(), in_use.tables)
+            except InputError as error:
+                raise InputError(f"`{in_use.file}`: {error}") from None
+        raise

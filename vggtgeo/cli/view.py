@@ -1,4 +1,4 @@
-"""`vggtgeo view`: a finished run in the Rerun viewer, or its page in a browser."""
+"""`vggtgeo view` and `vggtgeo export`: a finished run in a viewer, in a browser, or as files for other programs."""
 
 from __future__ import annotations
 
@@ -8,26 +8,23 @@ import time
 import warnings
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from vggtgeo.cli.options import JsonOption, QuietOption
-from vggtgeo.results.unfinished import check_can_be_shown
+from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.results.output_checks import EXPORTS, check_can_be_shown, check_is_run
 
 
 def view(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that a run wrote.")],
     rerun: Annotated[str, typer.Option(metavar="TARGET", help="spawn, serve, or a file ending with .rrd.")] = "spawn",
-    page: Annotated[bool, typer.Option("--page/--no-page", help="Open the report and its 3D view.")] = False,
+    page: Annotated[bool, typer.Option(help="Open the report and its 3D view.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show the run in DIR: path, map, and depth where it was saved."""
-    from vggtgeo.io.errors import InputError, InputWarning
-
-    if not folder.is_dir():
-        check_can_be_shown(folder)
     if page:
         _open_page(folder, as_json)
         return
@@ -61,8 +58,6 @@ def view(
 
 def _open_page(folder: Path, as_json: bool) -> None:
     """Open `report.html` in the browser; print its path, too, for machines without one."""
-    from vggtgeo.io.errors import InputError
-
     report = (folder / "report.html").resolve()
     if not report.is_file():
         raise InputError(f"`{report}` does not exist; `vggtgeo run` and `Result.save` write it for a run in memory")
@@ -77,3 +72,32 @@ def serve_until_interrupted(url: str | None, quiet: bool = False) -> None:
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             time.sleep(3600.0)
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that a run wrote.")],
+    to: Annotated[
+        Literal["colmap", "nerfstudio", "ply", "glb", "las", "tum", "kitti"], typer.Option(help="The format.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for the files; by default DIR/export/FORMAT.")
+    ] = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the run in DIR for another program."""
+    check_is_run(folder)
+    from vggtgeo.export import export as write
+
+    target = output or folder / EXPORTS / to
+    written = write(folder, to, target)
+    if as_json:
+        typer.echo(json.dumps({"folder": str(target), "format": to, **written}))
+    elif not quiet:
+        typer.echo(f"{target}: {', '.join(_in_words(*item) for item in written.items())}")
+
+
+def _in_words(name: str, value: float) -> str:
+    """Return text as `3 images`, `0.42 px mean reprojection error over points`."""
+    unit = " px" if name.endswith("_px") else ""
+    return f"{value:.6g}{unit} {name.removesuffix('_px').replace('_', ' ')}"

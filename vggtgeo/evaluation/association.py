@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, check_real, real_array
+from vggtgeo.io.given import check_real
 
 MAX_TIME_DIFFERENCE = 0.01
 """Largest time difference of a match, seconds; evo's default."""
@@ -18,10 +18,6 @@ def nearest_in_time(
 
     Returns the matched rows of `times`, and the row of `others` for each. A row of `others` may be used several times.
     """
-    times, others = real_array("times", times, (None,)), real_array("others", others, (None,))
-    check_real("max_dt", max_dt)
-    if (np.diff(others) < 0).any():
-        raise InputError("`others` must increase; sort them")
     if len(others) == 0 or len(times) == 0:
         return np.zeros(0, int), np.zeros(0, int)
     after = np.clip(np.searchsorted(others, times, side="right"), 0, len(others) - 1)
@@ -40,7 +36,6 @@ def associate(
     Each pose of the shorter trajectory is matched with the nearest of the longer one. Both results have the times of
     the shorter trajectory. InputError if `max_dt` is negative or nothing matches.
     """
-    check_trajectories(estimate, truth)
     check_real("max_dt", max_dt)
     if not max_dt >= 0:
         raise InputError(f"`max_dt` must be at least 0 seconds, got {max_dt}")
@@ -53,12 +48,6 @@ def associate(
     if len(times) == 0:
         raise InputError(f"no pose of the two trajectories matches within {max_dt:g} s: {spans(estimate, truth)}")
     return Trajectory(times, estimate.poses[estimate_rows]), Trajectory(times, truth.poses[truth_rows])
-
-
-def check_trajectories(estimate: Trajectory, truth: Trajectory) -> None:
-    """Raise InputError unless both are trajectories."""
-    for name, given in (("estimate", estimate), ("truth", truth)):
-        check_kind(name, given, Trajectory, "a `Trajectory`, for example of `Trajectory.load_tum`")
 
 
 def spans(estimate: Trajectory, truth: Trajectory) -> str:

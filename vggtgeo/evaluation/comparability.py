@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.evaluation.absolute import absolute_error
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
-from vggtgeo.evaluation.relative import relative_error, rotation_angle
+from vggtgeo.evaluation.pose_errors import absolute_error, relative_error, rotation_angle
 from vggtgeo.evaluation.report import ABSURD_SCALE, FEW_MATCHES
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory

@@ -12,11 +12,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, check_trajectories, nearest_in_time
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, nearest_in_time
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_positive, real_array, real_numbers
 
 LEVEL = 0.95
 
@@ -43,20 +42,11 @@ class Consistency:
 def consistency(errors: Float[np.ndarray, "n k"], covariances: Float[np.ndarray, "n k k"]) -> Consistency:
     """Return the NEES of `errors` with their `covariances`, in the same coordinates and units.
 
-    InputError for wrong shapes, no error, NaN, or a covariance that is not positive definite.
+    InputError if there is no error. Covariances must be positive definite.
     """
-    errors, covariances = real_numbers("errors", errors), real_numbers("covariances", covariances)
-    if errors.ndim != 2 or not errors.size or covariances.shape != (*errors.shape, errors.shape[1]):
-        raise InputError(
-            f"`errors` has shape {errors.shape}, `covariances` {covariances.shape}; expected [n, k] and [n, k, k]"
-        )
-    if not (np.isfinite(errors).all() and np.isfinite(covariances).all()):
-        raise InputError("`errors` and `covariances` must be finite; leave rows with NaN or infinity out")
-    try:
-        factors = np.linalg.cholesky(covariances)
-    except np.linalg.LinAlgError:
-        raise InputError("`covariances` must be positive definite") from None
-    white = np.linalg.solve(factors, errors[..., None])[..., 0]
+    if not errors.size:
+        raise InputError("`errors` is empty; at least one error is needed")
+    white = np.linalg.solve(np.linalg.cholesky(covariances), errors[..., None])[..., 0]
     count, degrees = errors.shape
     low, high = chi2.ppf([0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], count * degrees) / count
     return Consistency((white**2).sum(axis=1), degrees, float(low), float(high))
@@ -68,7 +58,6 @@ def pose_consistency(
     place_sigma: Float[np.ndarray, " n"],
     rotation_sigma: Float[np.ndarray, " n"],
     scale: float = 1.0,
-    max_dt: float = MAX_TIME_DIFFERENCE,
 ) -> tuple[Consistency, Consistency]:
     """Return the NEES of positions and of rotations, for standard deviations relative to the first pose.
 
@@ -76,16 +65,7 @@ def pose_consistency(
     scale: factor on the estimate's lengths. Poses with a standard deviation of zero or NaN are left out; InputError if
     none is left.
     """
-    check_trajectories(estimate, truth)
-    place_sigma = real_array("place_sigma", place_sigma, (None,))
-    rotation_sigma = real_array("rotation_sigma", rotation_sigma, (None,))
-    check_positive("scale", scale, "factor")
-    if not len(estimate) == len(place_sigma) == len(rotation_sigma):
-        raise InputError(
-            f"`place_sigma` and `rotation_sigma` must have {len(estimate)} entries, one per pose of `estimate`, got "
-            f"{len(place_sigma)} and {len(rotation_sigma)}"
-        )
-    rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)
+    rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, MAX_TIME_DIFFERENCE)
     found, true = (
         rigid.invert(poses[:1]) @ poses if len(poses) else poses
         for poses in (estimate.poses[rows], truth.poses[others])

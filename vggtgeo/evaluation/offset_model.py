@@ -6,7 +6,7 @@ B of the ground truth's point in the camera frame (lever arm and rotation),
 
     T(t_i - d) = A E_i B,    residuals  p_T - p_AEB  and  log(R_T R_AEB^T),  in the ground truth's world.
 
-Both residuals have the noise model `drift_noise`, estimated alternately with the unknowns (D. Cochrane, G. H. Orcutt,
+Both residuals have the noise model `DriftNoise`, estimated alternately with the unknowns (D. Cochrane, G. H. Orcutt,
 JASA 44, 1949): errors of neighbouring poses are correlated, so that n poses are not n observations. Rotation and lever
 arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995. In numpy, not by `vggtgeo.solve`: whitening is
 O(n) per column, and the second Jacobian Z is not that of any residual.
@@ -17,18 +17,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicSpline
+from scipy.linalg import cholesky_banded, solve_banded
+from scipy.spatial.transform import Rotation, RotationSpline
 from scipy.stats import norm
 
 from vggtgeo.evaluation.alignment import umeyama
-from vggtgeo.evaluation.drift_noise import DriftNoise
-from vggtgeo.evaluation.interpolation import ContinuousTrajectory
 from vggtgeo.geometry.gauss_newton import gauss_newton
 from vggtgeo.geometry.rigid import cross
 from vggtgeo.geometry.trajectory import Trajectory
 
-Noises = tuple[DriftNoise, DriftNoise]
-
+_CORRELATIONS = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.999)
+_SHARES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 UNKNOWNS = 14
 """3 of A's translation, 3 of its rotation, its scale, the time offset, 3 of B's position, 3 of its rotation."""
 TIME, LEVER, TURN = slice(7, 8), slice(8, 11), slice(11, 14)
@@ -47,6 +47,99 @@ _WEAK_PRIOR, _MIN_GAIN = 10.0, 4.0
 counts as determined."""
 _MAX_POSES, _MAX_SEARCH_POSES = 400, 100
 """Of a fit, and in the search: correlated errors make more poses slower and hardly more accurate."""
+
+
+@dataclass(frozen=True)
+class DriftNoise:
+    """White noise plus a first-order autoregressive drift, and its whitening.
+
+    The error of pose i is `d_i + v_i` with the stationary drift `d_i = c d_(i-1) + w_i` and `var v = share var w`. The
+    bidiagonal D with the first row `sqrt(1 - c^2)` whitens the drift; `cov(D x) = var w (I + share D D^T)` is
+    tridiagonal, and its Cholesky factor whitens the rest: O(n) for any c and share. Both are estimated by restricted
+    maximum likelihood (H. D. Patterson, R. Thompson, Biometrika 58(3), 1971), since a fit of k parameters removes a
+    part of the drift from the residuals.
+
+    Fields: sigma, standard deviation of w, in the unit of the errors; correlation, c in [0, 1); share, `var v / var w`.
+    White noise has `correlation` and `share` zero.
+    """
+
+    sigma: float
+    correlation: float = 0.0
+    share: float = 0.0
+
+    def whitened(self, rows: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        """Return `rows` of errors or their derivatives, whitened: unit variance, no correlation."""
+        return self._factored(rows)[0]
+
+    def _factored(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return whitened rows, and the log determinant of the covariance for `sigma` 1."""
+        c, first = self.correlation, np.sqrt(1.0 - self.correlation**2)
+        white = np.concatenate([first * rows[:1], rows[1:] - c * rows[:-1]])
+        band = np.zeros((2, len(rows)))
+        band[0] = 1.0 + self.share * (1.0 + c * c)
+        band[0, 0] = 1.0 + self.share * first**2
+        band[1, :-1] = -self.share * c
+        band[1, :1] *= first
+        lower = cholesky_banded(band, lower=True)
+        determinant = 2.0 * float(np.log(lower[0]).sum()) - 2.0 * float(np.log(first))
+        return solve_banded((1, 0), lower, white) / self.sigma, determinant
+
+    @classmethod
+    def of(
+        cls, errors: Float[np.ndarray, "n 3"], jacobian: Float[np.ndarray, "n 3 k"], min_sigma: float
+    ) -> "DriftNoise":
+        """Return the most likely noise for the residuals of a fit with this `jacobian`; `min_sigma`: rounding error."""
+        count, unknowns = len(errors), jacobian.shape[2]
+        kinds = [cls(1.0), *(cls(1.0, c, share) for c in _CORRELATIONS for share in _SHARES)]
+        rows = np.concatenate([errors, jacobian.reshape(count, -1)], axis=1)
+        degrees = max(3 * count - unknowns, 1)
+        best = np.inf, kinds[0]
+        for kind in kinds:
+            white, determinant = kind._factored(rows)
+            variance = max(float((white[:, :3] ** 2).sum()) / degrees, min_sigma**2)
+            matrix = white[:, 3:].reshape(3 * count, unknowns)
+            # The restricted likelihood's term for the fitted parameters.
+            information = np.linalg.slogdet(matrix.T @ matrix + 1e-12 * np.eye(unknowns))[1]
+            cost = degrees * np.log(variance) + 3.0 * determinant + information
+            best = min(best, (cost, cls(np.sqrt(variance), kind.correlation, kind.share)), key=lambda one: one[0])
+        return best[1]
+
+
+Noises = tuple[DriftNoise, DriftNoise]
+
+
+class ContinuousTrajectory:
+    """Poses and velocities of a trajectory (two or more poses) at any time between its first and last pose.
+
+    Cubic splines of positions and rotations (scipy's `RotationSpline`), with continuous velocity.
+    """
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.times = trajectory.timestamps
+        self._begin = self.times[0]  # relative times keep microseconds, which times since 1970 lose in the spline
+        since = self.times - self._begin
+        self._positions = CubicSpline(since, trajectory.positions)
+        self._rotations = RotationSpline(since, Rotation.from_matrix(trajectory.rotations))
+
+    def covers(self, times: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Return which times lie between two poses at most two median intervals apart: a spline is wrong in gaps."""
+        after = np.searchsorted(self.times, times).clip(1, len(self.times) - 1)
+        gap = self.times[after] - self.times[after - 1]
+        inside = (times >= self.times[0]) & (times <= self.times[-1])
+        return inside & (gap <= 2.0 * np.median(np.diff(self.times)))
+
+    def poses(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
+        """Return the poses, body -> world."""
+        found = np.tile(np.eye(4), (len(times), 1, 1))
+        found[:, :3, :3] = self._rotations(times - self._begin).as_matrix()
+        found[:, :3, 3] = self._positions(times - self._begin)
+        return found
+
+    def velocities(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
+        """Return linear and angular velocity of the body in the world frame, m/s and rad/s."""
+        since = times - self._begin
+        turning = self._rotations(since).apply(self._rotations(since, 1))
+        return np.concatenate([self._positions(since, 1), turning], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +238,7 @@ class OffsetModel:
             for time in {0.0, *times}
             for start in self._starts(time, free)
         ]
-        unknowns = min(starts, key=lambda one: self._log_sigma(self._residuals(one)))
+        unknowns = min(starts, key=lambda one: sum(np.log(part.sigma) for part in self._white(self._residuals(one))))
         noise = self._noise(unknowns, free)
         for _ in range(_ROUNDS):
             unknowns, before = self._solved(unknowns, free, noise), noise
@@ -182,9 +275,6 @@ class OffsetModel:
         position = ((moved - true[:, :3, 3]) ** 2).sum(axis=1).mean()
         rotation = _turn_of_steps(found[:, :3, :3], true[:, :3, :3])[1]
         return float(np.log(position + self._min_sigma[0] ** 2) + np.log(rotation + self._min_sigma[1] ** 2))
-
-    def _log_sigma(self, residuals: np.ndarray) -> float:
-        return sum(np.log(one.sigma) for one in self._white(residuals))
 
     def _starts(self, time: float, free: np.ndarray) -> Iterator[Unknowns]:
         """Return initial values from positions alone, and from rotations: the latter are better for a straight path or

@@ -14,15 +14,23 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
-from vggtgeo.evaluation.absolute import absolute_error
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, check_trajectories
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
 from vggtgeo.evaluation.comparability import MAX_LEFT, comparability
-from vggtgeo.evaluation.interpolation import ContinuousTrajectory
-from vggtgeo.evaluation.offset_model import LEVEL, LEVER, MAX_OFFSET, TIME, TURN, UNKNOWNS, Fit, OffsetModel
+from vggtgeo.evaluation.offset_model import (
+    LEVEL,
+    LEVER,
+    MAX_OFFSET,
+    TIME,
+    TURN,
+    UNKNOWNS,
+    ContinuousTrajectory,
+    Fit,
+    OffsetModel,
+)
+from vggtgeo.evaluation.pose_errors import absolute_error
 from vggtgeo.evaluation.report import FEW_MATCHES
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.given import check_real
 
 _PARTS = {"time offset": TIME, "lever arm": LEVER, "rotation": TURN}
 
@@ -60,13 +68,15 @@ class Offsets:
 
     def removed(self, estimate: Trajectory, truth: Trajectory) -> Trajectory:
         """Return the ground truth without the significant offsets: of the camera itself, by the estimate's clock."""
-        has = {name: name in self.significant for name in _PARTS}
-        lever = self.lever if has["lever arm"] else np.zeros(3)
-        turn = self.turn if has["rotation"] else np.eye(3)
-        moved = shifted(estimate, truth, self.time) if has["time offset"] else truth
-        return Trajectory(moved.timestamps, moved.poses @ rigid.invert(_pose(turn, lever)))
+        body = np.eye(4)
+        if "lever arm" in self.significant:
+            body[:3, 3] = self.lever
+        if "rotation" in self.significant:
+            body[:3, :3] = self.turn
+        moved = shifted(estimate, truth, self.time) if "time offset" in self.significant else truth
+        return Trajectory(moved.timestamps, moved.poses @ rigid.invert(body))
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON, seconds, metres, degrees; None if the motion does not determine a number."""
         known = lambda values, sds: [float(v) if np.isfinite(sd) else None for v, sd in zip(values, sds, strict=True)]
         parts = {"time_offset_s": ([self.time], [self.time_sd]), "lever_arm_m": (self.lever, self.lever_sd)}
@@ -124,7 +134,6 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
         0.05
 
     """
-    check_trajectories(estimate, truth)
     plain = absolute_error(*associate(estimate, truth, max_dt), "sim3").statistics.rmse
     first, last = estimate.timestamps[[0, -1]]
     near = truth.select((truth.timestamps >= first - 2 * MAX_OFFSET) & (truth.timestamps <= last + 2 * MAX_OFFSET))
@@ -139,7 +148,8 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
     kept, names = _reduced(model, model.fit(free, start), tried)
     alone = model.fit(free & (np.arange(UNKNOWNS) < TIME.start))
     shown = {name: kept if name in names else model.refit(kept, _with(kept.free, name)) for name in _PARTS}
-    sds = {name: _deviations(fit)[_PARTS[name]] for name, fit in shown.items()}
+    deviations = lambda fit: np.where(fit.determined, np.sqrt(np.maximum(np.diag(fit.covariance), 0.0)), np.inf)
+    sds = {name: deviations(fit)[_PARTS[name]] for name, fit in shown.items()}
     found = Offsets(
         time=shown["time offset"].unknowns.time,
         time_sd=float(sds["time offset"][0]),
@@ -163,8 +173,6 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
 
 def shifted(estimate: Trajectory, truth: Trajectory, seconds: float) -> Trajectory:
     """Return the ground truth with `seconds` added to its times, and poses interpolated at the estimate's times."""
-    check_trajectories(estimate, truth)
-    check_real("seconds", seconds)
     times = truth.timestamps + seconds
     moved = Trajectory(times, truth.poses)
     if len(truth) < 2:
@@ -205,16 +213,6 @@ def _chance(fit: Fit, part: slice) -> float:
     # A pseudoinverse: exact paths without turns determine an offset in fewer directions than it has numbers.
     statistic = value[known] @ np.linalg.pinv(covariance, hermitian=True) @ value[known] / known.sum()
     return float(fisher.sf(statistic, known.sum(), fit.degrees))
-
-
-def _deviations(fit: Fit) -> np.ndarray:
-    return np.where(fit.determined, np.sqrt(np.maximum(np.diag(fit.covariance), 0.0)), np.inf)
-
-
-def _pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose
 
 
 def _numbers(values: Iterable[float], sds: Iterable[float], unit: str = "") -> str:

@@ -6,16 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vggtgeo.evaluation.absolute import AbsoluteError, absolute_error
 from vggtgeo.evaluation.alignment import VERTICAL
-from vggtgeo.evaluation.association import (
-    MAX_TIME_DIFFERENCE,
-    associate,
-    check_trajectories,
-    nearest_in_time,
-    spans,
-)
-from vggtgeo.evaluation.relative import RelativeError, Unit, relative_error
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate, nearest_in_time, spans
+from vggtgeo.evaluation.pose_errors import AbsoluteError, RelativeError, Unit, absolute_error, relative_error
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
@@ -74,10 +67,6 @@ class TrajectoryReport:
             found.append(f"no two poses are {self.relative.interval} apart: no RPE, give a smaller `delta`")
         return tuple(found)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return `as_dict()`."""
-        return self.as_dict()
-
     def __str__(self) -> str:
         se3, sim3, pairs = self.se3.statistics.rmse, self.sim3.statistics.rmse, self.relative
         translation, rotation = pairs.translation_statistics.rmse, np.degrees(pairs.rotation_statistics.rmse)
@@ -89,7 +78,7 @@ class TrajectoryReport:
 
     __repr__ = __str__
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON, metres and degrees; None if undefined."""
         pairs = self.relative, self.relative_sim3
         translations = [_plain(asdict(pair.translation_statistics)) for pair in pairs]
@@ -158,35 +147,32 @@ def evaluate_trajectory(
     )
 
 
-def coverage(estimate: Trajectory, truth: Trajectory, longest_gap: float = MAX_GAP) -> float:
-    """Return the share of the ground truth's duration between estimated poses at most `longest_gap` seconds apart.
+def coverage(estimate: Trajectory, truth: Trajectory) -> float:
+    """Return the share of the ground truth's duration between estimated poses at most `MAX_GAP` seconds apart.
 
     If the ground truth itself has a larger interval, gaps of two of its intervals are allowed. NaN for a ground truth
     without duration.
     """
-    check_trajectories(estimate, truth)
     if len(truth) < 2:
         return float("nan")
     begin, end = truth.timestamps[[0, -1]]
     times = np.clip(estimate.timestamps, begin, end)
-    return float(np.diff(times)[_close(estimate, truth, longest_gap)].sum() / (end - begin))
+    return float(np.diff(times)[_close(estimate, truth)].sum() / (end - begin))
 
 
-def followed(
-    times: Float[np.ndarray, " n"], estimate: Trajectory, truth: Trajectory, longest_gap: float = MAX_GAP
-) -> Bool[np.ndarray, " n"]:
+def followed(times: Float[np.ndarray, " n"], estimate: Trajectory, truth: Trajectory) -> Bool[np.ndarray, " n"]:
     """Return which of `times` (seconds) are covered as in `coverage`, or are at an estimated pose."""
     poses = estimate.timestamps
     after = np.searchsorted(poses, times)
-    close = np.concatenate([[False], _close(estimate, truth, longest_gap), [False]])
+    close = np.concatenate([[False], _close(estimate, truth), [False]])
     near = np.zeros(len(times), bool)
     near[nearest_in_time(times, poses, MAX_TIME_DIFFERENCE)[0]] = True
     return near | close[after]
 
 
-def _close(estimate: Trajectory, truth: Trajectory, longest_gap: float) -> np.ndarray:
+def _close(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
     usual = float(np.median(np.diff(truth.timestamps))) if len(truth) > 1 else 0.0
-    return np.diff(estimate.timestamps) <= max(longest_gap, 2.0 * usual)
+    return np.diff(estimate.timestamps) <= max(MAX_GAP, 2.0 * usual)
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:

@@ -23,8 +23,8 @@ from vggtgeo.io.given import path_of
 from vggtgeo.io.locks import not_written
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
+from vggtgeo.results.output_checks import EXPORTS, check_is_run
 from vggtgeo.results.summary import load_poses, read_summary
-from vggtgeo.results.unfinished import EXPORTS, check_is_run
 
 MILLI = 1000.0
 

@@ -78,7 +78,6 @@ def result_figure(
         return figure
     width, height = figure.get_size_inches()
     whole = NotebookFigure(figsize=(width, height + _MAP_HEIGHT))
-    FigureCanvasAgg(whole)
     above, below = whole.subplots(2, 1, height_ratios=[height, _MAP_HEIGHT])
     figure.set_dpi(150)
     canvas = figure.canvas

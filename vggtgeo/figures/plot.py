@@ -7,18 +7,34 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.patches import Ellipse
 
 from vggtgeo.bundle.analysis.covariances import Covariances
-from vggtgeo.bundle.analysis.observability_report import Observability
+from vggtgeo.bundle.analysis.observability_report import WEAK, Observability, lost_shares
 from vggtgeo.bundle.pair_checks import check_finite
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.solution import Solution
 from vggtgeo.evaluation import TrajectoryReport, associate
-from vggtgeo.figures.plots import NotebookFigure, energy_figure, errors_figure, trajectory_figure
-from vggtgeo.figures.uncertainty import covariance_figure, observability_figure
+from vggtgeo.figures.plots import (
+    BLUE,
+    INK,
+    ORANGE,
+    NotebookFigure,
+    energy_figure,
+    errors_figure,
+    line_colour,
+    style,
+    trajectory_figure,
+)
+from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_positive, real_array
+
+_FACTORS = (1, 3, 10, 30, 100, 300, 1000)
+"""Standard deviations to choose from for the ellipses."""
+_MAX_SHARE = 0.2
+"""Largest half axis of an ellipse, as share of the figure's extent."""
 
 
 @singledispatch
@@ -100,9 +116,78 @@ def _covariances(
         real_array("truth", truth, (keyframes, 3))
     if sigmas is not None:
         check_positive("sigmas", sigmas, "standard deviations")
-    return covariance_figure(value, state, truth, sigmas)
+    return _covariance_figure(value, state, truth, sigmas)
+
+
+def _covariance_figure(
+    found: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, sigmas: float | None = None
+) -> NotebookFigure:
+    """Draw the camera centres of `state` in the horizontal plane of the first camera, with ellipses of `sigmas`
+    standard deviations (by default chosen to be visible), and the true centres (world frame) if given.
+    """
+    poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
+    blocks = np.asarray(found.poses, np.float64)[:, :3, :3]
+    turn = poses[0, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)  # from each camera to the first
+    known = np.all(np.isfinite(blocks), axis=(1, 2))
+    spread = (turn @ np.where(known[:, None, None], blocks, 0.0) @ turn.transpose(0, 2, 1))[:, [0, 2]][:, :, [0, 2]]
+    flat = lambda centres: (centres @ poses[0, :3, :3].T + poses[0, :3, 3])[:, [0, 2]]
+    centres = flat(rigid.invert(poses)[:, :3, 3])
+    values, vectors = np.linalg.eigh(spread)
+    half_axes = np.sqrt(np.maximum(values, 0.0))
+    extent = max(float(np.ptp(centres, axis=0).max()), 1e-6)
+    seen = [factor for factor in _FACTORS if factor * half_axes.max() <= _MAX_SHARE * extent]
+    factor = sigmas if sigmas is not None else (seen or _FACTORS)[-1 if seen else 0]
+    figure = NotebookFigure(figsize=(6.5, 4.4), layout="constrained")
+    axes = figure.subplots()
+    style(axes)
+    for place, sizes, directions in zip(centres, half_axes, vectors, strict=True):
+        angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
+        size = 2 * factor * sizes[::-1]
+        axes.add_patch(Ellipse(place, *size, angle=angle, color=ORANGE, alpha=0.35, lw=0, zorder=1))
+    axes.plot(*centres.T, "o-", color=BLUE, ms=5, lw=0.8, label="estimate", zorder=3)
+    if truth is not None:
+        axes.plot(*flat(np.asarray(truth)).T, "+", color="black", ms=10, label="truth", zorder=4)
+    for number, place in enumerate(centres):
+        axes.annotate(str(number), place, (0, -14), textcoords="offset points", ha="center", fontsize=8, color=INK)
+    unknown = f"; undetermined: {', '.join(map(str, np.nonzero(~known)[0]))}" if not known.all() else ""
+    axes.set_title(f"Camera centres from above, ellipses of {factor:g} sigma{unknown}", loc="left", fontsize=10)
+    axes.set(xlabel="to the right of the first camera [m]", ylabel="ahead of it [m]")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.12)
+    axes.legend(frameon=False, fontsize=9)
+    return figure
 
 
 @plot.register(Observability)
-def _observability(value: Observability) -> NotebookFigure:
-    return observability_figure(value)
+def _observability(found: Observability) -> NotebookFigure:
+    """Draw, on the left, the balanced eigenvalues with all factors and without each kind; on the right, the share of
+    information about each common motion and the free intrinsics that is lost without each kind.
+    """
+    figure = NotebookFigure(figsize=(10.0, 3.8), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[2, 3])
+    shown = min(int(np.sum(found.free)), found.whole.values.shape[-1])
+    floor = 0.1 * float(np.finfo(found.whole.values.dtype).eps)
+    rows = [("all", found.whole.values[0], INK)]
+    rows += [(f"without {kind}", found.without.values[k], line_colour(k)) for k, kind in enumerate(found.terms)]
+    for name, values, colour in rows:
+        line = {"lw": 2.2, "zorder": 3} if name == "all" else {"lw": 1.2}
+        left.semilogy(np.maximum(np.asarray(values)[:shown], floor), ".-", ms=4, color=colour, label=name, **line)
+    left.axhline(WEAK, color="#c0392b", lw=0.9, ls="--")
+    left.annotate("weak below", (shown - 1, WEAK), (0, 3), textcoords="offset points", ha="right", fontsize=8)
+    left.set(xlabel="direction, the weakest first", ylabel="eigenvalue, balanced")
+    left.set_title("How well it is determined", loc="left", fontsize=10)
+    left.legend(frameon=False, fontsize=8)
+    shares = lost_shares(found)
+    names = [name for name in shares if not name.startswith("keyframe")]
+    for k, kind in enumerate(found.terms):
+        heights = [100 * shares[name][kind] for name in names]
+        right.bar(np.arange(len(names)) + 0.2 * (k - 1.5), heights, 0.2, color=line_colour(k), label=kind)
+    right.set_xticks(range(len(names)), [name.replace("translation ", "") for name in names], rotation=30, ha="right")
+    right.set_ylabel("information lost [%]")
+    right.set_title("Without a kind of observation", loc="left", fontsize=10)
+    right.legend(frameon=False, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.0))
+    right.set_ylim(0, 118)
+    right.set_yticks([0, 25, 50, 75, 100])
+    for axes in (left, right):
+        style(axes)
+    return figure

@@ -19,11 +19,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from vggtgeo.evaluation import AbsoluteError, TrajectoryReport, absolute_error, associate
-from vggtgeo.figures.style import BLUE, INK, ORANGE, style
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_path
 
+BLUE, ORANGE, GREEN, INK, RULE, GRID = "#1f5fbf", "#e07b1a", "#3a8f5c", "#333333", "#bbbbbb", "#e3e3e3"
+"""The report replaces them by variables of its style sheet."""
+LINES = (BLUE, ORANGE, GREEN, "#8e5fb0", "#b0413e", "#7a7a2a", "#3b9aa5", "#a05a2c")
+"""Colours of the lines of a figure, in order; repeated if there are more."""
 _WIDTH = 11.0
 """Inches."""
 _WEIGHT_OF_MEAN_UP = 0.02
@@ -37,10 +40,30 @@ _MIN_EXTENT = 0.1
 class NotebookFigure(Figure):
     """A figure that a notebook displays, with or without pyplot."""
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        FigureCanvasAgg(self)
+
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
         self.savefig(buffer, format="png", dpi=100, facecolor="white")
         return buffer.getvalue()
+
+
+def line_colour(number: int) -> str:
+    """Return the colour of a line."""
+    return LINES[number % len(LINES)]
+
+
+def style(axes: Any, **grid: Any) -> None:
+    """Style axes. grid: options of `axes.grid`."""
+    axes.grid(color=GRID, lw=0.7, **grid)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=INK, labelsize=9)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set(color=INK, fontsize=9)
+    for spine in axes.spines.values():
+        spine.set_color(RULE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +182,6 @@ def _draw(drawn: _Aligned, axes_of_view: np.ndarray, unit: str, width: float, si
     heights = high - low
     panel = min(0.85 * width * (heights[1] + heights[2]) / heights[0], 0.82 * width)
     figure = NotebookFigure(figsize=(width, panel + 2.2), layout="constrained")
-    FigureCanvasAgg(figure)
     top, side = figure.subplots(2, 1, height_ratios=[heights[1], heights[2]], sharex=True)
     for axes, vertical, name in ((top, 1, "seen from above"), (side, 2, side_title)):
         _draw_view(axes, drawn, origin, axes_of_view[[0, vertical]])
@@ -174,9 +196,7 @@ def _draw(drawn: _Aligned, axes_of_view: np.ndarray, unit: str, width: float, si
 
 
 def _draw_view(axes: Any, drawn: _Aligned, origin: np.ndarray, rows: np.ndarray) -> None:
-    def flat(points: np.ndarray) -> np.ndarray:
-        return rows @ (points - origin).T
-
+    flat = lambda points: rows @ (points - origin).T
     path = flat(drawn.estimate.positions)
     if drawn.truth is not None:
         axes.plot(*flat(drawn.truth.positions), color=ORANGE, lw=2.2, alpha=0.9, label="truth", zorder=2)
@@ -205,7 +225,6 @@ def _title(drawn: _Aligned, title: str, with_scale: bool, metres: bool) -> str:
 def errors_figure(report: TrajectoryReport) -> NotebookFigure:
     """Draw histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
     figure = NotebookFigure(figsize=(6.0, 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     found = (("SE(3)", report.se3, BLUE), ("Sim(3)", report.sim3, ORANGE))
     edges = np.linspace(0, 100 * max(float(error.errors.max()) for _, error, _ in found) + 1e-9, 31)
@@ -221,7 +240,6 @@ def errors_figure(report: TrajectoryReport) -> NotebookFigure:
 def energy_figure(history: np.ndarray, message: str) -> NotebookFigure:
     """Draw the energy before the first and after each iteration, logarithmic; `history` [h] without NaN."""
     figure = NotebookFigure(figsize=(5.0, 3.0), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.semilogy(history, ".-", color=BLUE)
     axes.set_xlabel("iteration")

@@ -3,6 +3,7 @@
 from vggtgeo.report.map_scene import Pictured as Pictured
 from vggtgeo.report.map_scene import map_scene as map_scene
 from vggtgeo.report.map_scene import pictured as pictured
+from vggtgeo.report.page import RunRecord as RunRecord
 from vggtgeo.report.page import write_page as write_page
 from vggtgeo.report.viewer import MapView as MapView
 from vggtgeo.report.viewer import check_viewer as check_viewer

@@ -12,11 +12,20 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from vggtgeo.figures.plots import trajectory_figure
-from vggtgeo.figures.style import BLUE, GREEN, GRID, INK, ORANGE, RULE, line_colour, style
+from vggtgeo.figures.plots import (
+    BLUE,
+    GREEN,
+    GRID,
+    INK,
+    ORANGE,
+    RULE,
+    NotebookFigure,
+    line_colour,
+    style,
+    trajectory_figure,
+)
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.window_recorder import WindowRecord
 
@@ -48,14 +57,12 @@ def trajectory_svg(
     estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory, with_scale: bool, metres: bool = True
 ) -> str:
     """Return the top and side view of the path. metres: whether the ground truth is in metres."""
-    figure = trajectory_figure(estimate, truth, keyframes, with_scale, None, _WIDTH + 0.4, metres)
-    return svg(figure)
+    return svg(trajectory_figure(estimate, truth, keyframes, with_scale, None, _WIDTH + 0.4, metres))
 
 
 def residuals_svg(records: Sequence[WindowRecord]) -> str:
     """Return the RMS residuals of all terms over time, one panel per unit."""
-    figure = Figure(figsize=(_WIDTH, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = NotebookFigure(figsize=(_WIDTH, 3.4), layout="constrained")
     units = {name: unit for record in records for name, unit in record.units.items()}
     kinds = list(dict.fromkeys(units.values())) or ["px"]
     rows = dict(zip(kinds, figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0], strict=True))
@@ -75,30 +82,29 @@ def residuals_svg(records: Sequence[WindowRecord]) -> str:
     return svg(figure)
 
 
-def picture(image: UInt8[np.ndarray, "h w 3"], width: int, quality: int = 82) -> str:
-    """Return an RGB image as the data URI of a JPEG, at most `width` pixels wide."""
+def jpeg(image: UInt8[np.ndarray, "h w 3"], width: int, quality: int) -> bytes:
+    """Return an RGB image as a JPEG, at most `width` pixels wide."""
     scale = min(1.0, width / image.shape[1])
     if scale < 1.0:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    done, code = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    assert done
-    return f"data:image/jpeg;base64,{base64.b64encode(code.tobytes()).decode()}"
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def picture(image: UInt8[np.ndarray, "h w 3"], width: int) -> str:
+    """Return an RGB image as the data URI of a JPEG, at most `width` pixels wide."""
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg(image, width, 82)).decode()}"
 
 
 def depth_colours(depth: Float[np.ndarray, "h w"], low: float, high: float) -> UInt8[np.ndarray, "h w 3"]:
     """Colour depth from `low` (bright) to `high` (dark) metres; unknown depth is grey."""
     share = np.clip((high - np.nan_to_num(depth, nan=high)) / max(high - low, 1e-6), 0.0, 1.0)
-    image = _map_colours(share)
+    image = shades(share)
     image[~np.isfinite(depth)] = 128
     return image
 
 
-def confidence_colours(confidence: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour confidence from 0 (dark) to 255 (bright)."""
-    return _map_colours(confidence / 255.0)
-
-
-def _map_colours(share: np.ndarray) -> np.ndarray:
+def shades(share: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Colour numbers from 0 (dark) to 1 (bright)."""
     return np.asarray(255 * mpl.colormaps["viridis"](share)[..., :3], np.uint8)
 
 

@@ -11,10 +11,9 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from vggtgeo.evaluation import align, associate
@@ -23,6 +22,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud, cell_numbers
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
+from vggtgeo.report.figures import jpeg
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
@@ -64,17 +64,21 @@ class MapScene:
         return json.dumps(self.header, separators=(",", ":")).replace("<", "\\u003c")
 
 
+def spread(count: int, most: int) -> Int[np.ndarray, " n"]:
+    """Return at most `most` of the rows 0 to `count` - 1, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+
+
 def pictured(keyframes: Sequence[Keyframe]) -> list[Pictured]:
     """Return at most `MAX_KEYFRAMES` keyframes, evenly spread, with small images."""
-    rows = np.unique(np.linspace(0, len(keyframes) - 1, min(MAX_KEYFRAMES, len(keyframes))).round().astype(int))
     return [
         Pictured(
-            f"frame {keyframes[row].frame}",
-            np.linalg.inv(keyframes[row].pose),
-            keyframes[row].timestamp,
-            _jpeg(keyframes[row].image),
+            f"frame {one.frame}",
+            np.linalg.inv(one.pose),
+            one.timestamp,
+            jpeg(one.image, _IMAGE_WIDTH, _IMAGE_QUALITY),
         )
-        for row in rows
+        for one in (keyframes[row] for row in spread(len(keyframes), MAX_KEYFRAMES))
     ]
 
 
@@ -191,8 +195,7 @@ def _spacing(points: np.ndarray) -> float:
 
 
 def _thinned(positions: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    rows = np.unique(np.linspace(0, len(positions) - 1, min(MAX_POSES, len(positions))).round().astype(int))
-    return positions[rows].astype(np.float32)
+    return positions[spread(len(positions), MAX_POSES)].astype(np.float32)
 
 
 def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> Trajectory | None:
@@ -224,12 +227,6 @@ def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> 
     x, y = cx / fx, cy / fy
     corners = length * np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]])
     return np.einsum("kij,cj->kci", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
-
-
-def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    scale = min(1.0, _IMAGE_WIDTH / image.shape[1])
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    return bytes(cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _IMAGE_QUALITY])[1])
 
 
 _GROWTH = 1.2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +14,10 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
+from vggtgeo.mapping.dense import DenseMap
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
-from vggtgeo.report.map_scene import map_scene, pictured
+from vggtgeo.report.map_scene import map_scene, pictured, spread
 from vggtgeo.report.viewer import INSTALL, has_viewer, style, template, view_html
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -26,7 +27,6 @@ from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.window_recorder import WindowRecord
 
-_Value = TypeVar("_Value")
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""
 VERDICT_LINES = {
@@ -38,45 +38,29 @@ _SAMPLE_WIDTH = 300
 """Pixels."""
 
 
-@dataclass(frozen=True)
-class Fact:
-    """A number at the top of the page."""
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """The data of a result in memory, from which report and depth images are made.
 
-    value: str
-    name: str
+    slam: the last state. dense: the dense map after the last adjustment. windows: one per adjustment of the window.
+    truth: ground truth, camera -> world. warnings: about the input and the weights of networks. title: of the report.
+    valid: bool [H, W], pixels of the undistorted images inside the original one; None if all are.
+    """
 
-
-@dataclass(frozen=True)
-class Sample:
-    """Images of a keyframe as data URIs; depth and confidence may be None."""
-
-    name: str
-    image: str
-    depth: str | None
-    confidence: str | None
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Duration of a stage, s, and its share of the longest."""
-
-    name: str
-    seconds: float
-    share: float
+    slam: Slam
+    dense: DenseMap
+    windows: tuple[WindowRecord, ...] = ()
+    truth: Trajectory | None = None
+    warnings: tuple[str, ...] = ()
+    title: str = "run"
+    valid: np.ndarray | None = None
 
 
 def write_page(
     path: Path,
-    slam: Slam,
-    *,
-    title: str,
-    truth: Trajectory | None,
-    cloud: PointCloud,
-    depth_maps: Sequence[DepthMap | None],
-    records: Sequence[WindowRecord],
+    record: RunRecord,
     summary: Mapping[str, Any],
     verdict: Verdict,
-    warnings: Sequence[str] = (),
     uncertainty: PoseUncertainty | None = None,
     mesh: Callable[[], Mesh | None] = lambda: None,
 ) -> None:
@@ -84,25 +68,22 @@ def write_page(
 
     Args:
         path: of the file.
-        slam: last state, with at least one frame.
-        title: of the page.
-        truth: ground truth, camera -> world, drawn beside the estimate.
-        cloud: the map.
-        depth_maps: dense depth of each keyframe.
-        records: one per adjustment of the window, in order.
+        record: of the run, with at least one frame.
         summary: content of `summary.json`.
         verdict: how far the result can be trusted; the first part of the page.
-        warnings: about the input; the state's notes follow.
         uncertainty: of the poses, for the 3D view.
         mesh: returns the mesh of the map for the 3D view, which is made last.
 
     """
+    slam, cloud, truth = record.slam, record.dense.cloud, record.truth
     trajectory = frame_trajectory(slam)
-    chosen = _spread(list(zip(slam.keyframes, depth_maps, strict=True)), SAMPLES)
+    chosen = [(slam.keyframes[row], record.dense.depth_maps[row]) for row in spread(len(slam.keyframes), SAMPLES)]
     low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
+    in_metres, keyframes = summary.get("truth", {}).get("in_metres", True), keyframe_trajectory(slam)
+    drawn = figures.trajectory_svg(trajectory, truth, keyframes, not slam.metric, in_metres) if len(trajectory) else ""
     text = template("vggtgeo.report", "page.html.j2").render(
         style=style(),
-        title=title,
+        title=record.title,
         facts=_facts(slam, trajectory, cloud, summary),
         simulated=bool(summary.get("simulated")),
         interrupted=bool(summary.get("interrupted")),
@@ -112,10 +93,10 @@ def write_page(
         verdict=verdict,
         verdict_line=VERDICT_LINES[verdict.level],
         timeline=_timeline(verdict),
-        warnings=[*warnings, *slam.notes],
-        trajectory=_draw_trajectory(slam, trajectory, truth, summary.get("truth", {}).get("in_metres", True)),
+        warnings=[*record.warnings, *slam.notes],
+        trajectory=drawn,
         has_truth=truth is not None,
-        residuals=figures.residuals_svg(records) if records else None,
+        residuals=figures.residuals_svg(record.windows) if record.windows else None,
         map_above=_map_picture(map_view.from_above, cloud, trajectory),
         map_inside=_map_picture(map_view.walk_in, cloud, trajectory),
         samples=[_sample(keyframe, depth_map, low, high) for keyframe, depth_map in chosen],
@@ -130,16 +111,14 @@ def write_page(
         scale=summary["scale"],
         scale_basis=summary.get("scale_basis"),
         install=INSTALL,
-        view=_view(slam, trajectory, truth, cloud, summary, uncertainty, mesh),
+        view=_view(record, trajectory, summary, uncertainty, mesh),
     )
     write_text(path, text)
 
 
 def _view(
-    slam: Slam,
+    record: RunRecord,
     trajectory: Trajectory,
-    truth: Trajectory | None,
-    cloud: PointCloud,
     summary: Mapping[str, Any],
     uncertainty: PoseUncertainty | None,
     mesh: Callable[[], Mesh | None],
@@ -147,13 +126,14 @@ def _view(
     """Return the 3D view; None if no frame has a pose, or K3D is not installed."""
     if not len(trajectory) or not has_viewer():
         return None
+    slam = record.slam
     scene = map_scene(
-        cloud,
+        record.dense.cloud,
         trajectory,
         pictured([slam.keyframes[number] for number in submaps_by_size(slam)[0]]),
         [float(value) for value in slam.intrinsics],
         mesh=mesh(),
-        truth=truth,
+        truth=record.truth,
         uncertainty=uncertainty,
         metric=slam.metric,
         truth_in_metres=summary.get("truth", {}).get("in_metres", True),
@@ -161,29 +141,23 @@ def _view(
     return view_html(scene)
 
 
-def _draw_trajectory(slam: Slam, trajectory: Trajectory, truth: Trajectory | None, metres: bool) -> str:
-    """Return the figure as SVG; empty if no frame has a pose. metres: whether the truth is in metres."""
-    if not len(trajectory):
-        return ""
-    return figures.trajectory_svg(trajectory, truth, keyframe_trajectory(slam), not slam.metric, metres)
-
-
-def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[Fact]:
+def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the numbers at the top of the page, each with its name."""
     facts = [
-        Fact(f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
-        Fact(f"{summary['keyframes']}", "keyframes"),
+        (f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
+        (f"{summary['keyframes']}", "keyframes"),
     ]
     if "frames_per_second" in summary:
-        facts.append(Fact(f"{summary['frames_per_second']:.1f}", "frames per second"))
+        facts.append((f"{summary['frames_per_second']:.1f}", "frames per second"))
     if summary["scale"] == "metric":
-        facts.append(Fact(f"{trajectory.length:.2f} m", "path length"))
+        facts.append((f"{trajectory.length:.2f} m", "path length"))
     if (truth := summary.get("truth")) is not None:
         aligned, name = ("ate_se3_m", "SE(3)") if slam.metric and truth["in_metres"] else ("ate_sim3_m", "Sim(3)")
         error = truth[aligned]["rmse"]
         shown = f"{100 * error:.2f} cm" if truth["in_metres"] else f"{error:.4g}"
-        facts.append(Fact(shown, f"ATE after {name}" + ("" if truth["in_metres"] else ", in the truth's unit")))
-    facts.append(Fact(f"{len(cloud):,}".replace(",", "\u202f"), "points in the map"))
-    facts.append(Fact(f"{summary['peak_memory_gb']:.2f} GB", "peak memory"))
+        facts.append((shown, f"ATE after {name}" + ("" if truth["in_metres"] else ", in the truth's unit")))
+    facts.append((f"{len(cloud):,}".replace(",", "\u202f"), "points in the map"))
+    facts.append((f"{summary['peak_memory_gb']:.2f} GB", "peak memory"))
     return facts
 
 
@@ -222,15 +196,11 @@ def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[st
     return [(title, [show(errors[name], by) for name in names]) for title, errors, by in rows]
 
 
-def _stages(seconds: Mapping[str, float]) -> list[Stage]:
+def _stages(seconds: Mapping[str, float]) -> list[tuple[str, float, float]]:
+    """Return name, duration in seconds, and its share of the longest, of each stage."""
     shown = {name: value for name, value in seconds.items() if name != "all" and value >= 0.005}
     longest = max(shown.values(), default=1.0)
-    return [Stage(name, value, value / longest) for name, value in sorted(shown.items(), key=lambda item: -item[1])]
-
-
-def _spread(values: Sequence[_Value], count: int) -> list[_Value]:
-    rows = np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int))
-    return [values[row] for row in rows]
+    return [(name, value, value / longest) for name, value in sorted(shown.items(), key=lambda item: -item[1])]
 
 
 def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
@@ -242,17 +212,18 @@ def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
     return float(np.quantile(known, 0.02)), float(np.quantile(known, 0.98))
 
 
-def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: float) -> Sample:
+def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: float) -> dict[str, str | None]:
+    """Return a name, and image, depth and confidence as data URIs."""
     image = figures.picture(keyframe.image, _SAMPLE_WIDTH)
     depth = confidence = None
     if depth_map is not None and np.isfinite(low):
         depth = figures.picture(figures.depth_colours(depth_map.depth, low, high), _SAMPLE_WIDTH)
-        shades = np.rint(255 * depth_map.confidence).astype(np.uint8)
-        confidence = figures.picture(figures.confidence_colours(shades), _SAMPLE_WIDTH)
+        shades = figures.shades(np.rint(255 * depth_map.confidence).astype(np.uint8) / 255.0)
+        confidence = figures.picture(shades, _SAMPLE_WIDTH)
     title = f"frame {keyframe.frame}, {keyframe.timestamp:.2f} s"
     if keyframe.recorded is not None:
         title = f"from the known map, recorded at {keyframe.recorded:.2f} s"
-    return Sample(title, image, depth, confidence)
+    return {"name": title, "image": image, "depth": depth, "confidence": confidence}
 
 
 def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | None:
@@ -261,13 +232,10 @@ def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return the settings as text, by name or `group.name`."""
-    rows: dict[str, str] = {}
+    rows: dict[str, Any] = {}
     for name, value in settings.items():
-        if isinstance(value, Mapping):
-            rows |= {f"{name}.{field}": _plain(own) for field, own in value.items()}
-        else:
-            rows[name] = _plain(value)
-    return rows
+        rows |= {f"{name}.{key}": own for key, own in value.items()} if isinstance(value, Mapping) else {name: value}
+    return {name: _plain(value) for name, value in rows.items()}
 
 
 def _plain(value: Any) -> str:

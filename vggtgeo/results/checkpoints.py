@@ -7,7 +7,6 @@ atomically. The interval grows so that all checkpoints take at most `SHARE` of t
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import math
 import re
@@ -26,9 +25,8 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.output_checks import check_checkpoint_path
+from vggtgeo.results.output_checks import EVERY, check_checkpoint_path
 from vggtgeo.results.summary import versions
-from vggtgeo.results.unfinished import EVERY
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
@@ -67,7 +65,7 @@ class Checkpoints:
     def __post_init__(self) -> None:
         path_of("path", self.path)
         check_real("checkpoint-every", self.every, "seconds, at least 0")
-        if not (math.isfinite(self.every) and self.every >= 0):
+        if not 0 <= self.every < math.inf:
             raise InputError(f"`checkpoint-every` must be seconds, at least 0, got {self.every:g}")
 
 
@@ -118,8 +116,7 @@ class RunSoFar:
     def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
         """Add the checkpoint's counts to `refusals`."""
         for role, counts in self.refused.items():
-            for entry, value in zip(dataclasses.fields(Refusals), counts, strict=True):
-                setattr(refusals[role], entry.name, value)
+            vars(refusals[role]).update(vars(Refusals(*counts)))
 
 
 KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, FrameEvidence, WindowRecord)
@@ -134,12 +131,9 @@ def run_identity(
     source: `Source.identity`. networks: digest of each network file. more: further values.
     """
     by_stage = {
-        f"{group.name}.{entry.name}": getattr(getattr(settings, group.name), entry.name)
-        for group in dataclasses.fields(settings)
-        for entry in dataclasses.fields(getattr(settings, group.name))
+        f"{group}.{name}": value for group, values in vars(settings).items() for name, value in vars(values).items()
     }
-    by_role = {entry.name: getattr(roles, entry.name) for entry in dataclasses.fields(roles)}
-    every = {**versions(), **source, **by_stage, **by_role, **networks, **more}
+    every = {**versions(), **source, **by_stage, **vars(roles), **networks, **more}
     # The default `repr` of an object contains its address, which differs between processes.
     return {name: re.sub(r" at 0x[0-9a-f]+", "", repr(value)) for name, value in every.items()}
 
@@ -177,14 +171,9 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
 
 def _header(path: Path) -> dict[str, Any]:
     try:
-        found = CHECKPOINT.facts(path)
+        return CHECKPOINT.facts(path)
     except InputError as error:
         raise InputError(f"{error}; start again with `--no-resume`") from None
-    types = {"identity": dict, "frames": int, "last": int, "digest": str}
-    valid = found.keys() == types.keys() and all(type(found[name]) is kind for name, kind in types.items())
-    if not valid or not all(type(value) is str for value in found["identity"].values()):
-        raise InputError(f"`{path}` contains no run; start again with `--no-resume`")
-    return found
 
 
 def _excerpt(value: str | None) -> str:
@@ -237,9 +226,8 @@ class CheckpointWriter:
     message: Callable[[str], None]
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, thread_name_prefix="checkpoint"))
     _writing: Future[float] | None = None
+    _written: bool = False
     _next: float = 0.0
-    _kept: int = 0
-    _failed: bool = False
 
     def __post_init__(self) -> None:
         self._next = time.monotonic() + self.asked.every
@@ -247,14 +235,14 @@ class CheckpointWriter:
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         """Start to write a checkpoint after a frame, if it is time."""
         if self._writing is not None and (self._writing.done() or self.asked.every == 0):
-            self._ended(self._writing)
-        if self._writing is None and not self._failed and time.monotonic() >= self._next:
+            self._wait()
+        if self._writing is None and time.monotonic() >= self._next:
             self._begin(slam, frame)
 
     def on_end(self, slam: Slam, frame: Frame | None) -> None:
         """Write a checkpoint after the last frame, if the run was long enough for an earlier one."""
         self._wait()
-        if self._kept and frame is not None and not self._failed:
+        if self._written and frame is not None:
             self._begin(slam, frame)
 
     def close(self) -> None:
@@ -262,13 +250,8 @@ class CheckpointWriter:
         self._wait()
         self._pool.shutdown()
 
-    def _wait(self) -> None:
-        if self._writing is not None:
-            self._ended(self._writing)
-
     def _begin(self, slam: Slam, frame: Frame) -> None:
-        so_far = self.gather(slam)
-        self._writing = self._pool.submit(self._write, so_far, frame)
+        self._writing = self._pool.submit(self._write, self.gather(slam), frame)
 
     def _write(self, so_far: RunSoFar, frame: Frame) -> float:
         """Write the file, once a window that is being adjusted is done; return the processor time, s."""
@@ -278,14 +261,15 @@ class CheckpointWriter:
         CHECKPOINT.write(self.asked.path, so_far, facts)
         return time.thread_time() - began
 
-    def _ended(self, writing: Future[float]) -> None:
-        """Schedule the next checkpoint; after an error the run continues without checkpoints."""
-        self._writing = None
+    def _wait(self) -> None:
+        """Wait for the file, and schedule the next; after an error the run continues without checkpoints."""
+        if self._writing is None:
+            return
+        writing, self._writing = self._writing, None
         try:
             took = writing.result()
+            self._written, self._next = True, time.monotonic()
+            self._next += max(self.asked.every, took / SHARE) if self.asked.every else 0.0
         except (OSError, TypeError, ValueError) as error:
-            self._failed = True
+            self._written, self._next = False, math.inf
             self.message(f"cannot write the checkpoint `{self.asked.path}`, this run cannot be resumed: {error}")
-            return
-        self._kept += 1
-        self._next = time.monotonic() + (max(self.asked.every, took / SHARE) if self.asked.every else 0.0)

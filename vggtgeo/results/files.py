@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from vggtgeo.io.files import write_picture, write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
 
@@ -46,15 +45,11 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
         uncertainty = frame_uncertainty(slam, rank)
         if uncertainty is not None:
             write_uncertainty(folder / submap_file("uncertainty", rank), uncertainty)
-    _write_map_times(folder / "map-times.txt", slam)
-
-
-def _write_map_times(path: Path, slam: Slam) -> None:
     known = [keyframe for keyframe in slam.keyframes if keyframe.recorded is not None]
     if known:
         head = "# time in keyframes.txt, and in the run that recorded the keyframe, by the clock of that run; s\n"
         rows = "".join(f"{keyframe.timestamp:.9f} {keyframe.recorded:.9f}\n" for keyframe in known)
-        write_text(path, head + rows)
+        write_text(folder / "map-times.txt", head + rows)
 
 
 def write_uncertainty(path: Path, sigma: PoseUncertainty) -> None:
@@ -78,20 +73,12 @@ def submap_file(name: str, rank: int) -> str:
     return f"{name}-{rank + 1}.txt" if rank else f"{name}.txt"
 
 
-def write_depth(
-    folder: Path, keyframes: Sequence[Keyframe], depth_maps: Sequence[DepthMap | None], metric: bool = True
-) -> None:
-    """Write the keyframes' dense depth: `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = unknown),
+def write_depth(folder: Path, depth_maps: Iterable[tuple[int, DepthMap | None]], metric: bool = True) -> None:
+    """Write dense depth of frames, given by number: `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = unknown),
     `depth/NNNNNN.confidence.png` (8 bit) and `depth/README.txt`, which describes the format.
 
-    A keyframe without depth gets no file. If no keyframe has depth, warn and write nothing.
+    A frame without depth gets no file. If no frame has depth, warn and write nothing.
     """
-    pairs = zip(keyframes, depth_maps, strict=True)
-    write_depth_maps(folder, ((keyframe.frame, depth_map) for keyframe, depth_map in pairs), metric)
-
-
-def write_depth_maps(folder: Path, depth_maps: Iterable[tuple[int, DepthMap | None]], metric: bool = True) -> None:
-    """Write depth of frames, given by number, as `write_depth` does."""
     written = False
     for frame, depth_map in depth_maps:
         if depth_map is None or depth_map.empty:
@@ -103,7 +90,7 @@ def write_depth_maps(folder: Path, depth_maps: Iterable[tuple[int, DepthMap | No
         for name, image in (("depth", counts), ("confidence", confidence)):
             write_picture(folder / "depth" / f"{frame:06d}.{name}.png", image)
     if not written:
-        warnings.warn("`depth` is empty: no keyframe has dense depth", InputWarning, stacklevel=3)
+        warnings.warn("`depth` is empty: no keyframe has dense depth", InputWarning, stacklevel=2)
         return
     write_text(folder / "depth" / "README.txt", DEPTH_README + (METRES if metric else FREE_SCALE))
 

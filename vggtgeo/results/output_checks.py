@@ -1,21 +1,27 @@
-"""Checks of a run's output folder: a run must not replace files that are not results.
+"""Checks of a run's folder, before a run writes into it or a command reads it: a run must replace results only.
 
-They run before the import of JAX, and again when the folder is locked.
+No slow import: commands call them before that of JAX, and a run again when it has locked the folder.
 """
 
 from __future__ import annotations
 
+import mimetypes
 import os
 import tempfile
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import whole_path
-from vggtgeo.io.locks import not_written
-from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED, check_may_be_folder
 
+UNFINISHED = "unfinished"
+"""Subfolder for the files of a run that is still going on."""
+SUMMARY = "summary.json"
+EXPORTS = "export"
+"""Default folder of `vggtgeo export` in the folder of a run, which no run writes or removes."""
+CHECKPOINT = "checkpoint.npz"
+"""In `unfinished/`: the state from which a killed run can be resumed."""
+EVERY = 10.0
+"""Seconds between two checkpoints."""
 NAMES = (
     SUMMARY,
     "settings.toml",
@@ -43,70 +49,87 @@ NOTE = "README.txt"
 _SEQUENCE_FILES = ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "camera-intrinsics.txt")
 
 
+def unfinished_message(folder: Path) -> str | None:
+    """Return a message if the run into `folder` is still going on or was killed, else None."""
+    stage = folder / UNFINISHED
+    if not stage.is_dir():
+        return None
+    older = "; the other files in the folder are from the previous run" if (folder / SUMMARY).is_file() else ""
+    resume = "; `vggtgeo run --resume` continues it" if (stage / CHECKPOINT).is_file() else ""
+    return f"the run into `{folder}` is unfinished (running or killed), its files are in `{stage}`{older}{resume}"
+
+
+def check_is_run(folder: Path) -> None:
+    """Raise InputError unless `folder` contains a finished run."""
+    if not (folder / SUMMARY).is_file():
+        raise InputError(
+            unfinished_message(folder)
+            or f"`{folder}` contains no run (`{SUMMARY}` is missing); give a folder that `vggtgeo run` wrote"
+        )
+
+
+def check_can_be_shown(folder: Path) -> None:
+    """Raise InputError unless `folder` has the trajectory and the map of a run."""
+    for name in ("trajectory.txt", "keyframes.txt", "map.ply"):
+        if not (folder / name).is_file():
+            raise InputError(
+                unfinished_message(folder)
+                or f"`{name}` is missing in `{folder}`; give the folder that `vggtgeo run -o` wrote"
+            )
+
+
 def check_output(place: Path, source: Path | None = None) -> None:
-    """Raise InputError for an invalid output folder: a file, the input itself, a folder of images, the root of the file
-    system, or a folder with other files under the names of results.
+    """Raise InputError for an invalid output folder: a file, the input itself, or a folder with images or other files
+    that are not a run's.
 
     source: file or folder that the run reads.
     """
-    _check_not_input(place, source)
-    _check_stage(place / UNFINISHED)
-
-
-def check_can_be_written(place: Path) -> None:
-    """Raise InputError if `place` is not writable, or cannot be created."""
-    there = next(folder for folder in (place, *place.absolute().parents) if folder.exists())
-    try:
-        tempfile.TemporaryFile(dir=there).close()
-    except OSError as error:
-        raise not_written(place, error) from None
-
-
-def _check_not_input(place: Path, source: Path | None) -> None:
-    check_may_be_folder(place)
-    if source is not None and place.exists() and source.is_dir() and place.samefile(source):
+    if place.exists() and not place.is_dir():
+        raise InputError(f"`{place}` is a file, expected a folder for the results; give another path with `-o`")
+    inside = None if source is None else _inside(place, source)
+    if inside == ".":
         raise InputError(f"`{place}` is the input folder; give another folder for the results with `-o`")
+    if inside is not None and is_known(inside):
+        raise InputError(
+            f"the input `{source}` is inside `{place / inside}`, which the run would replace; give another folder "
+            "for the results with `-o`"
+        )
     if not place.is_dir():
         return
-    if source is not None:
-        inside = _inside(place, source)
-        if inside is not None and is_known(inside):
-            raise InputError(
-                f"the input `{source}` is inside `{place / inside}`, which the run would replace; give another folder "
-                "for the results with `-o`"
-            )
-    if (place / SUMMARY).is_file():
-        return
-    for path in place.iterdir():
-        if path.name in _SEQUENCE_FILES or (path.suffix.lower() in IMAGE_SUFFIXES and not is_known(path.name)):
-            raise InputError(
-                f"`{place}` contains images or a sequence (`{path.name}`); give another folder for the results with "
-                "`-o`"
-            )
-    if not (place / UNFINISHED).is_dir():  # a run killed while its files were moved has no summary either
+    stage = place / UNFINISHED
+    if not (place / SUMMARY).is_file():
         for path in sorted(place.iterdir()):
-            if any(fnmatchcase(path.name, pattern) for pattern in NAMES):
+            is_image = (mimetypes.guess_type(path.name, strict=False)[0] or "").startswith("image/")
+            if path.name in _SEQUENCE_FILES or (is_image and not is_known(path.name)):
+                raise InputError(
+                    f"`{place}` contains images or a sequence (`{path.name}`); give another folder for the results "
+                    "with `-o`"
+                )
+            # A run killed while its files were moved has no summary either.
+            if not stage.is_dir() and any(fnmatchcase(path.name, pattern) for pattern in NAMES):
                 raise InputError(
                     f"`{place}` contains `{path.name}`, which the run would replace, but no `{SUMMARY}`: it is not "
                     "the folder of a run; give another folder for the results with `-o`"
                 )
-
-
-def _check_stage(stage: Path) -> None:
-    """Raise InputError for an `unfinished/` with other files than a run's: the run would delete them."""
-    if whole_path(stage.parent) == Path(whole_path(stage).anchor):
-        raise InputError(f"`{stage.parent}` is the root of the file system; give a folder for the results with `-o`")
-    if stage.is_symlink() or not stage.exists():
-        return
-    if not stage.is_dir():
+    if stage.exists() and not stage.is_dir():
         raise InputError(f"`{stage}` is a file, and a run creates a folder there; give another folder with `-o`")
     check_checkpoint_path(stage / CHECKPOINT)
-    for path in sorted(stage.iterdir()):
+    for path in stage.iterdir() if stage.is_dir() and not stage.is_symlink() else ():
         if not (is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, NOTE)):
             raise InputError(
                 f"`{stage}` contains `{path.name}`, which is not a run's and which the run would delete; give another "
                 "folder with `-o`"
             )
+
+
+def check_can_be_written(place: Path, option: str = "-o") -> None:
+    """Raise InputError if the folder `place` is not writable, or cannot be created. option: that names it."""
+    there = next(folder for folder in (place, *place.absolute().parents) if folder.exists())
+    try:
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"`{place}` cannot be written: {reason}; give another with `{option}`") from None
 
 
 def check_checkpoint_path(path: Path) -> None:
@@ -116,12 +139,11 @@ def check_checkpoint_path(path: Path) -> None:
 
 
 def _inside(place: Path, source: Path) -> str | None:
-    """Return the entry of `place` that contains `source`; None if `source` is elsewhere."""
-    try:
-        parts = whole_path(source).relative_to(whole_path(place)).parts
-    except ValueError:
+    """Return the entry of `place` that contains `source`, "." for `place` itself; None if `source` is elsewhere."""
+    inner, outer = Path(os.path.realpath(source)), Path(os.path.realpath(place))
+    if not inner.is_relative_to(outer):
         return None
-    return parts[0] if parts else None
+    return (inner.relative_to(outer).parts or (".",))[0]
 
 
 def is_result(folder: Path, file: Path) -> bool:
@@ -132,7 +154,7 @@ def is_result(folder: Path, file: Path) -> bool:
 
 def is_in_results(folder: Path, file: Path) -> bool:
     """Return whether `file` is in a folder that a run into `folder` replaces: `images`, `depth`, `unfinished`."""
-    return is_result(folder, file) and whole_path(file).parent != whole_path(folder)
+    return is_result(folder, file) and os.path.realpath(file.parent) != os.path.realpath(folder)
 
 
 def is_known(name: str) -> bool:

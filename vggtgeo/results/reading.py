@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import warnings
+from pathlib import Path
 from typing import Any
 
 from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.given import check_kind, path_of
+from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.result import Result
 from vggtgeo.results.summary import warn_if_truncated
 
@@ -61,17 +64,30 @@ def evaluate(
     known = Trajectory | Result | str | os.PathLike
     check_kind("estimate", estimate, known, "a trajectory, a result, or a path")
     true = _truth(truth)
-    return evaluate_trajectory(_estimate(estimate, true), true, **options)
+    if isinstance(estimate, Result):
+        estimate = estimate.trajectory
+    elif not isinstance(estimate, Trajectory):
+        estimate = load_estimate(path_of("estimate", estimate), true)
+    return evaluate_trajectory(estimate, true, **options)
 
 
-def _estimate(given: Any, truth: Trajectory) -> Trajectory:
-    if isinstance(given, Trajectory):
-        return given
-    if isinstance(given, Result):
-        return given.trajectory
-    place = path_of("estimate", given)
-    file = place / "trajectory.txt" if place.is_dir() else place
+def load_estimate(path: Path, truth: Trajectory) -> Trajectory:
+    """Load the trajectory of a file, or of a run's folder; warn if the run is unfinished, or the file truncated.
+
+    truth: gives the times of poses without times.
+    """
+    if unfinished := unfinished_message(path):
+        warnings.warn(unfinished, InputWarning, stacklevel=2)
+    file = path / "trajectory.txt" if path.is_dir() else path
     return warn_if_truncated(file, load_trajectory(file, truth))
+
+
+def truth_of(sequence: Sequence) -> Trajectory:
+    """Return the ground truth of a sequence; raise InputError if it has none."""
+    truth = sequence.ground_truth()
+    if truth is None:
+        raise InputError(f"`{sequence.name}` has no ground truth; give a trajectory in the TUM format")
+    return truth
 
 
 def _truth(given: Any) -> Trajectory:
@@ -82,7 +98,4 @@ def _truth(given: Any) -> Trajectory:
             return load_trajectory(given)
         given = open_sequence(given)
     check_kind("truth", given, Sequence, "a trajectory, a sequence with ground truth, or a path")
-    found: Trajectory | None = given.ground_truth()
-    if found is None:
-        raise InputError(f"`truth` is `{given.name}`, which has no ground truth; give a trajectory in the TUM format")
-    return found
+    return truth_of(given)

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,13 +20,13 @@ from vggtgeo.io.given import check_kind
 from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import check_dense, dense_map
-from vggtgeo.models.onnx.bounds import Refusals
+from vggtgeo.report import RunRecord
 from vggtgeo.results.checkpoints import digest_of_map, load_checkpoint, run_identity
-from vggtgeo.results.result import Result, RunRecord
+from vggtgeo.results.result import Result
 from vggtgeo.results.run_options import RunOptions
 from vggtgeo.results.source import PosePrior, Source, open_source, reduction_summary, with_pose_prior
 from vggtgeo.results.summary import compare_with_truth, summarise
-from vggtgeo.results.tracking_loop import RunCallbacks, Tracked, TrackingLoop
+from vggtgeo.results.tracking_loop import RunCallbacks, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
@@ -51,7 +51,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Finding, Verdict
 from vggtgeo.slam.verdict.judge import check_input, check_refusals, check_static_overlay, judge_or_report
-from vggtgeo.slam.window_recorder import WindowRecord, WindowRecorder
+from vggtgeo.slam.window_recorder import WindowRecorder
 
 FREE_MAP = (
     "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not used; start "
@@ -140,69 +140,52 @@ def reconstruct(
             first = _calibrate(source, selection, perception, settings, hooks, stop)
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
         with loop.checkpoint_writer(options.checkpoints, identity) as writer:
-            tracked = loop.track(writer)
-            slam, interrupted = _finish_unless_interrupted(tracked, perception.roles, settings, hooks, stop)
+            slam, interrupted, rate = loop.track(writer)
+            hooks.each("on_adjust", slam)
+            if not interrupted:
+                slam, interrupted = _finish(slam, perception.roles, settings, hooks, stop)
         summary_facts = {
             **perception.facts(),
             **options.facts,
-            "frames_per_second": round(tracked.frames_per_second, 2),
+            "frames_per_second": round(rate, 2),
             "interrupted": interrupted,
             **reduction_summary(source, slam),
             **prior_summary(slam, perception.roles),
             **({} if overlay.found is None else {"static_overlay": round(overlay.found.share, 4)}),
         }
-        finished = _FinishedRun(
-            slam=slam,
-            source=source,
-            warned=(*options.warned, *(collected if before is None else before.merge_warnings(collected))),
-            refusals=perception.refusals,
-            title=options.title or source.name,
-            facts=summary_facts,
-            clock=clock,
-            began=began - (0.0 if before is None else before.whole),
-            dense=options.dense,
-        )
-        return _conclude(finished, settings, hooks, windows.records, overlay, evidence)
-
-
-@dataclass(frozen=True, eq=False)
-class _FinishedRun:
-    """A run after its last adjustment."""
-
-    slam: Slam
-    source: Source
-    warned: tuple[Warning | str, ...]
-    refusals: Mapping[str, Refusals]
-    title: str
-    facts: Mapping[str, Any]
-    clock: Clock
-    began: float
-    dense: str
+        warned = (*options.warned, *(collected if before is None else before.merge_warnings(collected)))
+        began -= 0.0 if before is None else before.whole
+        recorders = windows, evidence, overlay
+        return _conclude(slam, source, perception, settings, options, summary_facts, warned, began, hooks, recorders)
 
 
 def _conclude(
-    run: _FinishedRun,
+    slam: Slam,
+    source: Source,
+    perception: Perception,
     settings: SlamSettings,
+    options: RunOptions,
+    facts: Mapping[str, Any],
+    warned: tuple[Warning | str, ...],
+    began: float,
     hooks: RunCallbacks,
-    windows: Iterable[WindowRecord],
-    overlay: StaticOverlaySearch,
-    evidence: EvidenceRecorder,
+    recorders: tuple[WindowRecorder, EvidenceRecorder, StaticOverlaySearch],
 ) -> Result:
     """Build the dense map and, in a thread beside it, the verdict; then the summary."""
-    slam, clock = run.slam, run.clock
-    report = compare_with_truth(slam, run.source.truth)
+    clock, (windows, evidence, overlay) = hooks.clock, recorders
+    report = compare_with_truth(slam, source.truth)
 
     @in_double_precision
     def judge() -> Verdict:
         with clock.measure("verdict (own thread)"):
-            of_input = check_input(run.warned, len(slam.frames)) + check_refusals(run.refusals) + overlay.findings()
-            return judge_or_report(slam, evidence.frames, of_input)
+            of_images = check_refusals(perception.refusals) + overlay.findings()
+            return judge_or_report(slam, evidence.frames, check_input(warned, len(slam.frames)) + of_images)
 
     hooks.each("on_stage", "dense map and verdict")
     with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:
         judging = pool.submit(judge)
         with clock.measure("dense map"):
-            built = dense_map(slam, run.dense)
+            built = dense_map(slam, options.dense)
         hooks.each("on_finish", slam, built.cloud)
         verdict = judging.result()
     summary = {
@@ -210,17 +193,18 @@ def _conclude(
             slam,
             verdict,
             settings=changed(settings),
-            seconds={**clock.seconds, "all": time.perf_counter() - run.began},
+            seconds={**clock.seconds, "all": time.perf_counter() - began},
             report=report,
-            truth_in_metres=run.source.truth_in_metres,
+            truth_in_metres=source.truth_in_metres,
             map_points=len(built.cloud),
-            dense=run.dense,
+            dense=options.dense,
         ),
-        **run.facts,
+        **facts,
     }
-    notices = (*([run.facts["meaningless"]] if "meaningless" in run.facts else []), *map(str, run.warned))
-    valid = (slam.camera.lens or run.source.camera).undistorter().valid
-    record = RunRecord(slam, built, tuple(windows), run.source.truth, notices, run.title, valid)
+    notices = (*([facts["meaningless"]] if "meaningless" in facts else []), *map(str, warned))
+    valid = (slam.camera.lens or source.camera).undistorter().valid
+    title = options.title or source.name
+    record = RunRecord(slam, built, tuple(windows.records), source.truth, notices, title, valid)
     return Result.assemble(record, verdict, summary)
 
 
@@ -256,28 +240,21 @@ def _calibrate(
         return None
     end = start + count * stride
     refused = {role: replace(counts) for role, counts in perception.refusals.items()}
+
+    def progress(passes: int, done: int | None) -> None:
+        name = f"camera calibration, pass {passes}"
+        if not done:
+            hooks.each("on_stage", f"{name}: adjusting" if done is None else f"{name} of at most {MAX_PASSES}")
+        if done is not None:
+            hooks.each("on_stage_frame", done, count)
+
     with hooks.clock.measure("self-calibration"), stop.at_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         frames = lambda: source.frames.frames(start, end, stride)
-        found = self_calibrate(
-            frames,
-            source.camera,
-            perception.roles,
-            settings,
-            lambda passes, done: _calibrating(hooks, passes, done, count),
-        )
+        found = self_calibrate(frames, source.camera, perception.roles, settings, progress)
     for role, counts in refused.items():
         vars(perception.refusals[role]).update(vars(counts))
     return found
-
-
-def _calibrating(hooks: RunCallbacks, passes: int, done: int | None, count: int) -> None:
-    """Report the progress of self-calibration, see `self_calibrate`."""
-    name = f"camera calibration, pass {passes}"
-    if not done:
-        hooks.each("on_stage", f"{name}: adjusting" if done is None else f"{name} of at most {MAX_PASSES}")
-    if done is not None:
-        hooks.each("on_stage_frame", done, count)
 
 
 def _without_overlay(
@@ -306,20 +283,17 @@ def _perception(
     return replace(found, roles=found.roles.seeded(seed)) if seed else found
 
 
-def _finish_unless_interrupted(
-    tracked: Tracked, roles: Roles, settings: SlamSettings, hooks: RunCallbacks, stop: Interruption
+def _finish(
+    slam: Slam, roles: Roles, settings: SlamSettings, hooks: RunCallbacks, stop: Interruption
 ) -> tuple[Slam, bool]:
-    """Run the last adjustment, unless Ctrl-C ended the run; return the state, and whether it did."""
-    hooks.each("on_adjust", tracked.slam)
-    if tracked.interrupted:
-        return tracked.slam, True
+    """Run the last adjustment; return the state, and whether Ctrl-C ended it."""
     hooks.each("on_stage", "last adjustment")
     try:
         with stop.at_once():
-            return finish(tracked.slam, roles, settings, hooks.clock), False
+            return finish(slam, roles, settings, hooks.clock), False
     except KeyboardInterrupt:
         hooks.each("on_message", "interrupted: keeping the result without the last adjustment")
-        return tracked.slam, True
+        return slam, True
 
 
 class StaticOverlaySearch(Callback):

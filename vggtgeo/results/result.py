@@ -23,28 +23,13 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_json
 from vggtgeo.io.given import check_kind, check_plain, path_of
-from vggtgeo.mapping.dense import DenseMap, dense_map
-from vggtgeo.report import write_page
-from vggtgeo.results.files import (
-    read_uncertainty,
-    write_depth,
-    write_depth_maps,
-    write_settings,
-    write_trajectories,
-    write_uncertainty,
-)
-from vggtgeo.results.reread_frames import depth_of_frames
+from vggtgeo.mapping.dense import dense_map
+from vggtgeo.report import RunRecord, write_page
+from vggtgeo.results.files import read_uncertainty, write_depth, write_settings, write_trajectories, write_uncertainty
+from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
-from vggtgeo.results.scene import write_scene
-from vggtgeo.results.summary import (
-    add_writing_time,
-    compare_with_truth,
-    load_poses,
-    read_summary,
-    summarise,
-    summary_error,
-)
-from vggtgeo.results.unfinished import unfinished_message
+from vggtgeo.results.scene import depth_of_frames, write_scene
+from vggtgeo.results.summary import add_writing_time, compare_with_truth, load_poses, read_summary, summarise
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import merge_pending_window
@@ -53,28 +38,9 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.window_recorder import WindowRecord
 
 DepthChoice = bool | Literal["every"]
 """Which depth images to save: none, those of the keyframes, or those of every frame."""
-
-
-@dataclass(frozen=True, eq=False)
-class RunRecord:
-    """The data of a result in memory, from which report and depth images are made.
-
-    slam: the last state. dense: the dense map after the last adjustment. windows: one per adjustment of the window.
-    truth: ground truth, camera -> world. warnings: about the input and the weights of networks. title: of the report.
-    valid: bool [H, W], pixels of the undistorted images inside the original one; None if all are.
-    """
-
-    slam: Slam
-    dense: DenseMap
-    windows: tuple[WindowRecord, ...] = ()
-    truth: Trajectory | None = None
-    warnings: tuple[str, ...] = ()
-    title: str = "run"
-    valid: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,10 +81,9 @@ class Result:
     @property
     def intrinsics_as_read(self) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy, pixels of the original images, if the run reduced them (`camera.max_pixels`)."""
-        reduced = self.summary.get("images_reduced")
-        if reduced is None:
+        if "images_reduced" not in self.summary:
             return self.intrinsics
-        fx, fy, cx, cy = (float(reduced["intrinsics_as_read"][name]) for name in ("fx", "fy", "cx", "cy"))
+        fx, fy, cx, cy = map(float, self.summary["images_reduced"]["intrinsics_as_read"].values())
         return fx, fy, cx, cy
 
     @property
@@ -161,14 +126,10 @@ class Result:
     def load(cls, folder: str | os.PathLike[str]) -> Self:
         """Load the folder of `Result.save` or `vggtgeo run`; raise InputError if a file is missing or invalid."""
         place = path_of("folder", folder)
-        unfinished = unfinished_message(place)
-        if unfinished:
+        if unfinished := unfinished_message(place):
             warnings.warn(unfinished, InputWarning, stacklevel=2)
         summary, verdict = read_summary(place)
-        try:
-            fx, fy, cx, cy = (float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy"))
-        except (KeyError, TypeError, ValueError) as error:
-            raise summary_error(place, error) from None
+        fx, fy, cx, cy = summary["intrinsics"].values()
         return cls(
             load_poses(place, "trajectory.txt"),
             load_poses(place, "keyframes.txt"),
@@ -253,10 +214,10 @@ class Result:
             meshed.result()
         if depth and self.record is not None:
             slam, depth_maps = self.record.slam, self.record.dense.depth_maps
-            if depth == "every":
-                write_depth_maps(place, depth_of_frames(slam, depth_maps, frames), slam.metric)
-            else:
-                write_depth(place, slam.keyframes, depth_maps, slam.metric)
+            numbers = (keyframe.frame for keyframe in slam.keyframes)
+            of_keyframes = zip(numbers, depth_maps, strict=True)
+            found = depth_of_frames(slam, depth_maps, frames) if depth == "every" else of_keyframes
+            write_depth(place, found, slam.metric)
         if self.record is not None:
             plain = add_writing_time(plain, time.perf_counter() - began)
         write_json(place / "summary.json", plain)
@@ -292,20 +253,8 @@ class Result:
                 metres=record is None or summary.get("truth", {}).get("in_metres", True),
             )
         if record is not None:
-            write_page(
-                place / "report.html",
-                record.slam,
-                title=record.title,
-                truth=record.truth,
-                cloud=self.cloud,
-                depth_maps=record.dense.depth_maps,
-                records=record.windows,
-                summary=summary,
-                verdict=self.verdict,
-                warnings=record.warnings,
-                uncertainty=self.uncertainty,
-                mesh=mesh,
-            )
+            page = place / "report.html"
+            write_page(page, record, summary, self.verdict, self.uncertainty, mesh)
 
     def to_dict(self) -> dict[str, Any]:
         """Return counts, path length, intrinsics and summary as plain values."""

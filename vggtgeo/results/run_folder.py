@@ -25,8 +25,7 @@ from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
 from vggtgeo.results.checkpoints import frames_kept
-from vggtgeo.results.output_checks import NAMES, NOTE, check_output
-from vggtgeo.results.unfinished import CHECKPOINT, SUMMARY, UNFINISHED
+from vggtgeo.results.output_checks import CHECKPOINT, NAMES, NOTE, SUMMARY, UNFINISHED, check_output
 
 RESERVE = 96 * 2**20
 """Bytes reserved on the disk until the results are written: a map of 500,000 points (14 MB), a mesh of a million faces
@@ -119,34 +118,34 @@ def open_run_folder(
 
     """
     place = Path(folder)
+    run = RunFolder(place)
     check_output(place, source)
     created = [path for path in (place, *place.parents) if not path.exists()]
     try:
         with locked_folder(place, _LOCK, "run"):
             try:
-                if resume is None:
-                    _check_no_checkpoint(RunFolder(place))
-                yield _prepare(RunFolder(place), reserve, bool(resume))
+                if resume is None and run.checkpoint.is_file():
+                    raise InputError(
+                        f"`{place}` contains a run that was killed after {frames_kept(run.checkpoint)}: add `--resume` "
+                        "to continue it, or `--no-resume` to start again"
+                    )
+                _prepare(run, reserve, bool(resume))
+                yield run
             finally:
-                _remove_stage_unless_needed(place / UNFINISHED)
+                _remove_stage_unless_needed(run.stage)
     finally:
         for path in created:
             if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
                 path.rmdir()
 
 
-def _check_no_checkpoint(run: RunFolder) -> None:
-    if run.checkpoint.is_file():
-        raise InputError(
-            f"`{run.folder}` contains a run that was killed after {frames_kept(run.checkpoint)}: add `--resume` to "
-            "continue it, or `--no-resume` to start again"
-        )
-
-
-def _prepare(run: RunFolder, reserve: int, resume: bool) -> RunFolder:
+def _prepare(run: RunFolder, reserve: int, resume: bool) -> None:
     """Make the stage: empty except for the checkpoint to resume from, with a note and the reserved space."""
     try:
-        _empty(run.stage, CHECKPOINT if resume else None)
+        kept = [run.checkpoint] if resume and run.checkpoint.is_file() else []
+        for path in run.stage.iterdir() if kept else [run.stage]:
+            if path not in kept:
+                _remove(path)
         run.stage.mkdir(exist_ok=True)
         write_text(
             run.stage / NOTE,
@@ -156,18 +155,7 @@ def _prepare(run: RunFolder, reserve: int, resume: bool) -> RunFolder:
             with (run.stage / _RESERVED).open("wb") as file:
                 _allocate(file.fileno(), reserve)
     except OSError as error:
-        _remove_stage_unless_needed(run.stage)
         raise not_written(run.folder, error, reserve) from None
-    return run
-
-
-def _empty(stage: Path, kept: str | None) -> None:
-    if kept is None or not (stage / kept).is_file():
-        _remove(stage)
-        return
-    for path in stage.iterdir():
-        if path.name != kept:
-            _remove(path)
 
 
 def _allocate(file: int, size: int) -> None:

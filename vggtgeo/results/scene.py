@@ -1,4 +1,4 @@
-"""Images, cameras and tracks of a run's views, for export to other programs.
+"""Images, cameras and tracks of a run's views, for export to other programs; depth of its frames.
 
 Views are the keyframes, or all frames. Files: `scene.npz`, `images/`, and `image-mask.png` if the undistorted images
 have invalid borders.
@@ -7,27 +7,35 @@ have invalid borders.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from vggtgeo.datasets import Frame
 from vggtgeo.datasets import Sequence as Frames
 from vggtgeo.geometry import rigid
-from vggtgeo.io.errors import InputError
+from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_picture
 from vggtgeo.io.persistence import Format, by_name
+from vggtgeo.mapping.depth_map import DepthMap
+from vggtgeo.mapping.frame_depth import FrameDepths
 from vggtgeo.mapping.tracks import Tracks, make_tracks
-from vggtgeo.results.reread_frames import reread_frames
+from vggtgeo.models.classical import SensorDepth
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.threads import map_in_threads
 
 MASK = "image-mask.png"
 JPEG_QUALITY = 95
+BATCH = 16
+"""Frames in memory at a time: a run keeps images of its keyframes only, so others are read a second time."""
 _TIME_TOLERANCE, _POSITION_TOLERANCE = 1e-5, 1e-4
 """Seconds, and relative length: the rounding of pose files."""
 
@@ -117,33 +125,9 @@ class Scene:
         """Load `scene.npz` of a run's folder; raise InputError if it is missing, invalid or of another version."""
         path = Path(folder) / "scene.npz"
         scene, _ = SCENE.read(path)
-        wrong = scene._invalid() if isinstance(scene, cls) else f"it holds a {type(scene).__name__}"
-        if wrong:
-            raise InputError(f"`{path}` is invalid ({wrong}); give a folder that `vggtgeo run` wrote")
-        found: Scene = scene
-        return found
-
-    def _invalid(self) -> str | None:
-        """Describe the first inconsistent array, if any: the programs that import an export do not check."""
-        tracks, views = self.tracks, len(self.frames)
-        arrays = {
-            "frames": (self.frames, (views,)),
-            "timestamps": (self.timestamps, (views,)),
-            "poses": (self.poses, (views, 4, 4)),
-            "intrinsics": (self.intrinsics, (4,)),
-            "points": (tracks.points, (len(tracks.points), 3)),
-            "colours": (tracks.colours, (len(tracks.points), 3)),
-            "point": (tracks.point, (len(tracks.point),)),
-            "view": (tracks.view, (len(tracks.point),)),
-            "pixel": (tracks.pixel, (len(tracks.point), 2)),
-        }
-        for name, (array, shape) in arrays.items():
-            if array.shape != shape or not np.isfinite(array).all():
-                return f"`{name}` is {array.dtype} of shape {array.shape}, must be finite, of shape {shape}"
-        for name, values, count in (("view", tracks.view, views), ("point", tracks.point, len(tracks))):
-            if len(values) and not 0 <= values.min() <= values.max() < count:
-                return f"`{name}` must be in [0, {count})"
-        return None
+        if not isinstance(scene, Scene):
+            raise InputError(f"`{path}` holds no scene; give a folder that `vggtgeo run` wrote")
+        return scene
 
 
 SCENE = Format("scene", 2, by_name((Scene, Tracks)))
@@ -183,3 +167,64 @@ def _other_frames(folder: Path, slam: Slam, scene: Scene, frames: Frames) -> Ite
 def _write_image(path: Path, image: np.ndarray) -> None:
     bgr = np.ascontiguousarray(image[..., ::-1])
     write_picture(path, bgr, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
+
+
+def reread_frames(slam: Slam, frames: Frames) -> Iterator[tuple[int, Frame]]:
+    """Yield each row of `slam.frames` with its frame, as read from `frames`; skip frames that cannot be read.
+
+    Raises:
+        InputError: the image size of `frames` differs from that of the run.
+
+    """
+    row_of = {record.frame: row for row, record in enumerate(slam.frames)}
+    if not row_of:
+        return
+    height, width = slam.keyframes[0].size
+    if (frames.camera.width, frames.camera.height) != (width, height):
+        raise InputError(
+            f"`frames` has images of {frames.camera.width} x {frames.camera.height} pixels, the run's are "
+            f"{width} x {height}; pass the frames that the run read"
+        )
+    numbers = sorted(row_of)
+    stride = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    with warnings.catch_warnings():  # the run has reported unreadable frames already
+        warnings.simplefilter("ignore", InputWarning)
+        for frame in frames.frames(numbers[0], numbers[-1] + 1, stride):
+            if frame.index in row_of:
+                yield row_of[frame.index], frame
+
+
+def depth_of_frames(
+    slam: Slam, depth_maps: Sequence[DepthMap | None], frames: Frames | None = None
+) -> Iterator[tuple[int, DepthMap | None]]:
+    """Yield frame number and depth of every frame, in the order of frames; see `FrameDepths`.
+
+    Args:
+        slam: state after the last adjustment.
+        depth_maps: dense depth of the keyframes.
+        frames: what the run read. Its depth images are undistorted as in the run and get the noise of a depth camera;
+            keyframe depth fills the rest. None: keyframe depth only.
+
+    Raises:
+        InputError: the image size of `frames` differs from that of the run.
+
+    """
+    depths, rows = FrameDepths(slam, depth_maps), iter(_sensor_depths(slam, frames))
+    while batch := list(islice(rows, BATCH)):
+        found = map_in_threads(lambda pair: depths.of(*pair), batch)
+        yield from ((slam.frames[row].frame, depth) for (row, _), depth in zip(batch, found, strict=True))
+
+
+def _sensor_depths(slam: Slam, frames: Frames | None) -> Iterator[tuple[int, DepthMap | None]]:
+    """Yield rows of `slam.frames`, each with the frame's depth image, undistorted."""
+    left = set(range(len(slam.frames)))
+    if frames is not None and frames.has_depth and slam.metric:
+        undistorter, sensor = (slam.camera.lens or frames.camera).undistorter(), SensorDepth()
+        for row, frame in reread_frames(slam, frames):
+            left.remove(row)
+            depth = None
+            if frame.depth is not None:
+                found = sensor.estimate(frame.image, undistorter.depth(frame.depth))
+                depth = DepthMap(found.depth, found.sigma_rel, found.confidence)
+            yield row, depth
+    yield from ((row, None) for row in sorted(left))

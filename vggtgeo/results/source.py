@@ -60,6 +60,11 @@ class Source:
     def has_depth(self) -> bool:
         return self.frames.has_depth
 
+    @property
+    def length(self) -> int | None:
+        """Number of frames; None for a stream or a live camera."""
+        return None if isinstance(self.frames, FrameStream) else len(self.frames) or None
+
     def check(self, start: int, end: int | None, stride: int) -> None:
         """Raise InputError for an invalid selection, or images too small for features, before anything is compiled."""
         if min(self.camera.width, self.camera.height) < MIN_SIDE:
@@ -68,21 +73,19 @@ class Source:
             raise InputError(
                 f"the images of `{self.name}` are {read} pixels{smaller}; both sides must be at least {MIN_SIDE}"
             )
-        length = sys.maxsize if isinstance(self.frames, FrameStream) else len(self.frames) or sys.maxsize
-        check_selection(self.name, length, start, end, stride)
+        check_selection(self.name, self.length or sys.maxsize, start, end, stride)
 
     def identity(self, selection: tuple[int, int | None, int]) -> dict[str, Any]:
         """Return what distinguishes this source from others before a frame is read."""
-        length = None if isinstance(self.frames, FrameStream) else len(self.frames)
         size = f"{self.camera.width} x {self.camera.height}"
         return {
-            **{"name": self.name, "frames": length, "size": size, "camera": self.camera},
+            **{"name": self.name, "frames": self.length, "size": size, "camera": self.camera},
             **{"depth": self.has_depth, "start, end, stride": selection},
         }
 
     def resumable(self, asked: Checkpoints | None) -> Checkpoints | None:
         """Return `asked`; raise InputError if it resumes a stream, whose frames cannot be read again."""
-        if asked is not None and asked.resume and self.count(0, None, 1) is None:
+        if asked is not None and asked.resume and self.length is None:
             raise InputError(f"`{self.name}` is a stream, whose frames cannot be read again: it cannot be resumed")
         return asked
 
@@ -110,12 +113,9 @@ class Source:
 
     def count(self, start: int, end: int | None, stride: int) -> int | None:
         """Return the number of frames of a selection; None for a stream."""
-        if isinstance(self.frames, FrameStream):
+        if self.length is None:
             return None
-        length = len(self.frames)
-        if not length:  # a live camera
-            return None
-        return len(range(start, length if end is None else min(length, end), stride))
+        return len(range(start, self.length if end is None else min(self.length, end), stride))
 
 
 def open_source(

@@ -89,7 +89,7 @@ def summarise(
         "notes": list(slam.notes),
         **counts,
     }
-    return values if report is None else {**values, "truth": {**report.as_dict(), "in_metres": truth_in_metres}}
+    return values if report is None else {**values, "truth": {**report.to_dict(), "in_metres": truth_in_metres}}
 
 
 def _pose_sigma(slam: Slam) -> dict[str, Any]:
@@ -165,25 +165,19 @@ def read_summary(folder: Path) -> tuple[dict[str, Any], Verdict]:
     """Return summary and verdict of the run in `folder`; raise InputError if the file is missing or invalid."""
     try:
         summary = json.loads(whole_text(folder / "summary.json", errors="strict"))
+        summary["intrinsics"] = {name: float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy")}
         return summary, Verdict.from_dict(summary["verdict"], summary["scale"] == "metric")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise summary_error(folder, error) from None
-
-
-def summary_error(folder: Path, error: Exception) -> InputError:
-    """Return the InputError for a summary whose reading raised `error`."""
-    return InputError(
-        f"`summary.json` in `{folder}` is invalid ({describe_error(error)}); give a folder that `vggtgeo run` wrote"
-    )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"`summary.json` in `{folder}` is invalid ({describe_error(error)}); give a folder that `vggtgeo run` wrote"
+        ) from None
 
 
 def describe_error(error: Exception) -> str:
     """Describe why a JSON file is invalid: the messages of Python's own exceptions do not name its entries."""
     if isinstance(error, KeyError):
         return f"`{error.args[0]}` is missing"
-    if isinstance(error, TypeError | AttributeError):
-        return "an entry has the wrong type"
-    return "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
+    return "an entry has the wrong type" if isinstance(error, TypeError | AttributeError) else str(error)
 
 
 POSES = {"trajectory.txt": "poses", "keyframes.txt": "keyframes"}
@@ -203,9 +197,9 @@ def warn_if_truncated(file: Path, poses: Trajectory) -> Trajectory:
     try:
         largest = json.loads(whole_text(file.with_name("summary.json"), errors="strict"))["submaps"][0]
         count = largest[POSES[file.name]]
-    except (ValueError, LookupError, TypeError, RecursionError):  # not a run's, or without the number
+    except (ValueError, LookupError, TypeError):  # not a run's, or without the number
         return poses
-    if type(count) is int and count != len(poses):
+    if count != len(poses):
         warnings.warn(
             f"`{file}` has {len(poses)} poses, expected {count} from `summary.json`: it is truncated or was edited; "
             "used as it is",

@@ -63,15 +63,6 @@ def read_only(frame: Frame) -> Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
-    """The state after the last tracked frame."""
-
-    slam: Slam
-    interrupted: bool
-    frames_per_second: float
-
-
-@dataclass(frozen=True, eq=False)
 class TrackingLoop:
     """The loop over frames.
 
@@ -107,8 +98,11 @@ class TrackingLoop:
         finally:
             writer.close()
 
-    def track(self, writer: CheckpointWriter | None) -> Tracked:
-        """Track all frames; Ctrl-C ends the loop after a whole frame, or at once while it waits for one."""
+    def track(self, writer: CheckpointWriter | None) -> tuple[Slam, bool, float]:
+        """Track all frames; return the state after the last one, whether Ctrl-C ended the loop, and frames per second.
+
+        Ctrl-C ends the loop after a whole frame, or at once while it waits for one.
+        """
         known = self.first if self.before is None else self.before.slam
         slam, frame, interrupted = known, None, False
         self.hooks.each("on_begin", self.source.name, self.source.count(*self.selection))
@@ -140,7 +134,7 @@ class TrackingLoop:
             writer.on_end(slam, frame)
         slam = merge_pending_window(slam)
         earlier = 0.0 if self.before is None else self.before.tracking
-        return Tracked(slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began))
+        return slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began)
 
     def _frames(self, writer: CheckpointWriter | None) -> tuple[list[Frame], Iterator[Frame]]:
         """Return the last two frames of the resumed run, if any, and the frames that are left."""

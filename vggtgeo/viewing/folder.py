@@ -15,8 +15,8 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
+from vggtgeo.results.output_checks import check_can_be_shown
 from vggtgeo.results.summary import load_poses
-from vggtgeo.results.unfinished import check_can_be_shown
 from vggtgeo.viewing import entities
 from vggtgeo.viewing.target import STAND_IN
 

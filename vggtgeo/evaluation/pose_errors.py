@@ -1,28 +1,74 @@
-"""Relative pose error (RPE; RTE and RRE of each pair): error of the motion over a given delta.
+"""Errors of matched trajectories: absolute (ATE) and relative (RPE; RTE and RRE of each pair).
 
-For poses `Q` (truth) and `P` (estimate), camera -> world, the error of the pair (i, j) is the motion
+ATE: distance of the camera centres from the ground truth after alignment.
+
+RPE: for poses `Q` (truth) and `P` (estimate), camera -> world, the error of the pair (i, j) is the motion
 `E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; the length of its translation is the RTE, the angle of its rotation the RRE, and the
 RPE is their root mean square. No alignment is needed; a reconstruction of free scale must be scaled before.
+
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
 """
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from vggtgeo.evaluation.absolute import ErrorStatistics
-from vggtgeo.evaluation.association import check_trajectories
+from vggtgeo.evaluation.alignment import VERTICAL, Alignment, Similarity, align
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, check_real, real_array
+from vggtgeo.io.given import check_real
 
 Unit = Literal["poses", "seconds", "metres"]
 UNITS: tuple[Unit, ...] = get_args(Unit)
 _MAX_POSES = 2**31
 PATH_TOLERANCE = 0.1
 """Share of a delta in seconds or metres by which overlapping pairs may miss it; evo's default."""
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Statistics of `count` non-negative errors, in their unit; NaN if there are none."""
+
+    rmse: float
+    mean: float
+    median: float
+    maximum: float
+    count: int
+
+    @classmethod
+    def of(cls, errors: Float[np.ndarray, " n"]) -> Self:
+        """Return the statistics of `errors` [n]."""
+        if len(errors) == 0:
+            return cls(np.nan, np.nan, np.nan, np.nan, 0)
+        rmse = float(np.sqrt(np.mean(np.square(errors))))
+        return cls(rmse, float(errors.mean()), float(np.median(errors)), float(errors.max()), len(errors))
+
+
+@dataclass(frozen=True, eq=False)
+class AbsoluteError:
+    """Fields: errors float64 [n], metres, one per pose; alignment of the estimate to the ground truth."""
+
+    errors: Float[np.ndarray, " n"]
+    alignment: Similarity
+
+    @property
+    def statistics(self) -> ErrorStatistics:
+        """Statistics of the errors, metres; `rmse` is the ATE."""
+        return ErrorStatistics.of(self.errors)
+
+
+def absolute_error(
+    estimate: Trajectory,
+    truth: Trajectory,
+    alignment: Alignment = "se3",
+    vertical: tuple[float, float, float] = VERTICAL,
+) -> AbsoluteError:
+    """Return the ATE of matched trajectories (see `associate`) after an `alignment` (see `align`)."""
+    motion = align(estimate, truth, alignment, vertical)
+    difference = motion.points(estimate.positions) - truth.positions
+    return AbsoluteError(np.linalg.norm(difference, axis=1), motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,15 +78,12 @@ class RelativeError:
     Fields:
         translation: float64 [m], metres (RTE).
         rotation: float64 [m], radians (RRE).
-        direction: float64 [m], angle between the translation directions, radians, independent of scale; NaN if one of
-            the translations is zero.
         delta: distance of the two poses of a pair, in `unit`.
         unit: "poses", "seconds", or "metres" of the true path.
     """
 
     translation: Float[np.ndarray, " m"]
     rotation: Float[np.ndarray, " m"]
-    direction: Float[np.ndarray, " m"]
     delta: float
     unit: Unit = "poses"
 
@@ -68,22 +111,15 @@ def relative_error(
     Pairs are consecutive, (0, delta), (delta, 2 delta), ..., as in evo; with `all_pairs` they overlap: (0, delta),
     (1, 1 + delta), ... In seconds and metres a pair ends with the first pose at least `delta` later; overlapping pairs
     with the nearest one, if it is within a tenth of delta. A trajectory shorter than delta gives empty arrays.
-    InputError if the lengths differ, or `delta` or `unit` is invalid.
+    InputError if `delta` or `unit` is invalid.
     """
-    check_trajectories(estimate, truth)
-    if len(estimate) != len(truth):
-        raise InputError(
-            f"`estimate` has {len(estimate)} poses, `truth` {len(truth)}; match them first with `associate`"
-        )
-    check_kind("all_pairs", all_pairs, bool | np.bool_, "True or False")
     first, second = pairs(truth, delta, all_pairs, unit)
-    estimated = _motion(estimate.poses[first], estimate.poses[second])
-    true = _motion(truth.poses[first], truth.poses[second])
-    error = _motion(true, estimated)
+    error = _motion(
+        _motion(truth.poses[first], truth.poses[second]), _motion(estimate.poses[first], estimate.poses[second])
+    )
     return RelativeError(
         translation=np.linalg.norm(error[:, :3, 3], axis=1),
         rotation=rotation_angle(error[:, :3, :3]),
-        direction=_angle_between(estimated[:, :3, 3], true[:, :3, 3]),
         delta=delta,
         unit=unit,
     )
@@ -135,7 +171,6 @@ def _overlapping(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]
 
 def rotation_angle(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
     """Return the angle of each rotation, radians in [0, pi]; accurate near 0 and pi, unlike an arc cosine."""
-    rotations = real_array("rotations", rotations, (None, 3, 3))
     skew = rotations - rotations.swapaxes(1, 2)
     sine = np.sqrt(skew[:, 2, 1] ** 2 + skew[:, 0, 2] ** 2 + skew[:, 1, 0] ** 2)
     return np.arctan2(sine, np.trace(rotations, axis1=1, axis2=2) - 1.0)
@@ -147,9 +182,3 @@ def _motion(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     motion[:, :3, :3] = transposed @ end[:, :3, :3]
     motion[:, :3, 3] = np.einsum("nij,nj->ni", transposed, end[:, :3, 3] - start[:, :3, 3])
     return motion
-
-
-def _angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    sine, cosine = np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)
-    moving = (np.linalg.norm(a, axis=1) > 0) & (np.linalg.norm(b, axis=1) > 0)
-    return np.where(moving, np.arctan2(sine, cosine), np.nan)
