@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 
 from vggtgeo.benchmark.suite import WalkTable
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence, without_depth
@@ -24,7 +25,6 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
-from vggtgeo.io.locks import locked
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry
 from vggtgeo.models.roles import InitialGeometry
 from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
@@ -129,7 +129,7 @@ def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> Rend
     if scratch is None:
         return _render(table, seed)
     kept = scratch / walk_name(table, seed)
-    with locked(kept.with_suffix(".lock"), timeout=-1):  # of the runs on one walk, one renders it
+    with FileLock(kept.with_suffix(".lock")):  # of the runs on one walk, one renders it
         if not kept.is_file():
             with atomic_open(kept, "wb") as stream:
                 pickle.dump(_render(table, seed), stream, pickle.HIGHEST_PROTOCOL)
