@@ -416,7 +416,7 @@ def is_finite(system: ArrowSystem) -> Bool[Array, ""]:
     return finite[0] & finite[1] & landmarks
 
 
-def unless(finite: Bool[Array, ""], tree: _Tree) -> _Tree:
+def nan_unless_finite(finite: Bool[Array, ""], tree: _Tree) -> _Tree:
     """Return the floats of a pytree, or NaN if its linearisation is not finite: zeros would look like a result."""
-    spoilt = lambda leaf: jnp.where(finite, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
-    return jax.tree.map(spoilt, tree)
+    or_nan = lambda leaf: jnp.where(finite, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
+    return jax.tree.map(or_nan, tree)

@@ -25,7 +25,8 @@ import jax.scipy as jsp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from vggtgeo.solvers.arrow import ArrowSystem, carry_to_nodes, dense_gradient, inverse_landmark_hessian
-from vggtgeo.solvers.assembly import (
+from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, pins
+from vggtgeo.solvers.schur_complement import (
     AbstractLayout,
     Blocks,
     add_prior_blocks,
@@ -33,7 +34,6 @@ from vggtgeo.solvers.assembly import (
     assemble_hosts,
     schur_products_of_hosts,
 )
-from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, pins
 
 
 class BandLayout(AbstractLayout):

@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem
-from vggtgeo.solvers.assembly import AbstractLayout, Blocks, assemble
+from vggtgeo.solvers.schur_complement import AbstractLayout, Blocks, assemble
 
 
 class SparseLayout(AbstractLayout):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vggtgeo.solvers.assembly import dense_schur_complement
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 import vggtgeo as vg
 from vggtgeo.bundle.linearise import energy_gradient, linearise

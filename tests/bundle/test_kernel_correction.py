@@ -11,9 +11,9 @@ import pytest
 from arrow_systems import dense_matrix, zero_step
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene
-from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.graduation import Graduation

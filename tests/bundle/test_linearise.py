@@ -12,7 +12,7 @@ from priors import prior_on
 from scenes import make_scene, matrix
 from scipy.linalg import expm
 from vggtgeo.solvers.arrow import ArrowVector
-from vggtgeo.solvers.assembly import dense_schur_complement
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.problem import Problem, State

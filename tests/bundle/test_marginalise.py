@@ -13,8 +13,8 @@ import pytest
 from scenes import make_scene
 from vggtgeo.solvers.adjoint import exact_model
 from vggtgeo.solvers.arrow import ArrowVector
-from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.kernels import Square
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 import vggtgeo as vg
 from vggtgeo.bundle.analysis.observability import symmetric_eigen

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from reported import raises
 from scenes import Scene, make_scene
-from vggtgeo.solvers.assembly import Reduced, dense_schur_complement
+from vggtgeo.solvers.schur_complement import Reduced, dense_schur_complement
 
 import vggtgeo as vg
 from vggtgeo.bundle.linearise import linearise

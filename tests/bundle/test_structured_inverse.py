@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint, exact_model
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
-from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.intrinsics import Intrinsics

@@ -110,7 +110,7 @@ def test_the_unit_of_a_recording_is_found(walk: Walk) -> None:
     """Its lengths are 1.05 of the map's: the unit is the inverse; oracle: the scale that the recording was given."""
     truth = walk[2]
     found = compare(RecordedPoses(_disturbed(truth)), _ties(truth, 0.003, np.random.default_rng(0)))
-    assert found.believed
+    assert found.accepted
     assert found.unit is not None
     assert abs(found.unit * 1.05 - 1) < 0.02
 
@@ -124,11 +124,11 @@ def test_wrongly_tracked_motions_do_not_decide(walk: Walk) -> None:
         replace(tie, pose=rigid.exponential(rng.normal(size=6) * 0.3) @ tie.pose) if row in wrong else tie
         for row, tie in enumerate(known.odometry_factors)
     ]
-    assert compare(RecordedPoses(_disturbed(truth)), replace(known, factors=tuple(factors))).believed
+    assert compare(RecordedPoses(_disturbed(truth)), replace(known, factors=tuple(factors))).accepted
 
 
 def test_motions_of_any_other_time_are_no_evidence(walk: Walk) -> None:
-    """Recordings of the same motions in another order are believed in one run of 10,000 (Ville's inequality): in none
+    """Recordings of the same motions in another order are accepted in one run of 10,000 (Ville's inequality): in none
     of 100 here. The mean of the ratio of likelihoods is at most 1 to within its spread.
     """
     truth, rng = walk[2], np.random.default_rng(2)
@@ -146,13 +146,13 @@ def test_motions_of_any_other_time_are_no_evidence(walk: Walk) -> None:
 
 
 def test_motions_that_are_all_alike_tell_nothing(walk: Walk) -> None:
-    """On a straight way at one speed the recording is neither believed nor contradicted, though every motion agrees."""
+    """On a straight way at one speed the recording is neither accepted nor contradicted, though every motion agrees."""
     truth = walk[2]
     poses = np.tile(np.eye(4), (len(truth), 1, 1))
     poses[:, 2, 3] = 0.2 * np.arange(len(truth))
     straight = Trajectory(truth.timestamps, poses)
     found = compare(RecordedPoses(straight), _ties(straight, 0.003, np.random.default_rng(0)))
-    assert not found.believed
+    assert not found.accepted
     assert not found.contradicted
 
 

@@ -37,8 +37,8 @@ from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.io.kept_program import KeptProgram
-from vggtgeo.solvers.arrow import is_finite, unless
-from vggtgeo.solvers.assembly import dense_schur_complement
+from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 _MAX_KEYFRAMES = 1000
 """Largest number of keyframes of a prior, whose matrix is dense: 0.3 GB."""
@@ -98,7 +98,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     # Known exactly, hence conditioned on; eliminating them would treat them as unknown.
     held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics.reshape(-1)])
     quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
-    root, offset = unless(finite, square_root(quadratic, gradient))
+    root, offset = nan_unless_finite(finite, square_root(quadratic, gradient))
     return MarginalPrior(
         root=root, offset=offset, poses=point.poses, intrinsics=point.parameters, weight=jnp.ones_like(offset, shape=())
     )

@@ -60,7 +60,7 @@ def recorded_prior(slam: Slam, roles: Roles) -> RecordedPrior | None:
     if roles.recorded is None:
         return None
     found = compare(roles.recorded, slam.map)
-    return RecordedPrior(roles.recorded, found.unit) if found.believed and found.unit is not None else None
+    return RecordedPrior(roles.recorded, found.unit) if found.accepted and found.unit is not None else None
 
 
 def last_placed(slam: Slam) -> FramePose | None:
@@ -75,4 +75,4 @@ def prior_summary(slam: Slam, roles: Roles) -> dict[str, Any]:
     if roles.recorded is None:
         return {}
     found = compare(roles.recorded, slam.map)
-    return {"pose_prior": {"used": found.believed, **asdict(found)}}
+    return {"pose_prior": {"used": found.accepted, **asdict(found)}}

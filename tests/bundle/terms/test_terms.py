@@ -20,8 +20,8 @@ from priors import prior_on
 from reported import raises
 from scenes import make_scene
 from scipy.spatial.transform import Rotation
-from vggtgeo.solvers.assembly import dense_schur_complement
 from vggtgeo.solvers.kernels import Barron, Cauchy, Square
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment

@@ -10,7 +10,7 @@ import pytest
 from arrow_systems import dense_matrix, zero_step
 from jax.flatten_util import ravel_pytree
 from own_terms import with_own_terms
-from vggtgeo.solvers.assembly import dense_schur_complement
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment

@@ -66,7 +66,7 @@ def test_a_lens_is_found() -> None:
     found = found_in(bent(window, -0.15, 0.05), 1.1)
     f, _, cx, cy = found.camera.intrinsics
     assert f == pytest.approx(window.intrinsics[0], rel=0.01)
-    assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.camera}"
+    assert found.is_significant, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.camera}"
     corner = np.hypot(cx, cy) / f
     drawn = lambda k1, k2, r: f * r * (k1 * r**2 + k2 * r**4)
     inside = np.linspace(0, 0.7 * corner, 20)
@@ -80,7 +80,7 @@ def test_a_lens_is_found() -> None:
 def test_no_lens_is_found_where_there_is_none() -> None:
     # Proves that noise alone is no lens, in six windows. Oracle: the pinhole that they were drawn with.
     found = [found_in(vg.simulate_window(seed=seed, **WINDOW), 1.1) for seed in range(6)]
-    assert not any(each.pays for each in found), [(each.gain, each.needed, each.camera) for each in found]
+    assert not any(each.is_significant for each in found), [(each.gain, each.needed, each.camera) for each in found]
 
 
 def test_an_adjustment_that_ends_in_no_camera_is_no_lens() -> None:

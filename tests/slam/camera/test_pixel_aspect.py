@@ -68,7 +68,7 @@ def test_squeezed_images_have_two_focal_lengths() -> None:
     # drawn with, resized.
     window, squeeze = rolling(1), 0.75
     found = found_in(bent(window, 0.0, 0.0, squeeze=squeeze), squeeze)
-    assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.state.intrinsics}"
+    assert found.is_significant, f"gain {found.gain:.4f}, needed {found.needed:.4f}, {found.state.intrinsics}"
     assert found.stretch == pytest.approx(np.log(squeeze), abs=0.005)
     fx, fy, cx, _ = window.intrinsics
     np.testing.assert_allclose(found.state.intrinsics[:2], [squeeze * fx, fy], rtol=0.01)
@@ -79,13 +79,13 @@ def test_squeezed_images_have_two_focal_lengths() -> None:
 def test_square_pixels_stay_square() -> None:
     # Proves that noise alone makes no second focal length, in six windows. Oracle: the one that they were drawn with.
     found = [found_in(rolling(seed), 1.0) for seed in range(6)]
-    assert not any(each.pays for each in found), [(each.gain, each.needed, each.stretch) for each in found]
+    assert not any(each.is_significant for each in found), [(each.gain, each.needed, each.stretch) for each in found]
 
 
 def test_a_level_path_tells_no_aspect() -> None:
     # Proves that a stretch that any stretch of the heights makes up for is not taken. Oracle: the gain of nothing.
     squeezed = bent(vg.simulate_window(seed=1, **WINDOW), 0.0, 0.0, squeeze=0.75)
-    assert not found_in(squeezed, 0.75).pays
+    assert not found_in(squeezed, 0.75).is_significant
 
 
 def test_what_ends_in_no_camera_is_none() -> None:

@@ -53,7 +53,7 @@ def test_a_wrong_camera_is_mended(seed: int) -> None:
     window = vg.simulate_window(seed=seed, **WINDOW)
     wrong = window.intrinsics * np.array([1.02, 1.02, 1.0, 1.0])
     found = trial(window, wrong)
-    assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, wanted {found.wanted}"
+    assert found.is_significant, f"gain {found.gain:.4f}, needed {found.needed:.4f}, wanted {found.wanted}"
     left = np.abs(found.wanted - window.intrinsics)
     assert left[0] < 0.01 * window.intrinsics[0], found.wanted
     assert left[2:].max() < 1.0, found.wanted
@@ -65,7 +65,7 @@ def test_a_wrong_camera_is_mended(seed: int) -> None:
 def test_a_right_camera_is_left_alone() -> None:
     # Proves that noise alone does not pay: of six windows with the true camera, none moves it. Oracle: the truth.
     trials = [trial(window, window.intrinsics) for window in (vg.simulate_window(seed=s, **WINDOW) for s in range(6))]
-    assert not any(each.pays for each in trials), [(each.gain, each.needed, each.wanted) for each in trials]
+    assert not any(each.is_significant for each in trials), [(each.gain, each.needed, each.wanted) for each in trials]
 
 
 def test_what_the_pairs_do_not_tell_stays() -> None:
@@ -74,7 +74,7 @@ def test_what_the_pairs_do_not_tell_stays() -> None:
     given = window.intrinsics * np.array([1.01, 1.01, 1.0, 1.0])
     found = trial(window, given)
     np.testing.assert_allclose(found.wanted, given, rtol=1e-6)
-    assert not found.pays
+    assert not found.is_significant
 
 
 def with_the_map(window: vg.data.SimulatedWindow, factor: float) -> RefinedCamera:
@@ -93,7 +93,7 @@ def test_a_wrong_camera_is_mended_without_measured_depth(factor: float) -> None:
     # Proves that a focal length 2 or 3 % off is found to 1 %, and that it pays. Oracle: the camera of the window.
     window = vg.simulate_window(seed=0, **WINDOW)
     found = with_the_map(window, factor)
-    assert found.pays, f"gain {found.gain:.4f}, needed {found.needed:.4f}, wanted {found.wanted}"
+    assert found.is_significant, f"gain {found.gain:.4f}, needed {found.needed:.4f}, wanted {found.wanted}"
     np.testing.assert_allclose(found.wanted[:2], window.intrinsics[:2], rtol=0.01)
     np.testing.assert_allclose(found.wanted[2:], window.intrinsics[2:], atol=1.5)
 
@@ -102,7 +102,7 @@ def test_a_wrong_camera_is_mended_without_measured_depth(factor: float) -> None:
 def test_a_right_camera_is_left_alone_without_measured_depth() -> None:
     # Proves that noise alone does not pay there either. Oracle: the truth, in six windows.
     found = [with_the_map(vg.simulate_window(seed=seed, **WINDOW), 1.0) for seed in range(6)]
-    assert not any(each.pays for each in found), [(each.gain, each.needed, each.wanted) for each in found]
+    assert not any(each.is_significant for each in found), [(each.gain, each.needed, each.wanted) for each in found]
 
 
 def test_a_lens_that_nobody_told_of_is_no_focal_length() -> None:

@@ -24,7 +24,7 @@ from vggtgeo.slam.camera.rolling_shutter import (
     find_readout,
     image_shift,
     pair_to_global_shutter,
-    without_readout,
+    problem_to_global_shutter,
 )
 from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
@@ -110,7 +110,7 @@ def test_a_rolling_shutter_is_found_and_taken_out(seconds: float, columns: bool)
     problem, start, _ = with_readout(motions, seconds, columns).pack()
     state = adjusted(problem, start)
     found = find_readout(problem, state, motions, (HEIGHT, WIDTH), LONGEST, adjusted)
-    assert found.pays, (found.gain, found.needed)
+    assert found.is_significant, (found.gain, found.needed)
     assert found.readout.columns == columns
     assert found.readout.seconds == pytest.approx(seconds, rel=0.05)
     before, after = (np.sqrt(np.mean(WINDOW.errors(one) ** 2)) for one in (state, found.state))
@@ -123,7 +123,7 @@ def test_what_is_taken_out_is_what_the_motion_put_in() -> None:
     at_once, _, _ = WINDOW.pack()
     problem, _, _ = with_readout(motions, seconds).pack()
     truth = WINDOW.truth()
-    repaired = without_readout(problem, truth, motions, (HEIGHT, WIDTH), Readout(seconds, False, 0.0))
+    repaired = problem_to_global_shutter(problem, truth, motions, (HEIGHT, WIDTH), Readout(seconds, False, 0.0))
     for name in ("points", "lines"):
         expected, wrong, right = (np.asarray(residuals_at(p, truth)[name]) for p in (at_once, problem, repaired))
         assert np.abs(wrong - expected).max() > 3.0
@@ -183,7 +183,7 @@ def test_images_that_are_read_at_once_have_none() -> None:
         state = adjusted(problem, start)
         for motions in (some_motions(seed), np.zeros((KEYFRAMES, 6))):
             found = find_readout(problem, state, motions, (HEIGHT, WIDTH), LONGEST, adjusted)
-            assert found is None or not found.pays or found.readout.shift < 0.1
+            assert found is None or not found.is_significant or found.readout.shift < 0.1
 
 
 def test_the_motion_of_a_keyframe_is_that_between_its_neighbours() -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from vggtgeo.solvers.assembly import dense_schur_complement
+from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 from vggtgeo.bundle.linearise import free_coordinates, linearise
 from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit

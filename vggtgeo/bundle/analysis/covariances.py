@@ -31,7 +31,7 @@ from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.io.readable import Readable
-from vggtgeo.solvers.arrow import is_finite, unless
+from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.flat_directions import flat_stiffness
 from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
@@ -215,7 +215,7 @@ def _covariances_jit(
         parameters=problem.parameter_names,
         scale_is_free=jnp.any(flat_stiffness(system) > 0),
     )
-    return unless(is_finite(system), known)
+    return nan_unless_finite(is_finite(system), known)
 
 
 def variance_factor(problem: Problem, state: State, rank: Int[Array, ""]) -> Float[Array, ""]:

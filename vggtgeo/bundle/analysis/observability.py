@@ -49,11 +49,11 @@ from vggtgeo.solvers.arrow import (
     inverse_landmark_hessian,
     is_finite,
     join_landmarks,
-    unless,
+    nan_unless_finite,
 )
-from vggtgeo.solvers.assembly import Blocks, Reduced, dense_schur_complement
 from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
 from vggtgeo.solvers.local_inverse import balance, rank_tolerance
+from vggtgeo.solvers.schur_complement import Blocks, Reduced, dense_schur_complement
 
 DENSE_KEYFRAMES = 300
 """Largest number of keyframes for full spectra: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
@@ -109,7 +109,7 @@ def _observability_jit(problem: Problem, state: State) -> Observability:
     # One after the other: all matrices at once would take `2 k + 1` times the memory.
     spectra = jax.lax.map(lambda keep: _spectrum(combined(keep), coordinates), _selections(len(systems), state))
     found = _found(problem, state, systems, everything, coordinates, spectra)
-    return unless(is_finite(everything), found)
+    return nan_unless_finite(is_finite(everything), found)
 
 
 def _selections(count: int, state: State) -> Float[Array, "m k"]:

@@ -78,7 +78,7 @@ class RefinedCamera:
     needed: float = float("inf")
 
     @property
-    def pays(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the new camera predicts held-out matches significantly better than the given one."""
         return self.state is not None and self.gain > self.needed
 

@@ -75,7 +75,7 @@ class FoundLens:
     warp: float
 
     @property
-    def pays(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the distortion is significant and large enough to remove."""
         return self.gain > self.needed and MIN_WARP < self.warp < float("inf")
 

@@ -46,7 +46,7 @@ class FoundAspect:
     needed: float
 
     @property
-    def pays(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the pixels are significantly not square."""
         return self.gain > self.needed and abs(self.stretch) > MIN_STRETCH
 

@@ -60,7 +60,7 @@ class FoundReadout:
     needed: float
 
     @property
-    def pays(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the rolling shutter is significant."""
         return self.gain > self.needed
 
@@ -147,7 +147,7 @@ def pair_to_global_shutter(
     )
 
 
-def without_readout(
+def problem_to_global_shutter(
     problem: Problem, state: State, motions: np.ndarray, size: tuple[int, int], readout: Readout
 ) -> Problem:
     """Return the problem corrected for a known readout; state: an estimate of the map."""

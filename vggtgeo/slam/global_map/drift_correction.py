@@ -57,8 +57,10 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     motions, closing = odometry(slam)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     drifted = [loop for loop in loops if not loop.agrees(slam)]
-    torn = [tie for tie in closing if squared_distance(tie, poses) > LOOP_GATE and _pixels(tie, slam) > MAX_LOOP_ERROR]
-    if not drifted and not torn:
+    broken = [
+        tie for tie in closing if squared_distance(tie, poses) > LOOP_GATE and _pixels(tie, slam) > MAX_LOOP_ERROR
+    ]
+    if not drifted and not broken:
         return slam, list(loops)
     measured = (*closing, *(loop.motion for loop in loops))
     graph = _graph(slam, motions, measured, _units(slam, motions, loops))
@@ -76,8 +78,8 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     moved = at_poses(_without(slam, dropped), found.poses, units)
     # A loop that took no part (refused, or alone) is used where the corrected map agrees with it.
     own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
-    believed = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
-    return _noted(moved, len(loops) - len(believed), len(loops), slam), believed
+    accepted = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
+    return _noted(moved, len(loops) - len(accepted), len(loops), slam), accepted
 
 
 def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelativePose]]:

@@ -23,7 +23,7 @@ from vggtgeo.slam.camera.given_camera import (
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair
 from vggtgeo.slam.camera.pixel_aspect import are_square, aspect_prior, find_aspect
-from vggtgeo.slam.camera.rolling_shutter import find_readout, without_readout
+from vggtgeo.slam.camera.rolling_shutter import find_readout, problem_to_global_shutter
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
 from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS, GlobalShape, global_solver, shape_of
@@ -140,7 +140,7 @@ class _SharedByRounds:
         problem = without_surfaces(adjustment.problem) if finds_camera else adjustment.problem
         problem, gauge = with_one_gauge(problem, adjustment.initial, len(slam.keyframes), slam.metric)
         notes = gauge_notes(gauge, adjustment.keyframes, "global adjustment")
-        return _without_readout(slam, replace(adjustment, problem=problem)), notes
+        return _to_global_shutter(slam, replace(adjustment, problem=problem)), notes
 
     def try_camera(
         self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings, *, last: bool
@@ -171,14 +171,15 @@ def _solved(problem: Problem, state: State) -> State:
     return solve_jit(problem, state, global_solver(problem)).state
 
 
-def _without_readout(slam: Slam, adjustment: Adjustment) -> Adjustment:
+def _to_global_shutter(slam: Slam, adjustment: Adjustment) -> Adjustment:
     """Return the adjustment with matches corrected to global shutter if a readout time is known."""
     if slam.camera.readout is None:
         return adjustment
     problem, initial = adjustment.problem, adjustment.initial
     motions = camera_motions(slam, problem.num_keyframes)
     return replace(
-        adjustment, problem=without_readout(problem, initial, motions, slam.keyframes[0].size, slam.camera.readout)
+        adjustment,
+        problem=problem_to_global_shutter(problem, initial, motions, slam.keyframes[0].size, slam.camera.readout),
     )
 
 
@@ -191,7 +192,7 @@ def _try_rolling_shutter(
     motions = camera_motions(slam, adjustment.problem.num_keyframes)
     size, longest = slam.keyframes[0].size, frame_interval(slam)
     found = find_readout(adjustment.problem, state, motions, size, longest, _solved)
-    if found is None or not found.pays:
+    if found is None or not found.is_significant:
         return slam, adjustment, state
     adjustment = replace(adjustment, problem=found.problem)
     slam = _apply_solution(slam, adjustment, found.state)
@@ -231,7 +232,7 @@ def _try_pixel_aspect(slam: Slam, adjustment: Adjustment, state: State, solve: S
     if not adjustment.problem.shared_focal:
         return slam, adjustment, state
     found = find_aspect(adjustment.problem, state, solve)
-    if found is None or not found.pays:
+    if found is None or not found.is_significant:
         return slam, adjustment, state
     adjustment = replace(adjustment, problem=found.problem)
     slam = _apply_solution(slam, adjustment, found.state)
@@ -278,7 +279,7 @@ def _apply_refined_camera(
         return slam
     notes = [*slam.notes, *_lens_note(found, slam.keyframes[0].size)]
     always = settings.camera.refine_intrinsics == "always"
-    if found.state is not None and (found.pays or always):
+    if found.state is not None and (found.is_significant or always):
         slam = _apply_solution(slam, adjustment, found.state)
         if found.change > REPORTED_CHANGE:
             cameras = [", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted)]
@@ -289,7 +290,7 @@ def _apply_refined_camera(
 
 def _apply_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
     """Return the state with its distortion removed if that improves the fit, and a note."""
-    if found is None or np.isinf(found.warp) or not found.pays:
+    if found is None or np.isinf(found.warp) or not found.is_significant:
         return slam
     adjusted = undistorted(_apply_solution(slam, adjustment, found.state), found.camera)
     k1, k2, *_ = found.camera.distortion

@@ -46,7 +46,7 @@ def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
         return slam
     found = compare(roles.recorded, slam.map)
     slam = replace(slam, notes=(*slam.notes, _note(found)))
-    if not found.believed:
+    if not found.accepted:
         # A keyframe that no image ties to the others stays tied by what was recorded.
         return _with_ties(slam, [tie for tie in slam.map.recorded_factors if _alone(slam, tie)])
     units = recorded_units(roles.recorded, slam.map)
@@ -171,7 +171,7 @@ def _alone(slam: Slam, tie: MeasuredRelativePose) -> bool:
 
 def _note(found: Comparison) -> str:
     basis = f"{found.compared} motions between keyframes, logarithm of the likelihood ratio {found.evidence:.1f}"
-    if found.believed:
+    if found.accepted:
         return f"recorded poses are a prior of the motion: the images agree with them ({basis})"
     if found.contradicted:
         return f"the recorded poses are not of these images, and are not used ({basis})"

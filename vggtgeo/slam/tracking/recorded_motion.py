@@ -54,7 +54,7 @@ class Comparison:
     evidence: float
 
     @property
-    def believed(self) -> bool:
+    def accepted(self) -> bool:
         return self.evidence > SIGNIFICANT
 
     @property

@@ -233,9 +233,9 @@ def _held(window: Window, roots: tuple[int, ...]) -> np.ndarray:
     """Return the members with fixed poses: those of an old part of the map that the camera returned to, if any, else
     the roots of submaps.
     """
-    hung = np.isin(window.members, window.held)
+    fixed = np.isin(window.members, window.held)
     # When the camera has returned to old keyframes, the old part must not move: the roots would be a second gauge.
-    return hung if hung.any() else np.isin(window.members, roots)
+    return fixed if fixed.any() else np.isin(window.members, roots)
 
 
 def factor_room(settings: SlamSettings, metric: bool) -> dict[type, int]:
