@@ -23,7 +23,7 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, largest_shift
+from vggtgeo.slam.camera.lens import RADIAL, FoundLens, can_undistort, find_lens, largest_shift
 from vggtgeo.slam.global_map.global_adjustment import _apply_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.pending_window import merge_pending_window
@@ -74,6 +74,29 @@ def test_a_lens_is_found() -> None:
     assert np.abs(drawn(k1, k2, inside) - drawn(-0.15, 0.05, inside)).max() < 1.5
     assert tangential == [0.0, 0.0]
     assert found.warp == pytest.approx(np.abs(drawn(k1, k2, np.linspace(0, corner * 1.07, 50))).max(), rel=0.3)
+
+
+@pytest.mark.long
+def test_the_lens_is_that_of_an_adjustment_with_its_camera() -> None:
+    # Proves the search over adjustments of a pinhole, and the noise of undistorted pixels. Oracle: `solve` with the
+    # lens among its unknowns.
+    window = bent(vg.simulate_window(seed=0, **WINDOW), -0.15, 0.05)
+    _, _, cx, cy = window.intrinsics
+    guess = np.array([1.1 * window.intrinsics[0], cx, cy, 0.0, 0.0, 0.0, 0.0])
+    intrinsics = vg.cameras.Intrinsics(
+        guess,
+        model=vg.cameras.RadialTangential,
+        shared_focal=True,
+        prior_sigma=np.array([*np.full(3, 0.3 * guess[0]), RADIAL, RADIAL, 1.0, 1.0]),
+        fixed=np.arange(7) > 4,
+    )
+    problem, start, _ = vg.pack(window.observations, window.start, intrinsics, 1.0 / window.observations.depth_mean)
+    expected = np.asarray(_solve(problem, start).state.intrinsics)
+    camera = found_in(window, 1.1).camera
+    radius = np.linspace(0, np.hypot(cx, cy) / expected[0], 50)
+    drawn = lambda f, k1, k2: f * radius * (1 + k1 * radius**2 + k2 * radius**4)
+    error = np.abs(drawn(camera.intrinsics[0], *camera.distortion[:2]) - drawn(expected[0], *expected[3:5])).max()
+    assert error < 0.1, f"{error:.3f} px, {camera}, {expected}"
 
 
 @pytest.mark.long

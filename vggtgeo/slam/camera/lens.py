@@ -13,8 +13,8 @@ undistorted pixels. Its gradient needs no other adjustment: it is the partial de
 gradients, which include how the map follows. Newton's method with bounded steps and updated second derivatives then
 takes a few adjustments. All are of the same program as the map's other adjustments.
 
-Noise is in the pixels as the lens draws them. Undistorting scales it by the derivative of the undistortion, so the
-weights of the matches are divided by the square of that; otherwise a lens that shrinks the image would be favoured.
+Noise is in the pixels as the lens draws them. Undistorting scales it, so the weight of a match is divided by the
+determinant of the undistortion's derivative; otherwise a lens that shrinks the image would be favoured.
 
 Poses of tracked frames are relative to keyframes, so they follow.
 """

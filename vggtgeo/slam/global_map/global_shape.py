@@ -30,9 +30,9 @@ MAX_NEIGHBOURS = 16
 EDGE_SHARES = (0.5, 0.75, 1.0)
 """Stored edges as a share of the largest number: time is in proportion to them, and each is a program of its own."""
 MAX_DENSE = 256
-"""Keyframes up to which the reduced system is factorised as a dense matrix: at 64 as fast as conjugate gradients, at
-192 in 0.6 of their time, and compiled in two thirds of it. The program depends on the shape alone, not on the graph, so
-that it serves other maps."""
+"""Keyframes up to which the reduced system is factorised as a dense matrix: at 200 as fast as conjugate gradients and
+half as fast as a band (docs/results/solver.md). But its program depends on the shape alone, not on the graph: it is
+compiled during the run, and serves other maps."""
 MAX_ITERATIONS = 40
 """Iterations of an adjustment of the whole map, which mostly converges after fewer."""
 
