@@ -61,7 +61,7 @@ def _steps(recording: Recording) -> tuple[list[np.ndarray], list[float]]:
     recorder, images = vg.callbacks.EvidenceRecorder(recording.camera), []
     for frame in recording.frames:
         recorder.add(frame)
-        images.append(recorder.so_far().image)
+        images.append(recorder.so_far()[1])
     times = recording.truth.timestamps
     nearest = [int(np.abs(times - frame.timestamp).argmin()) for frame in recording.frames]
     poses, inner = rigid.invert(recording.truth.poses[nearest]), np.array(recording.camera.intrinsics)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from recorded_run import recorded_run
+from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
@@ -43,6 +45,22 @@ def test_corners_are_followed_through_bands_of_light(turned: bool) -> None:
     off = off_truth(recorder, 1)
     assert len(off) > 30
     assert np.nanmean(off < 1.5) > 0.8, f"{np.nanmean(off < 1.5):.0%} within 1.5 px"
+
+
+def test_corners_are_followed_through_a_fast_turn() -> None:
+    """A turn of 17 degrees within a frame keeps most corners that stay in the picture; oracle: its homography."""
+    frame, k = recorded_run().frames[0], recorded_run().sequence.camera.matrix
+    turn = k @ Rotation.from_euler("y", 17, degrees=True).as_matrix() @ np.linalg.inv(k)
+    height, width = frame.image.shape[:2]
+    turned = cv2.warpPerspective(frame.image, turn, (width, height), borderMode=cv2.BORDER_REFLECT)
+    recorder = recorded([frame, replace(frame, image=turned)])
+    first, last = recorder.frames
+    there = cv2.perspectiveTransform(first.pixels[:, None].astype(np.float64), turn)[:, 0]
+    inside = np.all((there > 16) & (there < (width - 16, height - 16)), 1)
+    rows, others = first.common(last)
+    right = np.linalg.norm(there[rows] - last.pixels[others], axis=1) < 1.0
+    assert right.sum() > 0.8 * inside.sum(), f"{right.sum()} of {inside.sum()} corners were followed"
+    assert right.mean() > 0.8, f"{right.mean():.0%} of the tracks are right"
 
 
 def recorded(frames: list[Frame]) -> EvidenceRecorder:

@@ -36,10 +36,14 @@ MORE = 1.2
 ROUND_TRIP = 0.5
 """Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
 PATCH = (15, 15)
+LEVELS, LEVELS_FROM_SHIFT = 4, 2
+"""Of the image pyramid, beyond the images themselves: reach of 100 pixels, and of 25 around the translation."""
+REDUCTION = 4
+"""Of the images whose translation is searched: it need only be right within half a patch."""
 _FLOW = {
     "winSize": PATCH,
-    "maxLevel": 4,
     "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),
+    "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
 }
 
 
@@ -76,16 +80,38 @@ class FollowedCorners(NamedTuple):
 def follow(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Follow corners from one grey image to the next; return where they are, and which came back to their start.
 
-    Positions are float32 [m, 2], pixels.
+    In a fast turn corners move farther than Lucas and Kanade's pyramid reaches: those that are not found where they
+    were are searched once more from the translation of the whole picture. Positions are float32 [m, 2], pixels.
     """
+    moved, kept = _follow_from(before, after, pixels, np.zeros(2, np.float32), LEVELS)
+    shift = translation(before, after)
+    if kept.all() or np.linalg.norm(shift) <= PATCH[0] / 2:
+        return moved, kept
+    others, again = _follow_from(before, after, pixels, shift, LEVELS_FROM_SHIFT)
+    return np.where(kept[:, None], moved, others), kept | again
+
+
+def _follow_from(
+    before: np.ndarray, after: np.ndarray, pixels: np.ndarray, shift: np.ndarray, levels: int
+) -> tuple[np.ndarray, np.ndarray]:
     start = pixels.reshape(-1, 1, 2)
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None, **_FLOW)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **_FLOW)
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, start + shift, maxLevel=levels, **_FLOW)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, there, there - shift, maxLevel=levels, **_FLOW)
     off = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
     moved = there.reshape(-1, 2)
     height, width = after.shape
     inside = (moved > 4).all(1) & (moved < (width - 5, height - 5)).all(1)
     return moved, (ok.ravel() == 1) & (again.ravel() == 1) & (off < ROUND_TRIP) & inside
+
+
+def translation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the translation between two grey images by phase correlation, float32 [2], pixels."""
+    height, width = (side // REDUCTION for side in before.shape)
+    small = [
+        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) for image in (before, after)
+    ]
+    shift, _ = cv2.phaseCorrelate(*small, cv2.createHanningWindow((width, height), cv2.CV_32F))
+    return REDUCTION * np.array(shift, np.float32)
 
 
 def follow_through_bands(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
