@@ -84,15 +84,6 @@ def test_how_long_a_window_takes_changes_nothing(room: Room, tracked: Slam, monk
     np.testing.assert_array_equal(frame_trajectory(again).poses, frame_trajectory(tracked).poses)
 
 
-@pytest.mark.slow
-def test_two_ends_lines_recover_the_truth(room: Room) -> None:
-    """ATE below 1.5 cm where each segment has two unknowns; oracle: the renderer's poses."""
-    frames, camera, truth = room
-    slam = run_over(frames, camera, settings=updated(SETTINGS, {"line": {"two_ends_lines": True}}))
-    assert slam.window.solved[0].problem.fraction is not None
-    assert evaluate_trajectory(frame_trajectory(slam), truth).se3.statistics.rmse < 0.015
-
-
 def test_no_recompilation_after_the_first_window(room: Room, tracked: Slam) -> None:
     """A second pass compiles nothing; oracle: JAX's own events of compilation."""
     frames, camera, _ = room

@@ -23,9 +23,8 @@ from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.sparse_map.map import Map, submap_of
 from vggtgeo.slam.sparse_map.units import longer, scaled_factor, scaled_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.recorded_motion import SIGNIFICANT, compare

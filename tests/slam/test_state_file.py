@@ -22,7 +22,6 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRotation
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -30,7 +29,8 @@ from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import load_state, save_state
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import SeenPoints, UnplacedFrame
-from vggtgeo.slam.window.window import WindowPrior
+from vggtgeo.slam.window.sliding_window import WindowPrior
+from vggtgeo.slam.window_steps import merge_pending_window
 
 MIDDLE = 4
 """Frame of the recorded run whose state is saved."""

@@ -20,10 +20,10 @@ from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
+from vggtgeo.slam.window_steps import merge_pending_window
 
 MAP = Format("map", VERSION, by_name(STATE_CLASSES))
 MIN_REDESCRIBED = 0.2

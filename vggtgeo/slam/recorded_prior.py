@@ -13,8 +13,8 @@ import numpy as np
 
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.sparse_map.units import longer
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.recorded_motion import carried, compare, recorded_tie

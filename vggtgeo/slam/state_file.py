@@ -42,7 +42,7 @@ from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, UnplacedFrame
 from vggtgeo.slam.window.adjustment import Adjustment
-from vggtgeo.slam.window.window import Window, WindowPrior
+from vggtgeo.slam.window.sliding_window import Window, WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 

@@ -11,9 +11,9 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.run import frame_trajectory
-from vggtgeo.slam.sparse_map.connected import loop_edges, submap_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
+from vggtgeo.slam.sparse_map.map import loop_edges, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import lost_stretches
 from vggtgeo.slam.window_recorder import WindowRecord

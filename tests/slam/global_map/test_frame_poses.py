@@ -15,8 +15,7 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.camera.rolling_shutter import image_shift
 from vggtgeo.slam.global_map import frame_poses as module
-from vggtgeo.slam.global_map.carried_poses import carried_poses
-from vggtgeo.slam.global_map.frame_motions import frame_motions
+from vggtgeo.slam.global_map.carried_poses import carried_poses, frame_motions
 from vggtgeo.slam.global_map.frame_poses import MIN_POINTS, frame_poses
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.sparse_map.keyframe import Slots

@@ -17,12 +17,11 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.robust import sigma_by_median
 from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
-from vggtgeo.slam.global_map.carried_poses import carried_poses
-from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions
+from vggtgeo.slam.global_map.carried_poses import camera_motions, carried_poses, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.global_map.smooth_motion import smoothed
 from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
-from vggtgeo.slam.sparse_map.connected import submap_of
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.evidence import tangent

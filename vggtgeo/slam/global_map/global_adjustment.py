@@ -24,8 +24,8 @@ from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undist
 from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair
 from vggtgeo.slam.camera.pixel_aspect import are_square, aspect_prior, find_aspect
 from vggtgeo.slam.camera.rolling_shutter import find_readout, problem_to_global_shutter
+from vggtgeo.slam.global_map.carried_poses import camera_motions, frame_interval
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
-from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS, GlobalShape, global_solver, shape_of
 from vggtgeo.slam.global_map.guided_matches import guided_pairs
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma

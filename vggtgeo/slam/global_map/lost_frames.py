@@ -14,14 +14,14 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.keyframe_decision import needs_keyframe
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.map_points import in_view
 from vggtgeo.slam.tracking.relocalisation import record_of, relocalise
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_to, track, track_by_map
 from vggtgeo.slam.tracking.tracker import FramePose, UnplacedFrame, frame_pose
-from vggtgeo.slam.window.window import Window
+from vggtgeo.slam.window.sliding_window import Window
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.slam.settings.checks import CheckedSettings
-from vggtgeo.slam.settings.groups import is_kernel
+from vggtgeo.slam.settings.groups import CheckedSettings, is_kernel
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
 

@@ -112,13 +112,13 @@ def match_keyframes(
     return Pair(first.number, second.number, points, lines)
 
 
-_NO_LINES = LineMatches(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+NO_LINES = LineMatches(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
 
 def without_matches(first: int, second: int) -> Pair:
     """Return a pair of keyframes that is known to overlap although nothing was matched."""
     none, nowhere = np.zeros(0, int), np.zeros((0, 2))
-    return Pair(first, second, PointMatches(none, none, nowhere, nowhere, np.zeros(0)), _NO_LINES)
+    return Pair(first, second, PointMatches(none, none, nowhere, nowhere, np.zeros(0)), NO_LINES)
 
 
 def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Directed]:
