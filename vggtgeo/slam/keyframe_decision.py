@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.settings.groups import KeyframeSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.covisibility import SAMPLES
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import close_loop_while_tracking, view_of
@@ -26,8 +26,6 @@ MAX_SHIFT = 1.0
 the map, not the image, limits the pose."""
 THIRD_VIEW = 0.25
 """Share of these limits at which a map gets its third keyframe."""
-SAMPLES = 64
-"""Key points that this is measured on."""
 
 
 def becomes_keyframe(slam: Slam, found: Track, settings: KeyframeSettings) -> bool:
@@ -127,4 +125,4 @@ def track_by_old_keyframe(
     near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):
         return slam, again
-    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie_between(found, again)))), again
+    return slam.with_factors(tie_between(found, again)), again

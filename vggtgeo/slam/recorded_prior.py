@@ -6,7 +6,7 @@ another recording, a run with them is to the last bit the run without.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,7 @@ class RecordedPrior:
         tie = recorded_tie(self.recorded, before, newest, self.unit)
         if tie is None or known or label[before.number] != label[newest.number]:
             return slam
-        return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie)))
+        return slam.with_factors(tie)
 
 
 def recorded_prior(slam: Slam, roles: Roles) -> RecordedPrior | None:

@@ -49,7 +49,6 @@ LOOP_GATE = POSE_GATE
 """Squared Mahalanobis distance above which a loop is false: one true loop in 10,000 is lost."""
 GRADUATION = Graduation(factors=(256.0, 64.0, 16.0, 4.0), iterations=6)
 """A loop of 2 cm against 10 m of drift has a residual of 500 standard deviations, half of the first width."""
-ITERATIONS = 50
 ROOM = 32
 """Loops are padded to a multiple of this, and poses to `padded_count`: a graph of about the same size compiles
 nothing."""
@@ -115,7 +114,7 @@ def solve_pose_graph(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
     )
     small = count <= DENSE_POSES
     reduced = DenseCholesky() if small else choose_reduced_solver(problem)
-    solver = SchurLevenbergMarquardt(max_iterations=ITERATIONS, rtol=1e-6, reduced_solver=reduced)
+    solver = SchurLevenbergMarquardt(rtol=1e-6, reduced_solver=reduced)
     solution = solve_graph_jit(problem, initial, solver)
     poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64)[:count])
     if not np.isfinite(poses).all():

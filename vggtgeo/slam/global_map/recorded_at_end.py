@@ -11,6 +11,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.drift_correction import at_poses
+from vggtgeo.slam.global_map.joining import moved_submap
 from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, squared_distance
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
@@ -45,7 +46,7 @@ def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
     if roles.recorded is None:
         return slam
     found = compare(roles.recorded, slam.map)
-    slam = replace(slam, notes=(*slam.notes, _note(found)))
+    slam = slam.with_notes(_note(found))
     if not found.accepted:
         # A keyframe that no image ties to the others stays tied by what was recorded.
         return _with_ties(slam, [tie for tie in slam.map.recorded_factors if _alone(slam, tie)])
@@ -60,7 +61,7 @@ def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
 def _with_ties(slam: Slam, ties: list[MeasuredRelativePose]) -> Slam:
     """Replace the recorded motions of the state."""
     factors = [factor for factor in slam.map.factors if not getattr(factor, "recorded", False)]
-    return replace(slam, map=replace(slam.map, factors=(*factors, *ties)))
+    return slam.with_map(factors=(*factors, *ties))
 
 
 def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
@@ -88,7 +89,7 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
                 recorded_motion = tie.pose if tie.second == second else rigid.invert(tie.pose)
                 poses[second] = recorded_motion @ poses[first]
     factors = tuple(factor for factor in slam.map.factors if not isinstance(factor, MeasuredBaseline))
-    return at_poses(replace(slam, map=replace(slam.map, factors=factors)), poses, scales)
+    return at_poses(slam.with_map(factors=factors), poses, scales)
 
 
 def _local_units(
@@ -124,21 +125,10 @@ def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
         if tie is None:
             continue
         motion = tie.pose if tie.second == own.number else rigid.invert(tie.pose)
-        carried_by = rigid.invert(own.pose) @ motion @ near.pose
-        keyframes = tuple(
-            replace(keyframe, pose=rigid.orthonormal(keyframe.pose @ carried_by))
-            if keyframe.number in other
-            else keyframe
-            for keyframe in slam.keyframes
-        )
-        roots = tuple(root for root in slam.map.roots if root not in other)
-        joined = replace(slam.map, keyframes=keyframes, roots=roots, factors=(*slam.map.factors, tie))
-        note = (
-            f"the submap that began at frame {slam.keyframes[min(other)].frame} is joined to the rest by recorded poses"
-        )
-        slam = replace(
-            slam, map=joined, window=replace(slam.window, prior=None, solved=None, held=()), notes=(*slam.notes, note)
-        )
+        began = slam.keyframes[min(other)].frame
+        slam = moved_submap(slam, other, rigid.invert(own.pose) @ motion @ near.pose).with_factors(tie)
+        slam = slam.with_notes(f"the submap that began at frame {began} is joined to the rest by recorded poses")
+        slam = replace(slam, window=replace(slam.window, prior=None, solved=None, held=()))
         main |= other
     return slam
 
@@ -151,15 +141,14 @@ def _with_carried_frames(slam: Slam, recorded: RecordedPoses, units: np.ndarray)
         found = None
         if not record.tracked and last is not None and np.isfinite(units[last.reference]):
             found = carried(recorded, slam.map, last, record.timestamp, float(units[last.reference]))
-        frames.append(record if found is None else _by_recording(record, found))
+        frames.append(record if found is None else _placed_by(record, found))
         last = frames[-1] if frames[-1].tracked else last
-    return replace(slam, tracker=replace(slam.tracker, frames=tuple(frames)))
+    return slam.with_tracker(frames=tuple(frames))
 
 
-def _by_recording(record: FramePose, found: Track) -> FramePose:
-    return replace(
-        record, reference=found.keyframe.number, relative=found.relative, tracked=True, evidence=found.evidence
-    )
+def _placed_by(record: FramePose, found: Track) -> FramePose:
+    number = found.keyframe.number
+    return replace(record, reference=number, relative=found.relative, tracked=True, evidence=found.evidence)
 
 
 def _alone(slam: Slam, tie: MeasuredRelativePose) -> bool:

@@ -64,15 +64,9 @@ def parsed(assignment: str) -> Tables:
     _check_name(name)
     group, field = name.split(".")
     try:
-        read = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except ValueError:  # a word, or a number of more digits than Python reads
         value = text
-    except (ValueError, RecursionError) as error:  # more digits or brackets than Python reads
-        raise InputError(f"`{name}` cannot be read: {error}") from None
-    else:
-        if len(read) > 1:  # a line break begins another setting
-            raise InputError(f"`{name}` is set beside others, of {len(read)} lines; give each a `--set` of its own")
-        value = read["value"]
     return {group: {field: value}}
 
 

@@ -22,6 +22,8 @@ MIN_OVERLAP = 0.25
 """Share of a keyframe's points inside another's image required for matching."""
 GATE_SIGMA = 4.0
 """Standard deviations within the gate of matches."""
+SAMPLES = 64
+"""Key points, spread over the image, that an overlap is measured on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,7 @@ class Directed:
     line_confidence: np.ndarray
 
 
-def some_points(keyframe: Keyframe, intrinsics: np.ndarray, *, fill: bool = False, most: int = 64) -> np.ndarray:
+def some_points(keyframe: Keyframe, intrinsics: np.ndarray, *, fill: bool = False) -> np.ndarray:
     """Return world points of a few slots of known depth, spread over the image, float64 `[m, 3]`.
 
     fill: also slots of unknown depth, at the mean inverse depth of the others. In a turn without metric depth only the
@@ -67,7 +69,7 @@ def some_points(keyframe: Keyframe, intrinsics: np.ndarray, *, fill: bool = Fals
     if fill and known.any():
         inverse = np.where(known, inverse, np.mean(inverse[known]))
     rows = np.nonzero(np.isfinite(inverse))[0]
-    some = rows[:: max(len(rows) // most, 1)]
+    some = rows[:: max(len(rows) // SAMPLES, 1)]
     return rigid.unproject(keyframe.points.pixels[some], inverse[some], keyframe.pose, intrinsics)
 
 
