@@ -25,17 +25,16 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.results.files import write_trajectories
 from vggtgeo.results.summary import list_submaps
 from vggtgeo.simulation import simulate
-from vggtgeo.slam.global_map.compile_ahead import compile_global, expected_keyframes
+from vggtgeo.slam.global_map.compile_ahead import expected_keyframes
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
-from vggtgeo.slam.global_map.global_shape import shape_for
 from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.run import finish, frame_trajectory
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.factors import FREE_LENGTH
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window.sliding_window import solve_jit, window_problem
+from vggtgeo.slam.window.sliding_window import window_problem
 from vggtgeo.slam.window_steps import adjust_window, camera_prior
 
 SIZE = (320, 240)
@@ -132,32 +131,12 @@ def _shaken(slam: Slam, metres: float, degrees: float, from_keyframe: int = 1, t
 )
 def test_global_adjustment_brings_a_map_back(room: Room, tracked: Slam, surfaces: float) -> None:
     """Keyframes moved by 5 cm and 2 degrees each come back to below 1 cm; oracle: the renderer's poses."""
-    settings = updated(
-        SETTINGS,
-        {
-            "refinement": {"global_adjustment": True},
-            "depth_terms": {"surface_points": surfaces},
-        },
-    )
+    changes = {"refinement": {"global_adjustment": True}, "depth_terms": {"surface_points": surfaces}}
+    settings = updated(SETTINGS, changes)
     wrong = _shaken(tracked, 0.05, 2.0)
     assert _keyframe_error(wrong, room[2]) > 0.03
     error = _keyframe_error(finish(wrong, ROLES, settings), room[2])
     assert error < 0.01, f"{error:.4f} m"
-
-
-@pytest.mark.long
-def test_what_is_compiled_ahead_is_what_the_end_needs(tracked: Slam) -> None:
-    """Compiled for a map of so many keyframes, the solver of the last adjustment is not compiled again; oracle: how
-    many programs of it were prepared.
-    """
-    settings = updated(SETTINGS, {"refinement": {"global_adjustment": True}})
-    kept = lambda: solve_jit.prepared
-    before = kept()
-    compile_global(shape_for(len(tracked.keyframes), 0, settings), settings)
-    compiled = kept()
-    assert compiled == before + 1
-    finish(tracked, ROLES, settings, rounds=1)
-    assert kept() == compiled
 
 
 def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
@@ -175,10 +154,7 @@ def test_a_loop_joins_what_has_come_apart(room: Room, tracked: Slam) -> None:
 
     Oracle: the renderer's poses; and the same adjustment without the loops, which leaves the parts where they are.
     """
-    middle, settings = (
-        len(tracked.keyframes) // 2,
-        updated(SETTINGS, {"depth_terms": {"surface_points": 0.0}}),
-    )
+    middle, settings = len(tracked.keyframes) // 2, updated(SETTINGS, {"depth_terms": {"surface_points": 0.0}})
     apart = _shaken(tracked, 0.05, 2.0, from_keyframe=middle, together=True)
     within = [pair for pair in apart.map.pairs if (pair.first < middle) == (pair.second < middle)]
     tied = [f for f in apart.map.factors if len({number < middle for number in f.keyframes}) == 1]
@@ -197,15 +173,8 @@ def _visited_twice(slam: Slam, motion: np.ndarray) -> Slam:
     again = tuple(replace(k, number=k.number + count, pose=k.pose @ rigid.invert(motion)) for k in slam.keyframes)
     pairs = tuple(replace(p, first=p.first + count, second=p.second + count) for p in slam.map.pairs)
     ties = tuple(replace(t, first=t.first + count, second=t.second + count) for t in slam.map.odometry_factors)
-    known = slam.map
-    twice = replace(
-        known,
-        keyframes=(*known.keyframes, *again),
-        pairs=(*known.pairs, *pairs),
-        factors=(*known.factors, *ties),
-        roots=(0, count),
-    )
-    return replace(slam, map=twice)
+    twice = slam.with_map(keyframes=(*slam.keyframes, *again), pairs=(*slam.map.pairs, *pairs), roots=(0, count))
+    return twice.with_factors(*ties)
 
 
 @pytest.mark.long

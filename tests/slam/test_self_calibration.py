@@ -74,16 +74,8 @@ def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
         numbers = frozenset(range(count))
         pairs = tuple(pair for pair in wide.map.pairs if numbers.issuperset(pair.key))
         frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
-        assert (
-            Claim.of(
-                replace(
-                    slam,
-                    map=replace(slam.map, pairs=pairs, factors=(), roots=(0,)),
-                    tracker=replace(slam.tracker, frames=frames),
-                )
-            ).guessed
-            == held
-        )
+        judged = slam.with_map(pairs=pairs, factors=(), roots=(0,)).with_tracker(frames=frames)
+        assert Claim.of(judged).guessed == held
 
 
 def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:

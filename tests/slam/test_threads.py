@@ -36,11 +36,6 @@ def test_threads_give_the_list_of_a_loop(cores: int, monkeypatch: pytest.MonkeyP
     assert map_in_threads(square, range(50)) == [value * value for value in range(50)]
     assert len(names) > 1 or cores == 1
     assert map_in_threads(square, []) == []
-
-
-def test_a_fault_in_a_thread_reaches_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an item raises is raised; oracle: the exception of that item."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
     with pytest.raises(ZeroDivisionError):
         map_in_threads(lambda value: 1 / value, [2, 1, 0])
 

@@ -11,7 +11,7 @@ from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.settings.groups import KeyframeSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.covisibility import SAMPLES
+from vggtgeo.slam.sparse_map.covisibility import SAMPLES, share_inside
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import close_loop_while_tracking, view_of
@@ -37,13 +37,7 @@ def becomes_keyframe(slam: Slam, found: Track, settings: KeyframeSettings) -> bo
 def needs_keyframe(slam: Slam, pose: np.ndarray, keyframe: Keyframe, inliers: int, settings: KeyframeSettings) -> bool:
     """Return whether a frame sees too little of its keyframe (`view_change`), or shares too few matches with it.
 
-    Args:
-        slam: the state, for its camera and whether lengths are metres.
-        pose: of the frame, float64 [4, 4], world -> camera.
-        keyframe: that it was tracked against.
-        inliers: matches with that keyframe that agree with the pose.
-        settings: largest distance and angle, least inliers.
-
+    pose: of the frame, float64 [4, 4], world -> camera. inliers: matches with the keyframe that agree with the pose.
     """
     return view_change(slam, pose, keyframe, settings) > 1.0 or inliers < settings.min_inliers
 
@@ -76,10 +70,7 @@ def _unitless_change(pose: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarra
     relative = pose @ rigid.invert(keyframe.pose)
     turned = pinhole.rays(keyframe.points.pixels[some], intrinsics) @ relative[:3, :3].T
     moved = turned + inverse[:, None] * relative[:3, 3]
-    height, width = keyframe.size
-    with np.errstate(invalid="ignore"):
-        x, y = pinhole.project(moved, intrinsics).T
-        left = 1.0 - np.mean((x > 0) & (x < width) & (y > 0) & (y < height))
+    left = 1.0 - share_inside(pinhole.project(moved, intrinsics), keyframe)
     sine = np.linalg.norm(np.cross(turned, moved), axis=1)
     parallax = np.sqrt(np.mean(np.arctan2(sine, (turned * moved).sum(1)) ** 2))
     sigma = keyframe.points.estimate_sigma[np.isfinite(keyframe.points.estimate_sigma)]

@@ -28,7 +28,7 @@ def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
         return slam
     keyframe = slam.keyframes[slam.window.members[-1]]
     rotation = keyframe.pose[:3, :3]
-    axes = mean_rotation(slam.map.axes) if slam.map.axes else None
+    axes = Rotation.from_matrix(np.asarray(slam.map.axes)).mean().as_matrix() if slam.map.axes else None
     predicted = None if axes is None else rotation @ axes
     view = ManhattanEstimator().estimate(keyframe.lines.segments.endpoints, slam.intrinsics, predicted)
     if view is None:
@@ -42,8 +42,3 @@ def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
         return slam
     # `view.information` is that of `Log(R M^T)` at the tracked pose; degrees apart, the root at zero is the same.
     return slam.with_factors(MeasuredRotation(keyframe.number, view.rotation @ axes.T, view.information))
-
-
-def mean_rotation(rotations: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Return the rotation nearest to all of `rotations` [3, 3] (chordal mean)."""
-    return Rotation.from_matrix(np.asarray(rotations)).mean().as_matrix()

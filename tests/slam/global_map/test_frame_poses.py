@@ -126,14 +126,6 @@ def test_without_enough_points_a_pose_stays() -> None:
     assert not np.array_equal(frame_poses(slam)[1], carried_poses(slam)[1])
 
 
-def test_what_tracking_knew_counts_as_a_prior() -> None:
-    """A pose that tracking knew far better than points tell it stays where it is; oracle: the information of both."""
-    slam, pose = walked(np.random.default_rng(3))
-    sure = with_second(slam, evidence=Evidence(sigma_translation=1e-5, sigma_rotation=1e-5))
-    assert off(sure, pose) > 0.9 * np.linalg.norm(rigid.centre(carried_poses(slam)[1][1]) - rigid.centre(pose))
-    assert off(with_second(slam, evidence=Evidence()), pose) < 1e-4
-
-
 @pytest.mark.parametrize("columns", [False, True])
 def test_a_rolling_shutter_is_taken_out_of_what_a_frame_shows(columns: bool) -> None:
     """Images that are read within 90 ms: pixels of frame and keyframe as they were read place it where those of one

@@ -75,13 +75,14 @@ def some_points(keyframe: Keyframe, intrinsics: np.ndarray, *, fill: bool = Fals
 
 def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> float:
     """Return the share of world points inside the image of `keyframe`."""
-    if not len(points):
-        return 0.0
-    height, width = keyframe.size
+    return share_inside(rigid.project(points, keyframe.pose, intrinsics), keyframe) if len(points) else 0.0
+
+
+def share_inside(pixels: np.ndarray, keyframe: Keyframe) -> float:
+    """Return the share of pixels [m, 2] inside the image of `keyframe`; those behind the camera are NaN."""
+    (x, y), (height, width) = pixels.T, keyframe.size
     with np.errstate(invalid="ignore"):
-        x, y = rigid.project(points, keyframe.pose, intrinsics).T
-        inside = (x > 0) & (x < width) & (y > 0) & (y < height)
-    return float(np.mean(inside))
+        return float(np.mean((x > 0) & (x < width) & (y > 0) & (y < height)))
 
 
 def match_keyframes(

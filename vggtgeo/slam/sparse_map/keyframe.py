@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import pinhole
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
 from vggtgeo.slam.perception.description import Description
@@ -176,20 +177,10 @@ def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineF
 
 def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) -> Slots:
     measured = depth.depth, depth.sigma_rel, depth.confidence
-    z, sigma_rel, trust = (read_at(image, pixels).astype(np.float64) for image in measured)
-    inverse, seen = 1.0 / z, read_at(confidence, pixels).astype(np.float64)
+    z, sigma_rel, trust = (pinhole.at_pixels(image, pixels).astype(np.float64) for image in measured)
+    inverse, seen = 1.0 / z, pinhole.at_pixels(confidence, pixels).astype(np.float64)
     nothing = np.full(len(pixels), np.nan)
     return Slots(pixels, inverse, inverse, sigma_rel * inverse, np.nan_to_num(trust), seen, nothing)
-
-
-def read_at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return the value of the nearest pixel, [m] or [m, 3]; outside the image that of the border.
-
-    Undistortion may move key points outside.
-    """
-    height, width = image.shape[:2]
-    columns, rows = np.rint(pixels).astype(int).T
-    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
 
 
 def along_segments(inverse: np.ndarray, segment: np.ndarray, fraction: np.ndarray) -> np.ndarray:

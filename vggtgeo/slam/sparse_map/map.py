@@ -70,9 +70,13 @@ def submap_of(known: Map) -> np.ndarray:
     first, second = np.array(ends, int).reshape(-1, 2).T
     graph = coo_array((np.ones(len(first)), (first, second)), (count, count))
     _, label = connected_components(graph, directed=False)
-    _, start, inverse = np.unique(label, return_index=True, return_inverse=True)
-    # Rank of each submap by its first keyframe: scipy's labels have no documented order.
-    return np.asarray(np.argsort(np.argsort(start))[inverse])
+    return by_first_member(label)
+
+
+def by_first_member(label: np.ndarray) -> np.ndarray:
+    """Return labels [n] numbered in the order of their first members: scipy's have no documented order."""
+    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[inverse])
 
 
 def loop_edges(known: Map, apart: int) -> tuple[tuple[int, int], ...]:
@@ -80,7 +84,6 @@ def loop_edges(known: Map, apart: int) -> tuple[tuple[int, int], ...]:
 
     They have matches or a measured relative pose, and are at least `apart` keyframes (those of a window) apart.
     """
-    ends = [tie.keyframes for tie in known.odometry_factors] + [
-        pair.key for pair in known.pairs if len(pair.points) + len(pair.lines)
-    ]
+    ends = [tie.keyframes for tie in known.odometry_factors]
+    ends += [pair.key for pair in known.pairs if len(pair.points) + len(pair.lines)]
     return tuple(sorted({(first, second) for first, second in ends if abs(second - first) >= apart}))
