@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from changed import changed
 from recorded_run import ROLES, SETTINGS
 from reported import raises
 from same_leaves import differences
@@ -104,7 +103,7 @@ def test_the_state_of_a_run_is_a_map(known: Slam) -> None:
     camera = sequence().camera
     assert list(differences(entered(first_half(), camera, ROLES.points), entered(known, camera, ROLES.points))) == []
     with raises("known_map"):
-        entered(changed(known, "map", keyframes=()), camera, ROLES.points)
+        entered(known.with_map(keyframes=()), camera, ROLES.points)
 
 
 def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:
@@ -129,7 +128,7 @@ def test_known_space_gets_no_second_keyframes(known: Slam) -> None:
 def test_localising_leaves_the_map_as_it_is(known: Slam) -> None:
     """Frames are placed, and no keyframe, match, tie or camera changes, however far they lead; oracle: the map."""
     # Without factors, so that going from keyframe to keyframe would add them anew.
-    known = changed(known, "map", factors=())
+    known = known.with_map(factors=())
     slam = vg.finish(run(0, settings=FIXED, known_map=known), ROLES, FIXED)
     assert len({record.reference for record in slam.frames}) > 1
     assert list(differences(known.map, slam.map)) == []

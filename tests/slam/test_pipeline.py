@@ -10,7 +10,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from changed import changed
 from recorded_run import ROLES, SETTINGS, black, room, run_over
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.classical import NoDepth, SiftMatcher
@@ -123,7 +122,7 @@ def _shaken(slam: Slam, metres: float, degrees: float, from_keyframe: int = 1, t
         centre = np.zeros(3) if together else rigid.centre(keyframes[number].pose)
         motion[:3, 3] = centre + metres * shift - motion[:3, :3] @ centre
         keyframes[number] = replace(keyframes[number], pose=keyframes[number].pose @ rigid.invert(motion))
-    return changed(slam, "map", keyframes=tuple(keyframes))
+    return slam.with_map(keyframes=tuple(keyframes))
 
 
 @pytest.mark.parametrize(
@@ -158,7 +157,7 @@ def test_a_loop_joins_what_has_come_apart(room: Room, tracked: Slam) -> None:
     apart = _shaken(tracked, 0.05, 2.0, from_keyframe=middle, together=True)
     within = [pair for pair in apart.map.pairs if (pair.first < middle) == (pair.second < middle)]
     tied = [f for f in apart.map.factors if len({number < middle for number in f.keyframes}) == 1]
-    apart = changed(apart, "map", pairs=tuple(within), factors=tuple(tied))
+    apart = apart.with_map(pairs=tuple(within), factors=tuple(tied))
     assert len(within) < len(tracked.map.pairs)
     closed = close_loops(apart, ROLES, settings)
     assert any(pair.first < middle <= pair.second for pair in closed.map.pairs[len(within) :])

@@ -18,9 +18,8 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.recorded_prior import prior_summary
+from vggtgeo.slam.recorded_prior import prior_summary, with_recorded_ties
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose

@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from changed import changed
 
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -34,8 +33,8 @@ def _tie(first: int, second: int) -> MeasuredRelativePose:
 def test_what_was_noted_meanwhile_is_kept() -> None:
     """Window, camera and notes of the adjustment, and the frames, factors and notes of tracking; oracle: by hand."""
     early, found, late = _tie(0, 1), _tie(1, 2), _tie(0, 2)
-    begun = changed(STATE, "map", factors=(early,))
-    adjusted = changed(changed(begun, "camera", intrinsics=2 * CAMERA), "window", members=(1, 2))
+    begun = STATE.with_map(factors=(early,))
+    adjusted = begun.with_camera(intrinsics=2 * CAMERA).with_window(members=(1, 2))
     slam = begin_window(begun, lambda: adjusted.with_factors(found).with_notes("adjusted"))
     frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
     slam = slam.with_tracker(frames=(frame,)).with_factors(late).with_notes("tracked")
@@ -62,7 +61,7 @@ def test_it_is_due_by_the_number_of_frames() -> None:
 @pytest.mark.parametrize("again", [lambda slam: pickle.loads(pickle.dumps(slam)), copy.deepcopy])
 def test_a_state_that_waits_for_a_window_pickles_and_copies(again: Callable[[Slam], Slam]) -> None:
     """A Future has a lock, which does neither: the copy has the result. Oracle: that of the state itself."""
-    adjusted = changed(changed(STATE, "camera", intrinsics=2 * CAMERA), "window", members=(1, 2))
+    adjusted = STATE.with_camera(intrinsics=2 * CAMERA).with_window(members=(1, 2))
     slam = begin_window(STATE, lambda: adjusted)
     found = again(slam)
     assert found.pending.due == slam.pending.due

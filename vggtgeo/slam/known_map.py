@@ -117,7 +117,7 @@ def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
     if known.camera.calibrated:
         return known
     # Its own run found it, and its keyframes stand as that camera sees them.
-    return replace(known, camera=replace(known.camera, given=known.intrinsics, self_calibrated=True))
+    return known.with_camera(given=known.intrinsics, self_calibrated=True)
 
 
 def _check_matcher(known: Slam, points: PointMatcher) -> None:

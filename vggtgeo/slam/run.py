@@ -27,12 +27,12 @@ from vggtgeo.slam.global_map.global_adjustment import ROUNDS, adjust_all
 from vggtgeo.slam.global_map.joining import join_at_end
 from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
-from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.recorded_prior import with_recorded_ties
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size

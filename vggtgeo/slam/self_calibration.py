@@ -66,8 +66,8 @@ def self_calibrate(
         if not _is_plausible(found, camera):
             return None
         before, own, lens = begin(camera, roles), found.intrinsics, found.camera.lens
-        estimate = replace(before.camera, intrinsics=own, given=own, self_calibrated=True, lens=lens)
-        before = replace(before, camera=estimate, notes=(_note(found, passes, camera),))
+        before = before.with_camera(intrinsics=own, given=own, self_calibrated=True, lens=lens)
+        before = before.with_notes(_note(found, passes, camera))
         moved = np.abs(own[:2] / last.intrinsics[:2] - 1).max()
         if moved < SETTLED and (lens is None) == (last.camera.lens is None):
             break

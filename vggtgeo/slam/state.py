@@ -99,6 +99,14 @@ class Slam:
         """Return the state with these fields of its tracker replaced."""
         return replace(self, tracker=replace(self.tracker, **fields))
 
+    def with_window(self, **fields: Any) -> Slam:
+        """Return the state with these fields of its window replaced."""
+        return replace(self, window=replace(self.window, **fields))
+
+    def with_camera(self, **fields: Any) -> Slam:
+        """Return the state with these fields of the estimate of its camera replaced."""
+        return replace(self, camera=replace(self.camera, **fields))
+
     def with_factors(self, *factors: Factor) -> Slam:
         """Return the state with further factors in its map."""
         return self.with_map(factors=(*self.map.factors, *factors))

@@ -82,14 +82,10 @@ def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
     for own in updated:
         keyframes[own.number] = own
     history = np.asarray(solution.history, np.float64)
-    window = replace(
-        window,
-        solved=(adjustment, solution.state),
-        energies=history[np.isfinite(history)],
-        iterations=solution.record,
+    adjusted = slam.with_map(keyframes=tuple(keyframes)).with_camera(intrinsics=intrinsics)
+    return adjusted.with_window(
+        solved=(adjustment, solution.state), energies=history[np.isfinite(history)], iterations=solution.record
     )
-    camera = replace(slam.camera, intrinsics=intrinsics)
-    return replace(slam, map=replace(known, keyframes=tuple(keyframes)), window=window, camera=camera)
 
 
 def camera_prior(slam: Slam) -> CameraPrior:

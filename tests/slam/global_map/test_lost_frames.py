@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from changed import changed
 from recorded_run import ROLES, SETTINGS, room, run_over
 from vggtgeo.models.classical import NoDepth
 
@@ -64,7 +63,7 @@ def test_keyframes_are_listed_by_time(lost: Slam) -> None:
     """A keyframe that was made at the end of a frame in between is listed where it was seen. Oracle: the times."""
     first, second, *others = lost.keyframes
     swapped = (replace(first, timestamp=second.timestamp), replace(second, timestamp=first.timestamp), *others)
-    listed = keyframe_trajectory(changed(lost, "map", keyframes=swapped))
+    listed = keyframe_trajectory(lost.with_map(keyframes=swapped))
     assert listed.timestamps.tolist() == sorted(keyframe.timestamp for keyframe in swapped)
 
 
@@ -76,7 +75,7 @@ def test_frames_of_another_place_stay_lost(lost: Slam, walk: tuple[list[Frame], 
     elsewhere = tuple(
         replace(_lost(frame), frame=KNOWN + row, timestamp=(KNOWN + row) / 10) for row, frame in enumerate(mirrored)
     )
-    found = place_lost_without_depth(changed(lost, "tracker", unplaced=elsewhere), FREE_ROLES, SETTINGS)
+    found = place_lost_without_depth(lost.with_tracker(unplaced=elsewhere), FREE_ROLES, SETTINGS)
     assert found.map is lost.map
     assert not any(record.tracked for record in found.frames[KNOWN:])
 

@@ -40,9 +40,10 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             arrived = tracked @ slam.keyframes[reference].pose
             change = poses[row] @ rigid.invert(arrived)
             tie = ties.get((reference, record.reference))
-            gross = tie is not None and _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
-            # Without depth the length of its motion was a guess, which frames tracked by points do not share.
-            apart = gross or (tie is not None and tie.by_rays)
+            # By rays the length of its motion was a guess, which frames tracked by points do not share.
+            apart = tie is not None and (
+                tie.by_rays or _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
+            )
             between = [] if apart else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
             span = max(times[row] - times[last], 1e-9)
             for k in between:

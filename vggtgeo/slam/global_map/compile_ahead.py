@@ -11,6 +11,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.pixel_aspect import aspect_prior
+from vggtgeo.slam.global_map.depth_alignment import align_pairs
 from vggtgeo.slam.global_map.global_adjustment import shares_focal
 from vggtgeo.slam.global_map.global_shape import (
     EDGE_SHARES,
@@ -25,7 +26,7 @@ from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.sparse_map.factors import factor_terms, surface_term
+from vggtgeo.slam.sparse_map.factors import factor_terms
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit, warm_up
 
@@ -103,8 +104,7 @@ def compile_global(
     if not (metric or shared_focal):
         terms = (*terms, aspect_prior(np.ones(2)))
     if metric and settings.depth_terms.surface_points > 0:
-        nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
-        terms = (*terms, surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing))
+        terms = (*terms, align_pairs((), (), (), settings.depth_terms.surface_points, shape.pairs))
     problem, initial = smallest_problem(shape.size, settings, terms, shared_focal)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)

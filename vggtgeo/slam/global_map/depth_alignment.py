@@ -126,13 +126,12 @@ def align_pairs(
     pairs: Sequence[tuple[int, int]],
     surfaces: Sequence[Surface],
     effective: float,
-    room: int | None = None,
+    room: int,
 ) -> SurfaceAlignment:
     """Return the alignments of all pairs at the current poses as one term; pairs without overlap have weight 0.
 
-    room: observations of the term, by default one a pair.
+    room: observations of the term.
     """
-    room = len(pairs) if room is None else room
     relative = np.tile(np.eye(4), (room, 1, 1))
     for row, (i, j) in enumerate(pairs):
         relative[row] = keyframes[j].pose @ rigid.invert(keyframes[i].pose)

@@ -163,7 +163,7 @@ def at_poses(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
         ),
         factors=tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors),
     ).with_tracker(frames=tuple(scaled_record(record, unit(record.reference)) for record in slam.frames))
-    return replace(moved, window=replace(slam.window, prior=None, solved=None))
+    return moved.with_window(prior=None, solved=None)
 
 
 def _with_refused(slam: Slam, refused: int, proposed: int) -> Slam:

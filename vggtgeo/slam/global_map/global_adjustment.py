@@ -60,8 +60,8 @@ class _Solved(NamedTuple):
     def of(cls, slam: Slam, adjustment: Adjustment, state: State) -> Self:
         """Write the result of an adjustment into the state."""
         keyframes, intrinsics = write_back(slam.keyframes, adjustment, state)
-        camera, window = replace(slam.camera, intrinsics=intrinsics), replace(slam.window, solved=None)
-        return cls(replace(slam.with_map(keyframes=keyframes), camera=camera, window=window), adjustment, state)
+        adjusted = slam.with_map(keyframes=keyframes).with_camera(intrinsics=intrinsics).with_window(solved=None)
+        return cls(adjusted, adjustment, state)
 
     def with_problem(self, found: FoundReadout | FoundAspect) -> Self:
         """Take a changed problem and its solution."""
@@ -199,7 +199,7 @@ def _try_rolling_shutter(done: _Solved, settings: SlamSettings) -> _Solved:
     if found is None or not found.is_significant:
         return done
     done = done.with_problem(found)
-    return done._replace(slam=replace(done.slam, camera=replace(done.slam.camera, readout=found.readout)))
+    return done._replace(slam=done.slam.with_camera(readout=found.readout))
 
 
 def _try_camera(done: _Solved, edges: list[Directed], settings: SlamSettings) -> Slam:
@@ -292,12 +292,9 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
         else replace(record, seen=replace(record.seen, pixels=undistorted_pixels(record.seen.pixels, lens)))
         for record in slam.frames
     )
-    return replace(
-        slam.with_tracker(frames=frames),
-        map=undistorted_map(slam.map, lens),
-        camera=replace(slam.camera, intrinsics=np.array(lens.intrinsics, np.float64), lens=lens),
-        window=replace(slam.window, solved=None, prior=None),
-    )
+    ideal = replace(slam, map=undistorted_map(slam.map, lens)).with_tracker(frames=frames)
+    ideal = ideal.with_camera(intrinsics=np.array(lens.intrinsics, np.float64), lens=lens)
+    return ideal.with_window(solved=None, prior=None)
 
 
 def _lens_note(found: RefinedCamera, shape: tuple[int, int]) -> list[str]:

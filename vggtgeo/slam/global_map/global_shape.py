@@ -16,7 +16,7 @@ from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.factors import Factor, MeasuredBaseline, MeasuredRelativePose
-from vggtgeo.slam.window.sliding_window import window_size
+from vggtgeo.slam.window.sliding_window import TOLERANCE, window_size
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
 
@@ -100,6 +100,6 @@ def global_solver(problem: Problem) -> SchurLevenbergMarquardt:
     small = problem.num_keyframes <= MAX_DENSE
     return SchurLevenbergMarquardt(
         max_iterations=MAX_ITERATIONS,
-        rtol=1e-5,
+        rtol=TOLERANCE,
         reduced_solver=DenseCholesky() if small else choose_reduced_solver(problem),
     )

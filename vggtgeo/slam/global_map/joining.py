@@ -67,8 +67,7 @@ def join_submaps(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettin
         slam, fixed = scale_submap(slam, ratio, numbers), slam.window.members[:2]
     motion = rigid.invert(slam.keyframes[-1].pose) @ place.pose
     prior = None if slam.window.prior is None else _moved_prior(slam.window.prior, motion)
-    window = replace(slam.window, held=fixed, prior=prior, solved=None)
-    joined = moved_submap(replace(slam, window=window), numbers, motion)
+    joined = moved_submap(slam, numbers, motion).with_window(held=fixed, prior=prior, solved=None)
     began = slam.keyframes[min(numbers)].frame
     return joined.with_factors(
         MeasuredRelativePose(old.number, new.number, place.relative, place.information)
@@ -88,7 +87,7 @@ def scale_submap(slam: Slam, ratio: float, numbers: Collection[int]) -> Slam:
         keyframes=tuple(scaled_keyframe(k, ratio) if k.number in numbers else k for k in slam.keyframes),
         factors=tuple(f for f in factors if not (isinstance(f, MeasuredBaseline) and own(f))),
     ).with_tracker(frames=frames, velocity=longer(velocity, ratio) if newest in numbers else velocity)
-    return replace(scaled, window=replace(slam.window, prior=None, solved=None))
+    return scaled.with_window(prior=None, solved=None)
 
 
 def moved_submap(slam: Slam, numbers: Collection[int], motion: np.ndarray) -> Slam:
@@ -172,5 +171,4 @@ def _placed_by(slam: Slam, loop: Loop, other: set[int]) -> Slam:
     else:
         number, place = second, loop.motion.pose @ slam.keyframes[first].pose
     scaled = scale_submap(slam, ratio, other)
-    moved = moved_submap(scaled, other, rigid.invert(scaled.keyframes[number].pose) @ place)
-    return replace(moved, window=replace(moved.window, held=()))
+    return moved_submap(scaled, other, rigid.invert(scaled.keyframes[number].pose) @ place).with_window(held=())

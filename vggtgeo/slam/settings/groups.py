@@ -42,10 +42,9 @@ def positive(default: float, at_most: float = math.inf) -> Any:
     return _field(default, Expected(words, lambda value: _is_finite(value) and 0 < value <= at_most))
 
 
-def not_negative(default: float, at_most: float = math.inf) -> Any:
+def not_negative(default: float) -> Any:
     """Declare a setting that is a finite number of 0 or more."""
-    words = "a number, 0 or more" if math.isinf(at_most) else f"a number from 0 to {at_most:g}"
-    return _field(default, Expected(words, lambda value: _is_finite(value) and 0 <= value <= at_most))
+    return _field(default, Expected("a number, 0 or more", lambda value: _is_finite(value) and value >= 0))
 
 
 def one_of(default: str, *others: str) -> Any:

@@ -22,6 +22,7 @@ from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, along_segments
+from vggtgeo.slam.window.adjustment import MIN_INVERSE_DEPTH
 
 MAX_SIGMA = 0.05
 """Largest relative standard deviation of a depth that counts as known."""
@@ -65,7 +66,7 @@ def _triangulated(
     # Weighted sum of squared residuals about the mean: chi-square with `views - 1` degrees of freedom.
     spread = second - total * mean**2
     agree = spread < chi_square.ppf(CHANCE, np.maximum(views - 1, 1))
-    known = (views >= MIN_VIEWS) & agree & (mean > 1e-3) & (sigma < MAX_SIGMA * mean)
+    known = (views >= MIN_VIEWS) & agree & (mean > MIN_INVERSE_DEPTH) & (sigma < MAX_SIGMA * mean)
     # One end alone does not give a line in space.
     both = known.all(1, keepdims=True)
     return np.where(both, mean, np.nan), np.where(both, sigma, np.nan)

@@ -32,6 +32,8 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord, SchurLevenbergM
 
 MAX_ITERATIONS = 12
 """Iterations of an adjustment of the window: the window of the next keyframe goes on from its result."""
+TOLERANCE = 1e-5
+"""Relative decrease of the energy that ends an adjustment: the next one, of a window or a round, goes on from there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +90,8 @@ def window_size(settings: SlamSettings) -> PaddedSize:
 
 
 def window_solver() -> SchurLevenbergMarquardt:
-    """Return the solver of all windows. A loose tolerance suffices: the next window continues from the result."""
-    return SchurLevenbergMarquardt(max_iterations=MAX_ITERATIONS, rtol=1e-5, record_iterations=True)
+    """Return the solver of all windows."""
+    return SchurLevenbergMarquardt(max_iterations=MAX_ITERATIONS, rtol=TOLERANCE, record_iterations=True)
 
 
 @in_double_precision
