@@ -24,9 +24,9 @@ import vggtgeo as vg
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import dense_map
+from vggtgeo.slam.known_map import load_map, save_map
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state_file import load_state, save_state
 
 APART = 30.0
 """Metres, or units of a map without depth: beyond what is seen."""
@@ -49,8 +49,8 @@ def main() -> None:
         + "|"
     )
     with TemporaryDirectory() as folder:
-        state = Path(folder) / "state.npz"
-        save_state(state, result.record.slam)
+        state = Path(folder) / "state.map"
+        save_map(state, result.record.slam)
         for count in given.keyframes:
             with multiprocessing.get_context("spawn").Pool(1) as pool:
                 cells = pool.apply(_row, (state, count))
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def _row(state: Path, count: int) -> list[str]:
-    slam = load_state(state)
+    slam = load_map(state)
     own = slam.keyframes
     keyframes = tuple(_beside(own[row % len(own)], row, row // len(own)) for row in range(count))
     ties = tuple(MeasuredRelativePose(row, row + 1, np.eye(4), np.eye(6)) for row in range(count - 1))

@@ -21,12 +21,12 @@ from vggtgeo.geometry import rigid
 from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.simulation.sequence import SyntheticSequence
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.sparse_map.connected import loop_edges
+from vggtgeo.slam.sparse_map.map import loop_edges
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.judge import judge
+from vggtgeo.slam.window_steps import merge_pending_window
 
 HEADER = (
     "| seed | returns | frames | keyframes | odometry, cm | adjusted, cm | loops | false | verdict |\n"

@@ -29,16 +29,16 @@ STAIR = (
 """Packages of `vggtgeo`, the lowest first: each imports of those below it; those of one step nothing of each other."""
 STEP = {package: step for step, packages in enumerate(STAIR) for package in packages}
 SLAM_STAIR = (
-    ("clock", "made_ahead", "precision", "threads"),
+    ("clock", "precision", "threads"),
     ("perception",),
     ("settings",),
     ("sparse_map",),
     ("camera", "tracking", "window"),
     ("state",),
-    ("callback", "keyframe_decision", "pending_window", "recorded_prior", "submaps", "window_steps"),
+    ("callback", "keyframe_decision", "submaps", "window_steps"),
     ("window_recorder",),
     ("global_map",),
-    ("manhattan", "start"),
+    ("manhattan", "recorded_prior", "start"),
     ("pipeline",),
     ("state_file",),
     ("known_map",),

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from changed import changed
 from scipy.spatial.transform import Rotation
 from tiny_state import CAMERA, HEIGHT, WIDTH, keyframe, state
 
@@ -25,7 +24,7 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 SETTINGS = KeyframeSettings(keyframe_distance=0.2, keyframe_angle=float(np.deg2rad(10.0)))
 ENOUGH = 50
 METRIC = state()
-UNITLESS = changed(METRIC, "map", metric=False, keyframes=tuple(map(keyframe, range(3))))
+UNITLESS = METRIC.with_map(metric=False, keyframes=tuple(map(keyframe, range(3))))
 
 
 def pose(metres: float = 0.0, degrees: float = 0.0) -> np.ndarray:
@@ -130,6 +129,6 @@ def test_without_a_unit_uncertain_depths_need_a_keyframe_sooner(unit: float) -> 
 def test_a_third_view_comes_early() -> None:
     """Of two keyframes a quarter of the limit is enough. Oracle: the share of the map with three."""
     moved, reference = pose(np.tan(0.5 * MAX_PARALLAX)), spread(1.0)
-    two = changed(UNITLESS, "map", keyframes=UNITLESS.keyframes[:2])
+    two = UNITLESS.with_map(keyframes=UNITLESS.keyframes[:2])
     change = view_change(UNITLESS, moved, reference, SETTINGS)
     assert view_change(two, moved, reference, SETTINGS) == pytest.approx(4 * change)

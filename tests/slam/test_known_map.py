@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from changed import changed
 from recorded_run import ROLES, SETTINGS
 from reported import raises
 from same_leaves import differences
@@ -25,9 +24,9 @@ from vggtgeo.geometry import rigid
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.known_map import as_map, entered, save_map
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.window_steps import merge_pending_window
 
 FRAMES, HALF = 14, 7
 FIXED = replace(SETTINGS, keyframes=replace(SETTINGS.keyframes, localise_only=True))
@@ -104,7 +103,7 @@ def test_the_state_of_a_run_is_a_map(known: Slam) -> None:
     camera = sequence().camera
     assert list(differences(entered(first_half(), camera, ROLES.points), entered(known, camera, ROLES.points))) == []
     with raises("known_map"):
-        entered(changed(known, "map", keyframes=()), camera, ROLES.points)
+        entered(known.with_map(keyframes=()), camera, ROLES.points)
 
 
 def test_the_second_half_goes_on_in_the_map(known: Slam) -> None:
@@ -129,7 +128,7 @@ def test_known_space_gets_no_second_keyframes(known: Slam) -> None:
 def test_localising_leaves_the_map_as_it_is(known: Slam) -> None:
     """Frames are placed, and no keyframe, match, tie or camera changes, however far they lead; oracle: the map."""
     # Without factors, so that going from keyframe to keyframe would add them anew.
-    known = changed(known, "map", factors=())
+    known = known.with_map(factors=())
     slam = vg.finish(run(0, settings=FIXED, known_map=known), ROLES, FIXED)
     assert len({record.reference for record in slam.frames}) > 1
     assert list(differences(known.map, slam.map)) == []

@@ -12,7 +12,7 @@ from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import State
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.manhattan import constrain_rotation, mean_rotation
+from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.factors import MeasuredRotation, factor_terms
@@ -82,12 +82,6 @@ def test_the_nearest_of_the_24_frames() -> None:
     truth = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
     for relabel in Rotation.create_group("O").as_matrix():
         np.testing.assert_allclose(nearest_frame(truth @ relabel, truth), truth, atol=1e-12)
-
-
-def test_the_mean_of_rotations() -> None:
-    # Proves the mean of rotations about one axis. Oracle: the mean angle.
-    turns = tuple(Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() for angle in (0.1, 0.2, 0.3))
-    np.testing.assert_allclose(mean_rotation(turns), turns[1], atol=1e-12)
 
 
 def test_the_residual_is_the_measured_rotation() -> None:

@@ -18,14 +18,12 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.recorded_prior import prior_summary
+from vggtgeo.slam.recorded_prior import prior_summary, with_recorded_ties
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.sparse_map.map import Map, submap_of
 from vggtgeo.slam.sparse_map.units import longer, scaled_factor, scaled_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.recorded_motion import SIGNIFICANT, compare

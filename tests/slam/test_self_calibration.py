@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from changed import changed
 from recorded_run import FRAMES, ROLES, SETTINGS, recorded_run, walk
 from vggtgeo.models.onnx.bounds import Refusals
 
@@ -20,13 +19,12 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.slam import self_calibration
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.window_steps import camera_prior
+from vggtgeo.slam.window_steps import camera_prior, merge_pending_window
 
 GUESS = Camera.guess(320, 240)
 FEW = vg.RunOptions(end=3, dense="none")
@@ -43,7 +41,7 @@ def found(**camera: Any) -> Slam:
 
 def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
     """The state that self-calibration gives whose last adjustment ends with `end`."""
-    monkeypatch.setattr(self_calibration, "run_frames", lambda *_: iter([changed(end, "camera", lens=None)]))
+    monkeypatch.setattr(self_calibration, "run_frames", lambda *_: iter([end.with_camera(lens=None)]))
     monkeypatch.setattr(self_calibration, "finish", lambda *_, **__: end)
     return self_calibration.self_calibrate(tuple, GUESS, ROLES, SETTINGS)
 
@@ -55,7 +53,7 @@ def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
     assert slam.camera.lens == LENS
     assert slam.intrinsics.tolist() == slam.camera.given.tolist() == list(LENS.intrinsics)
     for focal in (280.0, 5000.0):
-        far = changed(slam, "camera", given=np.array([focal, focal, 158.0, 121.0]))
+        far = slam.with_camera(given=np.array([focal, focal, 158.0, 121.0]))
         assert not far.camera.calibrated, "the last adjustment estimates it once more"
     assert (slam.frames, slam.keyframes, slam.map.factors) == ((), (), ())
     assert "280.0 px (images of 320 x 240), lens distortion k1 -0.100" in slam.notes[0]
@@ -68,23 +66,15 @@ def test_a_guess_is_held_until_there_are_three_keyframes() -> None:
     # Proves that a window of two keyframes leaves a camera that nobody gave where it is, that one of three does not,
     # and that the verdict knows which of them it has. Oracle: the standard deviations of the priors.
     slam = recorded_run().slam
-    wide = changed(slam, "camera", sigma=np.full(4, 100.0), self_calibrated=False)
+    wide = slam.with_camera(sigma=np.full(4, 100.0), self_calibrated=False)
     for count, held in ((2, True), (3, False)):
-        slam = changed(wide, "map", keyframes=wide.keyframes[:count])
+        slam = wide.with_map(keyframes=wide.keyframes[:count])
         assert bool(camera_prior(slam).sigma[0] < 1.0) == held
         numbers = frozenset(range(count))
         pairs = tuple(pair for pair in wide.map.pairs if numbers.issuperset(pair.key))
         frames = tuple(replace(record, second=None) for record in wide.frames if record.reference < count)
-        assert (
-            Claim.of(
-                replace(
-                    slam,
-                    map=replace(slam.map, pairs=pairs, factors=(), roots=(0,)),
-                    tracker=replace(slam.tracker, frames=frames),
-                )
-            ).guessed
-            == held
-        )
+        judged = slam.with_map(pairs=pairs, factors=(), roots=(0,)).with_tracker(frames=frames)
+        assert Claim.of(judged).guessed == held
 
 
 def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,11 +85,11 @@ def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.M
     def run(_: Any, camera: Camera, __: Any, ___: Any, ____: Clock, before: Slam | None) -> Any:
         tracked.append(camera.intrinsics[0] if before is None else before.intrinsics[0])
         slam = found()
-        return iter([changed(slam, "camera", intrinsics=tracked[-1] * np.array([1.0, 1.0, 0.5, 0.4]))])
+        return iter([slam.with_camera(intrinsics=tracked[-1] * np.array([1.0, 1.0, 0.5, 0.4]))])
 
     def end(slam: Slam, *_: Any, rounds: int, uncertainty: bool) -> Slam:
         assert (rounds, uncertainty) == (1, False), "nothing of the pass but its camera is used"
-        return changed(slam, "camera", intrinsics=np.array([answers[len(tracked) - 1]] * 2 + [160.0, 120.0]))
+        return slam.with_camera(intrinsics=np.array([answers[len(tracked) - 1]] * 2 + [160.0, 120.0]))
 
     monkeypatch.setattr(self_calibration, "run_frames", run)
     monkeypatch.setattr(self_calibration, "finish", end)
@@ -117,12 +107,12 @@ def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     # and a focal length that is none give no camera.
     whole = found()
     for metric, least in ((False, 10), (True, 3)):
-        of = lambda count, metric=metric: changed(whole, "map", metric=metric, keyframes=whole.keyframes[:count])
+        of = lambda count, metric=metric: whole.with_map(metric=metric, keyframes=whole.keyframes[:count])
         assert begun(monkeypatch, of(least)) is not None
         assert begun(monkeypatch, of(least - 1)) is None
     lost = tuple(replace(record, tracked=row > 5) for row, record in enumerate(whole.frames))
-    assert begun(monkeypatch, changed(whole, "tracker", frames=lost)) is None
-    assert begun(monkeypatch, changed(whole, "camera", intrinsics=np.array([1e6, 1e6, 160.0, 120.0]))) is None
+    assert begun(monkeypatch, whole.with_tracker(frames=lost)) is None
+    assert begun(monkeypatch, whole.with_camera(intrinsics=np.array([1e6, 1e6, 160.0, 120.0]))) is None
 
 
 def test_windows_hold_a_found_camera() -> None:
@@ -133,7 +123,7 @@ def test_windows_hold_a_found_camera() -> None:
     ends = []
     for camera_found in (True, False):
         first = begin(guess, ROLES)
-        first = changed(first, "camera", self_calibrated=camera_found)
+        first = first.with_camera(self_calibrated=camera_found)
         *_, slam = run_frames(iter(recorded_run().frames), guess, ROLES, SETTINGS, Clock(), first)
         ends.append(merge_pending_window(slam).intrinsics)
     held, free = ends
@@ -154,7 +144,7 @@ class _Passes:
             return None
         own = np.array(self._camera.intrinsics)
         slam = begin(camera, roles)
-        return changed(slam, "camera", intrinsics=own, given=own, self_calibrated=True)
+        return slam.with_camera(intrinsics=own, given=own, self_calibrated=True)
 
 
 ADJUSTED = replace(SETTINGS, camera=vg.SlamSettings().camera, refinement=vg.SlamSettings().refinement)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -22,16 +21,17 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRotation
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import PendingWindow, Slam
-from vggtgeo.slam.state_file import load_state, save_state
+from vggtgeo.slam.state_file import STATE_CLASSES, VERSION
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import SeenPoints, UnplacedFrame
-from vggtgeo.slam.window.window import WindowPrior
+from vggtgeo.slam.window.sliding_window import WindowPrior
+from vggtgeo.slam.window_steps import merge_pending_window
 
+STATE = Format("state", VERSION, by_name(STATE_CLASSES))
 MIDDLE = 4
 """Frame of the recorded run whose state is saved."""
 
@@ -40,7 +40,7 @@ MIDDLE = 4
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The file of a state in the middle of the run."""
     path = tmp_path_factory.mktemp("state") / "state.npz"
-    save_state(path, full(recorded_run().states[MIDDLE]))
+    STATE.write(path, full(recorded_run().states[MIDDLE]))
     return path
 
 
@@ -89,7 +89,7 @@ def test_every_field_comes_back_to_the_bit(saved: Path) -> None:
     before = full(recorded_run().states[MIDDLE])
     empty = [field.name for field in dataclasses.fields(Slam) if _is_empty(getattr(before, field.name))]
     assert empty == []  # a new field is to be given a content in `full`
-    assert list(differences(before, load_state(saved))) == []
+    assert list(differences(before, STATE.read(saved)[0])) == []
 
 
 def _is_empty(value: Any) -> bool:
@@ -99,8 +99,8 @@ def _is_empty(value: Any) -> bool:
 def test_the_run_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     """Every state after the saved one, up to the end, is that of the undisturbed run; oracle: that run."""
     run = recorded_run()
-    save_state(tmp_path / "state.npz", run.states[MIDDLE])
-    loaded = load_state(tmp_path / "state.npz")
+    STATE.write(tmp_path / "state.npz", run.states[MIDDLE])
+    loaded, _ = STATE.read(tmp_path / "state.npz")
     rest = iter(run.frames[MIDDLE + 1 :])
     again = list(run_frames(rest, run.sequence.camera, ROLES, SETTINGS, Clock(), loaded))
     again[-1] = merge_pending_window(again[-1])
@@ -112,7 +112,7 @@ def test_the_run_goes_on_to_the_same_bits(tmp_path: Path) -> None:
 
 def test_arrays_that_fields_share_are_stored_once(saved: Path) -> None:
     """An array that two fields hold is one array again; oracle: identity, before and after."""
-    before, after = recorded_run().states[MIDDLE].keyframes[0], load_state(saved).keyframes[0]
+    before, after = recorded_run().states[MIDDLE].keyframes[0], STATE.read(saved)[0].keyframes[0]
     for keyframe in (before, after):
         assert keyframe.points.pixels is keyframe.features.pixels
 
@@ -152,10 +152,3 @@ def test_what_is_not_listed_is_not_written(value: Any, tmp_path: Path) -> None:
     with raises("content[1]", error=TypeError):
         BOX.write(tmp_path / "box", Box((1, value)))
     assert not list(tmp_path.iterdir())
-
-
-def test_reading_keeps_the_callers_precision(saved: Path) -> None:
-    """Double precision is the pipeline's own, the caller's switch stays; oracle: the switch, and the type read."""
-    with jax.enable_x64(False):
-        assert load_state(saved).window.solved[1].intrinsics.dtype == jnp.float64
-        assert jnp.asarray(np.ones(2)).dtype == jnp.float32

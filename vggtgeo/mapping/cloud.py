@@ -10,7 +10,7 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.point_cloud import PointCloud, cell_numbers
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 
 STEP = 3
@@ -92,7 +92,7 @@ def _sparse_points(keyframe: Keyframe, intrinsics: np.ndarray) -> _Points:
     slots = keyframe.points
     known = slots.determined & (slots.inverse_depth > 0.02)
     points = rigid.unproject(slots.pixels[known], slots.inverse_depth[known], keyframe.pose, intrinsics)
-    colours = read_at(keyframe.image, slots.pixels[known])
+    colours = pinhole.at_pixels(keyframe.image, slots.pixels[known])
     return _Points.of(points, colours, np.zeros((len(points), 3)), slots.confidence[known])
 
 

@@ -14,7 +14,7 @@ from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.mapping.dense import fill_holes
 from vggtgeo.mapping.depth_map import DIFFERENCE_RANGE, DepthMap, PosedDepth, confirm
 from vggtgeo.slam.global_map.frame_poses import frame_poses
-from vggtgeo.slam.sparse_map.connected import submap_of
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 
 MAX_VIEWS = 4

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.mapping.depth_map import COMPRESS_FROM
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
 from vggtgeo.slam.threads import map_in_threads
 
@@ -90,7 +90,7 @@ def _corrections(keyframe: Keyframe, log_depth: np.ndarray) -> tuple[np.ndarray,
     """Return pixels, log depth corrections and weights of the key points that have both an estimate and a prior."""
     slots = keyframe.points
     height, width = log_depth.shape
-    here = read_at(log_depth, slots.pixels)
+    here = pinhole.at_pixels(log_depth, slots.pixels)
     inside = np.all((slots.pixels > -0.5) & (slots.pixels < (width - 0.5, height - 0.5)), axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         estimate = -np.log(slots.inverse_depth)

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.sparse_map.covisibility import Pair
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 MAX_ERROR = 4.0
 """Largest reprojection error of an observation, pixels: two scales of the adjustment's Cauchy kernel."""
@@ -172,5 +172,5 @@ def _colours(keyframes: Sequence[Keyframe], view: np.ndarray, pixel: np.ndarray)
     colours = np.zeros((len(view), 3), np.uint8)
     for number in np.unique(view):
         here = view == number
-        colours[here] = read_at(keyframes[number].image, pixel[here])
+        colours[here] = pinhole.at_pixels(keyframes[number].image, pixel[here])
     return colours

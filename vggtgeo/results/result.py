@@ -32,12 +32,12 @@ from vggtgeo.results.scene import depth_of_frames, write_scene
 from vggtgeo.results.summary import add_writing_time, compare_with_truth, load_poses, read_summary, summarise
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
+from vggtgeo.slam.window_steps import merge_pending_window
 
 DepthChoice = bool | Literal["every"]
 """Which depth images to save: none, those of the keyframes, or those of every frame."""

@@ -18,7 +18,6 @@ from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, Notice, R
 from vggtgeo.results.source import Source
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
@@ -26,6 +25,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import FramePose
 from vggtgeo.slam.window.sliding_window import warm_up
+from vggtgeo.slam.window_steps import merge_pending_window
 
 
 class PendingFrames:

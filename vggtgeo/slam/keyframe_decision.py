@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.settings.groups import KeyframeSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.covisibility import SAMPLES, share_inside
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import close_loop_while_tracking, view_of
@@ -26,8 +26,6 @@ MAX_SHIFT = 1.0
 the map, not the image, limits the pose."""
 THIRD_VIEW = 0.25
 """Share of these limits at which a map gets its third keyframe."""
-SAMPLES = 64
-"""Key points that this is measured on."""
 
 
 def becomes_keyframe(slam: Slam, found: Track, settings: KeyframeSettings) -> bool:
@@ -39,13 +37,7 @@ def becomes_keyframe(slam: Slam, found: Track, settings: KeyframeSettings) -> bo
 def needs_keyframe(slam: Slam, pose: np.ndarray, keyframe: Keyframe, inliers: int, settings: KeyframeSettings) -> bool:
     """Return whether a frame sees too little of its keyframe (`view_change`), or shares too few matches with it.
 
-    Args:
-        slam: the state, for its camera and whether lengths are metres.
-        pose: of the frame, float64 [4, 4], world -> camera.
-        keyframe: that it was tracked against.
-        inliers: matches with that keyframe that agree with the pose.
-        settings: largest distance and angle, least inliers.
-
+    pose: of the frame, float64 [4, 4], world -> camera. inliers: matches with the keyframe that agree with the pose.
     """
     return view_change(slam, pose, keyframe, settings) > 1.0 or inliers < settings.min_inliers
 
@@ -78,10 +70,7 @@ def _unitless_change(pose: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarra
     relative = pose @ rigid.invert(keyframe.pose)
     turned = pinhole.rays(keyframe.points.pixels[some], intrinsics) @ relative[:3, :3].T
     moved = turned + inverse[:, None] * relative[:3, 3]
-    height, width = keyframe.size
-    with np.errstate(invalid="ignore"):
-        x, y = pinhole.project(moved, intrinsics).T
-        left = 1.0 - np.mean((x > 0) & (x < width) & (y > 0) & (y < height))
+    left = 1.0 - share_inside(pinhole.project(moved, intrinsics), keyframe)
     sine = np.linalg.norm(np.cross(turned, moved), axis=1)
     parallax = np.sqrt(np.mean(np.arctan2(sine, (turned * moved).sum(1)) ** 2))
     sigma = keyframe.points.estimate_sigma[np.isfinite(keyframe.points.estimate_sigma)]
@@ -127,4 +116,4 @@ def track_by_old_keyframe(
     near = again.keyframe
     if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):
         return slam, again
-    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie_between(found, again)))), again
+    return slam.with_factors(tie_between(found, again)), again

@@ -20,10 +20,10 @@ from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
+from vggtgeo.slam.window_steps import merge_pending_window
 
 MAP = Format("map", VERSION, by_name(STATE_CLASSES))
 MIN_REDESCRIBED = 0.2
@@ -49,10 +49,8 @@ def as_map(slam: Slam) -> Slam:
         )
         for keyframe in slam.keyframes
     )
-    known = replace(slam.map, keyframes=keyframes, axes=())
-    estimate = slam.camera
-    camera = replace(estimate, self_calibrated=False, readout=None)
-    return Slam(known, camera)
+    camera = replace(slam.camera, self_calibrated=False, readout=None)
+    return Slam(replace(slam.map, keyframes=keyframes, axes=()), camera)
 
 
 def save_map(path: str | os.PathLike[str], slam: Slam) -> None:
@@ -104,29 +102,22 @@ def entered(known: Slam, camera: Camera, points: PointMatcher) -> Slam:
     if not known.keyframes:
         raise InputError("`known_map` has no keyframe; give a map, or the state of a run that has tracked some frames")
     known = as_map(known)
-    height, width = known.keyframes[0].size
-    if (width, height) != (camera.width, camera.height):
-        raise InputError(
-            f"`known_map` is of images of {width} x {height} pixels; those of this run are {camera.width} x "
-            f"{camera.height}: a map is used with the camera that it was made with"
-        )
-    given = np.array(camera.intrinsics, np.float64)
     own = known.camera.given if known.camera.calibrated else known.intrinsics
-    if camera.known and np.abs(given - own).max() > SAME_CAMERA * own[0]:
-        cameras = [", ".join(f"{value:.1f}" for value in values) for values in (own, given)]
+    given = np.array(camera.intrinsics, np.float64)
+    differs = camera.known and np.abs(given - own).max() > SAME_CAMERA * own[0]
+    height, width = known.keyframes[0].size
+    if differs or (width, height) != (camera.width, camera.height):
+        before, now = (", ".join(f"{value:.1f}" for value in values) for values in (own, given))
         raise InputError(
-            f"`known_map` is of a camera with fx, fy, cx, cy = {cameras[0]} px; that of this run has {cameras[1]} px: "
-            "a map is used with the camera that it was made with"
+            f"`known_map` is of images of {width} x {height} pixels with fx, fy, cx, cy = {before} px; those of this "
+            f"run are {camera.width} x {camera.height} with {now} px: use a map with the camera that it was made with"
         )
     _check_matcher(known, points)
+    known = known.with_tracker(lost=1)
     if known.camera.calibrated:
-        return replace(known, tracker=replace(known.tracker, lost=1))
+        return known
     # Its own run found it, and its keyframes stand as that camera sees them.
-    return replace(
-        known,
-        tracker=replace(known.tracker, lost=1),
-        camera=replace(known.camera, given=known.intrinsics, self_calibrated=True),
-    )
+    return known.with_camera(given=known.intrinsics, self_calibrated=True)
 
 
 def _check_matcher(known: Slam, points: PointMatcher) -> None:

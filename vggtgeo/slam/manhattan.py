@@ -8,8 +8,6 @@ error does not grow with the length of the path. It enters the adjustment as a t
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -30,26 +28,17 @@ def constrain_rotation(slam: Slam, settings: SlamSettings) -> Slam:
         return slam
     keyframe = slam.keyframes[slam.window.members[-1]]
     rotation = keyframe.pose[:3, :3]
-    axes = mean_rotation(slam.map.axes) if slam.map.axes else None
+    axes = Rotation.from_matrix(np.asarray(slam.map.axes)).mean().as_matrix() if slam.map.axes else None
     predicted = None if axes is None else rotation @ axes
     view = ManhattanEstimator().estimate(keyframe.lines.segments.endpoints, slam.intrinsics, predicted)
     if view is None:
         return slam
     if axes is None:
-        return replace(slam, map=replace(slam.map, axes=(rotation.T @ view.rotation,)))
+        return slam.with_map(axes=(rotation.T @ view.rotation,))
     if len(slam.map.axes) < FIRST_VIEWS:
-        return replace(
-            slam,
-            map=replace(slam.map, axes=(*slam.map.axes, rotation.T @ nearest_frame(view.rotation, rotation @ axes))),
-        )
+        return slam.with_map(axes=(*slam.map.axes, rotation.T @ nearest_frame(view.rotation, rotation @ axes)))
     off = Rotation.from_matrix(rotation @ axes @ view.rotation.T).as_rotvec()
     if np.linalg.norm(off) > MAX_DISAGREEMENT:
         return slam
     # `view.information` is that of `Log(R M^T)` at the tracked pose; degrees apart, the root at zero is the same.
-    measured = MeasuredRotation(keyframe.number, view.rotation @ axes.T, view.information)
-    return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, measured)))
-
-
-def mean_rotation(rotations: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Return the rotation nearest to all of `rotations` [3, 3] (chordal mean)."""
-    return Rotation.from_matrix(np.asarray(rotations)).mean().as_matrix()
+    return slam.with_factors(MeasuredRotation(keyframe.number, view.rotation @ axes.T, view.information))

@@ -12,20 +12,18 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
-from vggtgeo.slam.global_map.join_submaps import join_submaps
+from vggtgeo.slam.global_map.joining import join_submaps
 from vggtgeo.slam.keyframe_decision import becomes_keyframe, track_by_old_keyframe, view_change
 from vggtgeo.slam.manhattan import constrain_rotation
-from vggtgeo.slam.pending_window import begin_window, is_due, merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import RecordedPrior, recorded_prior
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
-from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.sparse_map.map import Map, submap_of
 from vggtgeo.slam.start import (
     begin_again_with_depth,
     start_without_depth,
@@ -57,7 +55,7 @@ from vggtgeo.slam.tracking.track import (
 )
 from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose
 from vggtgeo.slam.tracking.two_view_motion import usual_step
-from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
+from vggtgeo.slam.window_steps import adjust_window, begin_window, insert_keyframe, is_due, merge_pending_window
 
 LOST_PATIENCE = 10
 """Number of lost frames with texture after which a new submap begins. Black frames do not count."""

@@ -1,25 +1,45 @@
-"""Recorded poses in the state of a run: where the next frame is, frames that no image places, and ties of keyframes.
+"""Recorded poses as a prior of the motion: while the run goes on, and in the last adjustment.
 
-All this only while the images agree with them (`tracking/recorded_motion.py`): until then, and where they are of
-another recording, a run with them is to the last bit the run without.
+They tell where the next frame is, place frames that no image places, and give factors between keyframes; at the end
+also the unit of a map without depth, and the places of submaps that never met. All this only while the images agree
+with them (`tracking/recorded_motion.py`): until then, and where they are of another recording, a run with them is to
+the last bit the run without.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 
+from vggtgeo.geometry import rigid
+from vggtgeo.slam.global_map.drift_correction import at_poses
+from vggtgeo.slam.global_map.joining import moved_submap
+from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, squared_distance
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.sparse_map.connected import submap_of
+from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.sparse_map.units import longer
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.recorded_motion import carried, compare, recorded_tie
+from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.tracking.recorded_motion import (
+    Comparison,
+    carried,
+    compare,
+    recorded_tie,
+    recorded_ties,
+    recorded_units,
+    weighted_median,
+)
 from vggtgeo.slam.tracking.track import Track
 from vggtgeo.slam.tracking.tracker import FramePose
+
+AROUND = 5
+"""Motions before and after a keyframe that tell its unit: about as many as are adjusted together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +72,7 @@ class RecordedPrior:
         tie = recorded_tie(self.recorded, before, newest, self.unit)
         if tie is None or known or label[before.number] != label[newest.number]:
             return slam
-        return replace(slam, map=replace(slam.map, factors=(*slam.map.factors, tie)))
+        return slam.with_factors(tie)
 
 
 def recorded_prior(slam: Slam, roles: Roles) -> RecordedPrior | None:
@@ -76,3 +96,133 @@ def prior_summary(slam: Slam, roles: Roles) -> dict[str, Any]:
         return {}
     found = compare(roles.recorded, slam.map)
     return {"pose_prior": {"used": found.accepted, **asdict(found)}}
+
+
+def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
+    """Add all recorded motions between keyframes before the last adjustment, if the images agree with them.
+
+    Without agreement none is added. A map of free scale gets the unit of the recording. Submaps, and frames that no
+    image has placed, are joined to the rest by the recorded motions.
+    """
+    if roles.recorded is None:
+        return slam
+    found = compare(roles.recorded, slam.map)
+    slam = slam.with_notes(_note(found))
+    if not found.accepted:
+        # A keyframe that no image ties to the others stays tied by what was recorded.
+        return _with_ties(slam, [tie for tie in slam.map.recorded_factors if _alone(slam, tie)])
+    units = recorded_units(roles.recorded, slam.map)
+    if not slam.metric:
+        slam = _in_recorded_unit(slam, roles.recorded, units)
+        units = np.where(np.isfinite(units), 1.0, np.nan)
+    slam = _with_carried_frames(_joined(slam, roles.recorded, units), roles.recorded, units)
+    return _with_ties(slam, recorded_ties(roles.recorded, slam.map, units))
+
+
+def _with_ties(slam: Slam, ties: list[MeasuredRelativePose]) -> Slam:
+    """Replace the recorded motions of the state."""
+    factors = [factor for factor in slam.map.factors if not getattr(factor, "recorded", False)]
+    return slam.with_map(factors=(*factors, *ties))
+
+
+def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
+    """Scale lengths to the unit of the recording, in submaps where it is known.
+
+    Scale drifts from keyframe to keyframe: each has the unit that the motions around it tell. The way from one to the
+    next is then that of the map, or the recorded one where both disagree by more than the recording drifts.
+    """
+    poses, scales = np.array([keyframe.pose for keyframe in slam.keyframes]), np.ones(len(slam.keyframes))
+    for submap in submaps_by_size(slam):
+        if not np.isfinite(units[submap[0]]):
+            continue
+        numbers = tuple(sorted(submap, key=lambda number: slam.keyframes[number].timestamp))
+        ties = [
+            recorded_tie(recorded, slam.keyframes[first], slam.keyframes[second], 1.0)
+            for first, second in pairwise(numbers)
+        ]
+        local = _local_units(slam, ties, numbers, float(units[numbers[0]]))
+        scales[list(numbers)] = 1.0 / local
+        poses[numbers[0], :3, 3] /= local[0]
+        for row, (tie, (first, second)) in enumerate(zip(ties, pairwise(numbers), strict=True)):
+            before, after = (slam.keyframes[number].pose for number in (first, second))
+            poses[second] = longer(after @ rigid.invert(before), 1.0 / local[row]) @ poses[first]
+            if tie is not None and squared_distance(tie, poses) > LOOP_GATE:
+                recorded_motion = tie.pose if tie.second == second else rigid.invert(tie.pose)
+                poses[second] = recorded_motion @ poses[first]
+    factors = tuple(factor for factor in slam.map.factors if not isinstance(factor, MeasuredBaseline))
+    return at_poses(slam.with_map(factors=factors), poses, scales)
+
+
+def _local_units(
+    slam: Slam, ties: list[MeasuredRelativePose | None], numbers: tuple[int, ...], usual: float
+) -> np.ndarray:
+    """Return the length of a unit of the recording at each keyframe of a submap.
+
+    It is the median of the ratio of lengths over the motions around it, weighted by the recorded length; `usual`
+    without any.
+    """
+    places = rigid.centres(np.array([slam.keyframes[number].pose for number in numbers]))
+    lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    true = np.array([0.0 if tie is None else np.linalg.norm(tie.pose[:3, 3]) for tie in ties])
+    found = np.full(len(numbers), usual)
+    for row in range(len(numbers)):
+        around = slice(max(row - AROUND, 0), row + AROUND)
+        known = (lengths[around] > 0) & (true[around] > 0)
+        if known.any():
+            found[row] = weighted_median(lengths[around][known] / true[around][known], true[around][known])
+    return found
+
+
+def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
+    """Place submaps of known unit by the recorded motion from the nearest keyframe of the largest submap.
+
+    Submaps that were joined to it before count as part of it.
+    """
+    main, *others = [set(numbers) for numbers in submaps_by_size(slam) if np.isfinite(units[numbers[0]])]
+    for other in others:
+        pairs = product((slam.keyframes[number] for number in main), (slam.keyframes[number] for number in other))
+        near, own = min(pairs, key=lambda pair: abs(pair[0].timestamp - pair[1].timestamp))
+        tie = recorded_tie(recorded, near, own, float(units[own.number]))
+        if tie is None:
+            continue
+        motion = tie.pose if tie.second == own.number else rigid.invert(tie.pose)
+        began = slam.keyframes[min(other)].frame
+        slam = moved_submap(slam, other, rigid.invert(own.pose) @ motion @ near.pose).with_factors(tie)
+        slam = slam.with_notes(f"the submap that began at frame {began} is joined to the rest by recorded poses")
+        slam = slam.with_window(prior=None, solved=None, held=())
+        main |= other
+    return slam
+
+
+def _with_carried_frames(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
+    """Place each frame that no image has placed by the recorded motion from the frame before."""
+    frames: list[FramePose] = []
+    last: FramePose | None = None
+    for record in slam.frames:
+        found = None
+        if not record.tracked and last is not None and np.isfinite(units[last.reference]):
+            found = carried(recorded, slam.map, last, record.timestamp, float(units[last.reference]))
+        frames.append(record if found is None else _placed_by(record, found))
+        last = frames[-1] if frames[-1].tracked else last
+    return slam.with_tracker(frames=tuple(frames))
+
+
+def _placed_by(record: FramePose, found: Track) -> FramePose:
+    number = found.keyframe.number
+    return replace(record, reference=number, relative=found.relative, tracked=True, evidence=found.evidence)
+
+
+def _alone(slam: Slam, tie: MeasuredRelativePose) -> bool:
+    """Return whether no other factor connects the later keyframe of a recorded motion to an earlier one."""
+    earlier = [pair.first for pair in slam.map.pairs if pair.second == tie.second and len(pair.points)]
+    tracked = [other.first for other in slam.map.odometry_factors if other.second == tie.second]
+    return not any(number < tie.second for number in (*earlier, *tracked))
+
+
+def _note(found: Comparison) -> str:
+    basis = f"{found.compared} motions between keyframes, logarithm of the likelihood ratio {found.evidence:.1f}"
+    if found.accepted:
+        return f"recorded poses are a prior of the motion: the images agree with them ({basis})"
+    if found.contradicted:
+        return f"the recorded poses are not of these images, and are not used ({basis})"
+    return f"the recorded poses are not used: too little is known to compare them with the images ({basis})"

@@ -24,21 +24,21 @@ from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import ROUNDS, adjust_all
-from vggtgeo.slam.global_map.join_at_end import join_at_end
+from vggtgeo.slam.global_map.joining import join_at_end
 from vggtgeo.slam.global_map.loops import close_loops
 from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
-from vggtgeo.slam.global_map.recorded_at_end import with_recorded_ties
 from vggtgeo.slam.known_map import entered
-from vggtgeo.slam.made_ahead import made_ahead
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
 from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.recorded_prior import with_recorded_ties
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.threads import made_ahead
 from vggtgeo.slam.tracking.frame_refinement import against_nearest
+from vggtgeo.slam.window_steps import merge_pending_window
 
 AHEAD = 3
 """Frames that are prepared before they are needed."""

@@ -65,20 +65,11 @@ def self_calibrate(
         found = finish(last, roles, settings, rounds=1, uncertainty=False)
         if not _is_plausible(found, camera):
             return None
-        before = begin(camera, roles)
-        before = replace(
-            before,
-            camera=replace(
-                before.camera,
-                intrinsics=found.intrinsics,
-                given=found.intrinsics,
-                self_calibrated=True,
-                lens=found.camera.lens,
-            ),
-            notes=(_note(found, passes, camera),),
-        )
-        moved = np.abs(found.intrinsics[:2] / last.intrinsics[:2] - 1).max()
-        if moved < SETTLED and (found.camera.lens is None) == (last.camera.lens is None):
+        before, own, lens = begin(camera, roles), found.intrinsics, found.camera.lens
+        before = before.with_camera(intrinsics=own, given=own, self_calibrated=True, lens=lens)
+        before = before.with_notes(_note(found, passes, camera))
+        moved = np.abs(own[:2] / last.intrinsics[:2] - 1).max()
+        if moved < SETTLED and (lens is None) == (last.camera.lens is None):
             break
     return before
 

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.sparse_map.factors import Factor
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.tracking.tracker import FramePose, Tracker, frame_pose
-from vggtgeo.slam.window.window import Window
+from vggtgeo.slam.window.sliding_window import Window
 
 
 @dataclass(frozen=True, eq=False)
 class PendingWindow:
-    """An adjustment of the window that runs beside tracking, see `pending_window.py`.
+    """An adjustment of the window that runs beside tracking, see `window_steps.py`.
 
     due: number of frames at which the state takes its result. begun: the state that it started from. result: that
     state, adjusted.
@@ -88,6 +90,30 @@ class Slam:
     def frames(self) -> tuple[FramePose, ...]:
         """Every frame's pose relative to its keyframe."""
         return self.tracker.frames
+
+    def with_map(self, **fields: Any) -> Slam:
+        """Return the state with these fields of its map replaced."""
+        return replace(self, map=replace(self.map, **fields))
+
+    def with_tracker(self, **fields: Any) -> Slam:
+        """Return the state with these fields of its tracker replaced."""
+        return replace(self, tracker=replace(self.tracker, **fields))
+
+    def with_window(self, **fields: Any) -> Slam:
+        """Return the state with these fields of its window replaced."""
+        return replace(self, window=replace(self.window, **fields))
+
+    def with_camera(self, **fields: Any) -> Slam:
+        """Return the state with these fields of the estimate of its camera replaced."""
+        return replace(self, camera=replace(self.camera, **fields))
+
+    def with_factors(self, *factors: Factor) -> Slam:
+        """Return the state with further factors in its map."""
+        return self.with_map(factors=(*self.map.factors, *factors))
+
+    def with_notes(self, *notes: str) -> Slam:
+        """Return the state with those of the notes that it does not have yet."""
+        return replace(self, notes=(*self.notes, *(note for note in notes if note not in self.notes)))
 
     def pose(self, record: FramePose) -> np.ndarray:
         """Return world -> camera of a frame, float64 [4, 4], by the current estimate of its keyframe."""

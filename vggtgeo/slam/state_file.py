@@ -1,4 +1,4 @@
-"""The state of the pipeline as a file: `step` continues from it exactly as from the saved state.
+"""Classes of a state in files (checkpoints, maps): `step` continues from a loaded state exactly as from the saved one.
 
 Everything is stored, also what could be recomputed (the view of the reference, the last window's problem): that would
 need the poses and the camera at the time of its computation, and costs more to compute than to read. For a pending
@@ -7,7 +7,6 @@ window adjustment the result is awaited and stored separately: it is used at the
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import jaxlie
@@ -24,15 +23,12 @@ from vggtgeo.bundle.terms.rotation import RotationPrior
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import path_of
-from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.mast3r import Mast3rView
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.perception.rgbd_view import Points, RgbdView
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
@@ -42,7 +38,7 @@ from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, UnplacedFrame
 from vggtgeo.slam.window.adjustment import Adjustment
-from vggtgeo.slam.window.window import Window, WindowPrior
+from vggtgeo.slam.window.sliding_window import Window, WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
@@ -51,52 +47,24 @@ STATE_CLASSES: tuple[type, ...] = (
         Slam,
         Map,
         CameraEstimate,
-        Tracker,
-        Window,
+        Readout,
         Camera,
-        PendingWindow,
+        Tracker,
         FramePose,
         SecondMotion,
         SeenPoints,
         UnplacedFrame,
         Evidence,
-        Keyframe,
-        Slots,
-        KeyframeImages,
-        CompressedImage,
     ),
+    *(Window, WindowPrior, PendingWindow, Keyframe, Slots, KeyframeImages, CompressedImage),
     *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
-    *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, WindowPrior, MarginalPrior, Readout),
+    *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, MarginalPrior),
     *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
     *(PointTerm, LineTerm, DepthPrior, IntrinsicsPrior, RelativePose, SurfaceAlignment, RotationPrior, BaselinePrior),
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
-"""All classes that a file may have; a state with any other is not written."""
+"""All classes that a file may have; a state with any other (descriptors of a user's matcher) is not written."""
 VERSION = 20
-STATE = Format("state", VERSION, by_name(STATE_CLASSES))
-
-
-def save_state(path: str | os.PathLike[str], slam: Slam) -> None:
-    """Write a state, atomically; no pickles.
-
-    Raises:
-        TypeError: the state has an object of a class that is not in `STATE_CLASSES` (for example descriptors of a
-            user's matcher).
-
-    """
-    STATE.write(path_of("path", path), slam)
-
-
-@in_double_precision
-def load_state(path: str | os.PathLike[str]) -> Slam:
-    """Load the state that `save_state` wrote, bit by bit.
-
-    Raises:
-        InputError: the file is missing, damaged, of a version that is not known, or holds no state.
-
-    """
-    found, _ = STATE.read(path_of("path", path))
-    return checked_state(Path(path), found)
 
 
 def checked_state(path: Path, found: object) -> Slam:

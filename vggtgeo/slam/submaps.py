@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.slam.sparse_map.connected import submap_of
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 
 

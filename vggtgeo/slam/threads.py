@@ -1,17 +1,25 @@
-"""Independent pieces of numpy and OpenCV work, spread over the cores: both let other threads run while they compute."""
+"""Work in threads: independent items over the cores, and values that are made before they are asked for.
+
+numpy and OpenCV let other threads run while they compute.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from contextlib import AbstractContextManager, nullcontext
+from queue import SimpleQueue
+from threading import Event, Semaphore, Thread
+from typing import Any, TypeVar
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 MAX_THREADS = 4
 """More wait for Python's lock: the pieces here are some milliseconds long."""
+PATIENCE = 5.0
+"""Seconds that whoever stops early waits for what is being made."""
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item], alone: bool = False) -> list[_Result]:
@@ -25,3 +33,46 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item],
         return [function(item) for item in todo]
     with ThreadPoolExecutor(min(workers, MAX_THREADS), thread_name_prefix="work") as pool:
         return list(pool.map(function, todo))
+
+
+def made_ahead(
+    make: Callable[[], _Result | None],
+    count: int,
+    waiting: Callable[[], AbstractContextManager[Any]] = nullcontext,
+) -> Iterator[_Result]:
+    """Yield the values of `make` until it returns None; make at most `count` ahead, in a thread.
+
+    Errors of `make` are raised here.
+
+    waiting: entered while the next one is waited for. A camera that stalls gives nothing, and does not end: so the
+    thread is no executor's, which the end of the program would wait for.
+    """
+    ready: SimpleQueue[tuple[_Result | None, BaseException | None]] = SimpleQueue()
+    room, stopped = Semaphore(count), Event()
+
+    def work() -> None:
+        while room.acquire() and not stopped.is_set():
+            try:
+                made, error = make(), None
+            except BaseException as raised:  # noqa: BLE001 - of any kind: it is raised where it is waited for
+                made, error = None, raised
+            ready.put((made, error))
+            if made is None:
+                break
+
+    thread = Thread(target=work, name="frames", daemon=True)
+    thread.start()
+    try:
+        while True:
+            with waiting():
+                made, error = ready.get()
+            if error is not None:
+                raise error
+            if made is None:
+                return
+            room.release()
+            yield made
+    finally:
+        stopped.set()
+        room.release()
+        thread.join(PATIENCE)

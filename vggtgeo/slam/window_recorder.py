@@ -67,16 +67,16 @@ class WindowRecorder(Callback):
         adjustment, state = slam.window.solved
         sizes = residual_sizes(adjustment.problem, state)
         shown = [term for term in adjustment.problem.terms if not isinstance(term, CameraTerm | DenseTerm)]
-        counts = {term.name: int(sizes.count[term.name]) for term in shown}
+        counts = {term.name: count for term in shown if (count := int(sizes.count[term.name]))}
         newest = slam.keyframes[adjustment.keyframes[-1]]
         energies = slam.window.energies if slam.window.energies is not None else np.full(2, np.nan)
         self.records.append(
             WindowRecord(
                 newest.frame,
                 newest.timestamp,
-                {name: float(sizes.rms[name]) for name, count in counts.items() if count},
-                {name: count for name, count in counts.items() if count},
-                {term.name: term.unit for term in shown if counts[term.name]},
+                {name: float(sizes.rms[name]) for name in counts},
+                counts,
+                {term.name: term.unit for term in shown if term.name in counts},
                 len(energies) - 1,
                 (float(energies[0]), float(energies[-1])),
             )

@@ -1,14 +1,38 @@
-"""The window's insertion and adjustment as steps of the whole state."""
+"""Steps of the whole state that change its window: insert a keyframe, adjust, and adjust in a thread beside tracking.
+
+The adjustment beside tracking starts with a new keyframe and is merged a fixed number of frames later. So a run is
+repeatable, whatever the speed of the machine. A new keyframe or a lost camera before that merges it at once.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import numpy as np
+
+from vggtgeo.models.classical import can_search
+from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
+from vggtgeo.slam.sparse_map.covisibility import match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window import sliding_window
-from vggtgeo.slam.window.adjustment import CameraPrior
+from vggtgeo.slam.state import PendingWindow, Slam
+from vggtgeo.slam.threads import map_in_threads
+from vggtgeo.slam.window.adjustment import CameraPrior, write_back
+from vggtgeo.slam.window.gauge import gauge_notes
+from vggtgeo.slam.window.line_triangulation import with_segment_depths
+from vggtgeo.slam.window.sliding_window import (
+    marginalise_oldest,
+    solve_jit,
+    window_edges,
+    window_problem,
+    window_solver,
+)
+
+LAG = 6
+"""Largest number of frames tracked meanwhile: matching and adjustment take as long as about five frames on two cores
+(`benchmarks/stage_times.py`)."""
 
 
 def insert_keyframe(
@@ -22,26 +46,84 @@ def insert_keyframe(
 ) -> Slam:
     """Insert a keyframe, which was tracked against `tied_to`, into the window and match it to the others.
 
-    length_known: whether the distance to `tied_to` is measured.
+    length_known: whether the distance to `tied_to` is measured. Images of keyframes outside the window are compressed.
     """
-    given = slam.map, slam.window, keyframe, slam.intrinsics, roles, settings, tied_to
-    known, window = sliding_window.enter(*given, length_known=length_known)
-    return replace(slam, map=known, window=window)
+    window = marginalise_oldest(slam.window, settings, tied_to)
+    match = lambda number: match_keyframes(
+        slam.keyframes[number], keyframe, roles, slam.intrinsics, length_known=length_known
+    )
+    matched = map_in_threads(match, window.members, alone=not can_search(keyframe.features))
+    pairs = tuple(pair for pair in matched if pair is not None)
+    members = (*window.members, keyframe.number)
+    # Members are read at every adjustment; decoding them each time would cost more than the memory is worth.
+    kept = tuple(k.expanded() if k.number in members else k.compressed() for k in slam.keyframes)
+    known = replace(slam.map, keyframes=(*kept, keyframe), pairs=(*slam.map.pairs, *pairs))
+    return replace(slam, map=known, window=replace(window, members=members))
 
 
 def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
-    """Adjust the window of the state."""
-    found = sliding_window.adjust(slam.map, slam.window, slam.intrinsics, camera_prior(slam), settings)
-    return replace(
-        slam,
-        map=found.map,
-        window=found.window,
-        camera=replace(slam.camera, intrinsics=found.intrinsics),
-        notes=(*slam.notes, *(note for note in found.notes if note not in slam.notes)),
+    """Bundle-adjust the window of the state: its keyframes and intrinsics."""
+    known, window = slam.map, slam.window
+    keyframes = list(known.keyframes)
+    # With measured depth, what a depth camera leaves out is glass, mirrors or far away: it is not triangulated.
+    if not known.metric:
+        members = {number: keyframes[number] for number in window.members}
+        for number, own in with_segment_depths(members, window_edges(known, members), slam.intrinsics).items():
+            keyframes[number] = own
+        known = replace(known, keyframes=tuple(keyframes))
+    adjustment, gauge = window_problem(known, window, slam.intrinsics, camera_prior(slam), settings)
+    slam = slam.with_notes(*gauge_notes(gauge, adjustment.keyframes, "window"))
+    solution = solve_jit(adjustment.problem, adjustment.initial, window_solver())
+    # The keyframes before the solve are still valid: go on with them, and report.
+    if not np.isfinite(float(solution.energy)):
+        failure = f"window at keyframe {window.members[-1]}: {solution.message}"
+        return replace(slam, map=known).with_notes(failure)
+    updated, intrinsics = write_back([keyframes[number] for number in window.members], adjustment, solution.state)
+    for own in updated:
+        keyframes[own.number] = own
+    history = np.asarray(solution.history, np.float64)
+    adjusted = slam.with_map(keyframes=tuple(keyframes)).with_camera(intrinsics=intrinsics)
+    return adjusted.with_window(
+        solved=(adjustment, solution.state), energies=history[np.isfinite(history)], iterations=solution.record
     )
 
 
 def camera_prior(slam: Slam) -> CameraPrior:
     """Return the prior of the intrinsics in the window."""
-    sigma = slam.camera.window_sigma(len(slam.keyframes))
-    return CameraPrior(slam.camera.given, sigma)
+    return CameraPrior(slam.camera.given, slam.camera.window_sigma(len(slam.keyframes)))
+
+
+def begin_window(slam: Slam, adjusted: Callable[[], Slam]) -> Slam:
+    """Return the state while `adjusted` is computed in a thread.
+
+    slam: state with the new keyframe as tracked; tracking continues in it. adjusted: pure function that returns the
+    state with the keyframe's matches and the adjusted window.
+    """
+    pool = ThreadPoolExecutor(1, thread_name_prefix="window")
+    result = pool.submit(in_double_precision(adjusted))
+    pool.shutdown(wait=False)
+    return replace(slam, pending=PendingWindow(len(slam.frames) + 1 + LAG, slam, result))
+
+
+def is_due(slam: Slam) -> bool:
+    """Return whether the next frame is to be tracked in the adjusted map."""
+    return slam.pending is not None and len(slam.frames) >= slam.pending.due
+
+
+def merge_pending_window(slam: Slam) -> Slam:
+    """Wait for the pending window and merge it.
+
+    Keyframes, matches and window are from its thread; frames, factors and notes added since it began from tracking. For
+    frames before it began, the thread's records are used.
+    """
+    if slam.pending is None:
+        return slam
+    begun, found = slam.pending.begun, slam.pending.result.result()
+    since = slam.tracker.frames[len(found.frames) :]
+    factors = slam.map.factors[len(begun.map.factors) :]
+    return replace(
+        found,
+        map=replace(found.map, factors=(*found.map.factors, *factors)),
+        tracker=replace(slam.tracker, frames=(*found.frames, *since)),
+        notes=(*found.notes, *slam.notes[len(begun.notes) :]),
+    )

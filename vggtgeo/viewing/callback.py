@@ -24,7 +24,7 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.settings.groups import WindowSettings
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots, read_at
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
 from vggtgeo.viewing import entities
@@ -108,7 +108,7 @@ def own_cloud(keyframe: Keyframe, intrinsics: np.ndarray, *, dense: bool) -> tup
     known = np.nonzero(np.isfinite(inverse) & (inverse > 0.1))[0][:MAX_POINTS]
     pixels = keyframe.points.pixels[known]
     points = pinhole.rays(pixels, intrinsics) / inverse[known, None]
-    return points.astype(np.float32), read_at(keyframe.image, pixels)
+    return points.astype(np.float32), pinhole.at_pixels(keyframe.image, pixels)
 
 
 class RerunCallback(Callback):

@@ -7,13 +7,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.run import frame_trajectory
-from vggtgeo.slam.sparse_map.connected import loop_edges, submap_of
 from vggtgeo.slam.sparse_map.covisibility import Pair
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, read_at
+from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.map import loop_edges, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import lost_stretches
 from vggtgeo.slam.window_recorder import WindowRecord
@@ -168,7 +168,7 @@ def log_points(stream: Any, keyframes: list[Keyframe], intrinsics: np.ndarray) -
         inverse = keyframe.points.inverse_depth
         known = np.nonzero(np.isfinite(inverse) & (inverse > 0.1))[0]
         points.append(rigid.unproject(keyframe.points.pixels[known], inverse[known], keyframe.pose, intrinsics))
-        colours.append(read_at(keyframe.image, keyframe.points.pixels[known]))
+        colours.append(pinhole.at_pixels(keyframe.image, keyframe.points.pixels[known]))
     stream.log("world/points", rr.Points3D(np.concatenate(points), colors=np.concatenate(colours), radii=-1.5))
 
 

@@ -26,12 +26,12 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.lens import RADIAL, FoundLens, can_undistort, find_lens, largest_shift
 from vggtgeo.slam.global_map.global_adjustment import _apply_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
-from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import SeenPoints
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.judge import aligned
+from vggtgeo.slam.window_steps import merge_pending_window
 
 WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
 _solve = eqx.filter_jit(vg.solve)

@@ -26,8 +26,7 @@ from vggtgeo.slam.camera.rolling_shutter import (
     pair_to_global_shutter,
     problem_to_global_shutter,
 )
-from vggtgeo.slam.global_map.carried_poses import carried_poses
-from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
+from vggtgeo.slam.global_map.carried_poses import camera_motions, carried_poses, frame_interval
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
 
 WIDTH, HEIGHT = SIZE

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from changed import changed
 from posed_keyframes import SIZE, small_keyframe
 
 from vggtgeo.geometry import rigid
@@ -82,13 +81,13 @@ def test_a_keyframe_that_was_tracked_wrongly_leaves_the_frames_before_it_where_t
     that frame alone where it did not; without depth they are another unit, or a length that was a guess. Oracle: the
     straight paths.
     """
-    slam = changed(_walked(begins=(0,)), "map", metric=metric)
+    slam = _walked(begins=(0,)).with_map(metric=metric)
     known = np.diag(np.repeat([sigma, 0.1], 3) ** -2.0)
     arrivals = [record for record in slam.frames if record.arrival is not None]
     ties = tuple(
         MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known, by_rays) for r in arrivals if r.arrival
     )
-    _, poses = carried_poses(changed(slam, "map", factors=ties))
+    _, poses = carried_poses(slam.with_map(factors=ties))
     for first in (0, 4):
         step = _straight(length) @ rigid.invert(_straight(length)[0])
         assert np.allclose(poses[first : first + 4] @ rigid.invert(poses[first]), step[:4], atol=1e-12)

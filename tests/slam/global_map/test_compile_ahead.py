@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from changed import changed
 from invoked import invoke
 from recorded_run import SETTINGS, recorded_run
 
@@ -55,7 +54,7 @@ def _with_or_without_depth(metric: bool) -> Slam:
     """A recorded run, its map with or without depth."""
     slam = recorded_run().states[-1]
     factors = (() if metric else (MeasuredBaseline(0, 1, 1.0, 1e-3),)) + slam.map.factors
-    return changed(slam, "map", metric=metric, factors=factors)
+    return slam.with_map(metric=metric, factors=factors)
 
 
 def _check_asked(

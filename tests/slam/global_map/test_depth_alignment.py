@@ -128,7 +128,7 @@ def test_surfaces_bring_keyframes_back(keyframes: list[Keyframe]) -> None:
     problem, initial, _ = make_scene().pack(fixed=True)
     solve = jax.jit(vg.solve)
     for _ in range(6):
-        term = align_pairs(wrong, pairs, surfaces, EFFECTIVE)
+        term = align_pairs(wrong, pairs, surfaces, EFFECTIVE, len(pairs))
         poses = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(np.array([each.pose for each in wrong]))))
         start = vg.State(poses, initial.intrinsics, initial.inverse_depth)
         found = solve(problem.with_terms((term, problem.depth)), start).state
@@ -151,7 +151,7 @@ def test_one_wall_leaves_free_what_it_does_not_tell(keyframes: list[Keyframe]) -
     wall = np.full(SIZE, 2.0, np.float16)
     flat = [replace(each, images=replace(each.images, depth=wall), pose=np.eye(4)) for each in keyframes]
     surfaces = [Surface.of(each, INTRINSICS) for each in flat]
-    term = align_pairs(flat, [(0, 1)], surfaces, EFFECTIVE)
+    term = align_pairs(flat, [(0, 1)], surfaces, EFFECTIVE, 1)
     values = np.linalg.svd(np.asarray(term.root[0]))[1]
     assert np.sum(values > 1e-6 * values[0]) == 3
     slid = np.array([0.02, -0.03, 0, 0, 0, 0.05])
@@ -165,5 +165,5 @@ def test_what_does_not_overlap_says_nothing(keyframes: list[Keyframe]) -> None:
     # Proves that a pair without a common surface has no weight. Oracle: two cameras back to back.
     turned = replace(keyframes[1], pose=moved(np.eye(4), np.array([0, 0, 0, 0, np.pi, 0])))
     surfaces = [Surface.of(each, INTRINSICS) for each in keyframes]
-    term = align_pairs([keyframes[0], turned], [(0, 1)], surfaces, EFFECTIVE)
+    term = align_pairs([keyframes[0], turned], [(0, 1)], surfaces, EFFECTIVE, 1)
     assert float(term.weight[0]) == 0.0

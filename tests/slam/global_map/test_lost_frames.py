@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from changed import changed
 from recorded_run import ROLES, SETTINGS, room, run_over
 from vggtgeo.models.classical import NoDepth
 
@@ -38,12 +37,11 @@ def lost(walk: tuple[list[Frame], Camera, Trajectory]) -> Slam:
     slam = run_over(frames[:KNOWN], camera)
     last = slam.frames[-1]
     later = [replace(last, frame=frame.index, timestamp=frame.timestamp, tracked=False) for frame in frames[KNOWN:]]
-    unplaced = tuple(_waiting(frame) for frame in frames[KNOWN:])
-    tracker = replace(slam.tracker, frames=(*slam.frames, *later), unplaced=unplaced)
-    return replace(slam, map=replace(slam.map, metric=False), tracker=tracker)
+    unplaced = tuple(_lost(frame) for frame in frames[KNOWN:])
+    return slam.with_map(metric=False).with_tracker(frames=(*slam.frames, *later), unplaced=unplaced)
 
 
-def _waiting(frame: Frame) -> UnplacedFrame:
+def _lost(frame: Frame) -> UnplacedFrame:
     return UnplacedFrame(frame.index, frame.timestamp, frame.image, ROLES.points.describe(frame.image))
 
 
@@ -65,7 +63,7 @@ def test_keyframes_are_listed_by_time(lost: Slam) -> None:
     """A keyframe that was made at the end of a frame in between is listed where it was seen. Oracle: the times."""
     first, second, *others = lost.keyframes
     swapped = (replace(first, timestamp=second.timestamp), replace(second, timestamp=first.timestamp), *others)
-    listed = keyframe_trajectory(changed(lost, "map", keyframes=swapped))
+    listed = keyframe_trajectory(lost.with_map(keyframes=swapped))
     assert listed.timestamps.tolist() == sorted(keyframe.timestamp for keyframe in swapped)
 
 
@@ -75,9 +73,9 @@ def test_frames_of_another_place_stay_lost(lost: Slam, walk: tuple[list[Frame], 
     """
     mirrored = [replace(frame, image=frame.image[:, ::-1].copy()) for frame in walk[0][:3]]
     elsewhere = tuple(
-        replace(_waiting(frame), frame=KNOWN + row, timestamp=(KNOWN + row) / 10) for row, frame in enumerate(mirrored)
+        replace(_lost(frame), frame=KNOWN + row, timestamp=(KNOWN + row) / 10) for row, frame in enumerate(mirrored)
     )
-    found = place_lost_without_depth(changed(lost, "tracker", unplaced=elsewhere), FREE_ROLES, SETTINGS)
+    found = place_lost_without_depth(lost.with_tracker(unplaced=elsewhere), FREE_ROLES, SETTINGS)
     assert found.map is lost.map
     assert not any(record.tracked for record in found.frames[KNOWN:])
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 import pytest
-from changed import changed
 from degenerate_scenes import packed, without_matches_of
 from recorded_run import recorded_run
 from reported import pattern
@@ -130,7 +129,7 @@ def test_true_errors_lie_within_what_is_stated(tmp_path: Path, monkeypatch: pyte
         np.sqrt(nominal.rotation**2 - stated.rotation**2), turn * 2 * np.sin(angles / 2), atol=1e-4
     )
     given = result.record.slam.camera.given + [0.0, 0.0, 3.0, 0.0]
-    moved = changed(result.record.slam, "camera", given=given)
+    moved = result.record.slam.with_camera(given=given)
     measured = pose_uncertainty.frame_uncertainty(moved)
     np.testing.assert_allclose(measured.translation, stated.translation)
     monkeypatch.setattr(pose_uncertainty, "CENTRE", 0.0)
@@ -145,9 +144,9 @@ def test_keyframes_without_an_uncertainty_are_named() -> None:
     at all, and nothing if it is whole. Oracle: rows made NaN by hand.
     """
     slam = recorded_run().slam
-    slam = changed(slam, "map", keyframes=tuple(replace(slam.keyframes[0], frame=n) for n in range(8)))
+    slam = slam.with_map(keyframes=tuple(replace(slam.keyframes[0], frame=n) for n in range(8)))
     sigma = np.full((8, 2), 0.01)
-    noted = lambda values: global_adjustment._uncertainty_notes(changed(slam, "map", pose_sigma=values))
+    noted = lambda values: global_adjustment._uncertainty_notes(slam.with_map(pose_sigma=values))
     assert noted(sigma) == []
     assert len(noted(None)) == 1
     sigma[[2, 3, 4, 6]] = np.nan

@@ -134,12 +134,16 @@ def test_the_program_says_what_random_weights_are_worth(files: Path, tmp_path: P
 
 
 def test_the_preset_builds_the_roles_it_documents(files: Path) -> None:
-    # Proves the table of the presets. Oracle: the types of the objects.
+    # Proves the table of the presets, and that only random weights are warned of. Oracle: the types of the objects.
     classical = Roles()
     found = perception("classical", classical)
     assert found.roles is classical
     assert found.facts() == {}
-    light = perception("light", classical, files).roles
+    found = perception("light", classical, files)
+    assert found.random
+    trained = {n: replace(one, metadata={"vggtgeo.weights": "checkpoint"}) for n, one in found.networks.items()}
+    assert "meaningless" not in replace(found, networks=trained).facts()
+    light = found.roles
     assert light.points is classical.points
     assert light.geometry is classical.geometry
     assert light.metric
@@ -148,17 +152,6 @@ def test_the_preset_builds_the_roles_it_documents(files: Path) -> None:
     assert isinstance(paper.geometry, WindowLocator)
     assert paper.geometry.views == 3
     assert paper.geometry.judge is classical.geometry
-
-
-def test_trained_weights_are_not_called_random(files: Path) -> None:
-    # Proves that the warning is about random weights only. Oracle: sessions
-    # whose metadata say another thing.
-    found = perception("light", Roles(), files)
-    trained = {
-        name: replace(session, metadata={"vggtgeo.weights": "checkpoint"}) for name, session in found.networks.items()
-    }
-    assert replace(found, networks=trained).random == []
-    assert "meaningless" not in replace(found, networks=trained).facts()
 
 
 def _whole_run(folder: Path, models: Path, size: tuple[int, int]) -> dict:

@@ -28,7 +28,6 @@ WRONG = {
     "keyframes.localise_only": (1,),
     "line.use_lines": (1, "yes"),
     "line.line_weight": (-0.1,),
-    "line.two_ends_lines": (None,),
     "line.manhattan": (0,),
     "depth_terms.depth_weight": (-2.0,),
     "depth_terms.depth_trust": ("omega", 1),
@@ -89,13 +88,6 @@ def test_a_group_in_its_place(group: str) -> None:
     assert getattr(vg.SlamSettings(), group).group == group
     with pytest.raises(vg.InputError, match=rf"`{group}` is 8; it must be a `vggtgeo\.\w+Settings`"):
         vg.SlamSettings(**{group: 8})
-
-
-def test_settings_that_do_not_fit_each_other_are_refused() -> None:
-    """Slots that are no multiple of a segment's samples are refused where segments have two unknowns only."""
-    assert vg.SlamSettings(window=vg.settings.WindowSettings(line_slots=100)).padded_samples is None
-    with pytest.raises(vg.InputError, match=r"`window.line_slots` is 100; with `line.two_ends_lines` it must be a mul"):
-        updated(vg.SlamSettings(), {"window": {"line_slots": 100}, "line": {"two_ends_lines": True}})
 
 
 @pytest.mark.parametrize("name", names())

@@ -20,15 +20,14 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
-from vggtgeo.slam.global_map.join_at_end import join_at_end
-from vggtgeo.slam.global_map.join_submaps import join_submaps, scale_submap
+from vggtgeo.slam.global_map.joining import join_at_end, join_submaps, scale_submap
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment, _align, compile_alignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import step
 from vggtgeo.slam.run import frame_trajectory
-from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking import relocalisation
 from vggtgeo.slam.tracking.evidence import Evidence
@@ -387,7 +386,7 @@ def torn(room: Room) -> tuple[Slam, Slam]:
         pairs=tuple(pair for pair in whole.map.pairs if own(pair.key)),
         factors=tuple(factor for factor in whole.map.factors if own(factor.keyframes)),
     )
-    apart = scale_submap(torn_apart, 1.6, lambda number: number >= origin)
+    apart = scale_submap(torn_apart, 1.6, range(origin, len(whole.keyframes)))
     moved = np.eye(4)
     moved[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.8, 0.2]))[0]
     moved[:3, 3] = [0.5, -1.0, 2.0]

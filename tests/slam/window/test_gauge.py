@@ -24,8 +24,7 @@ from vggtgeo.simulation.small_window import SimulatedWindow, simulate_window
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
-from vggtgeo.slam.window.sliding_window import marginalise_oldest
-from vggtgeo.slam.window.window import Window, WindowPrior
+from vggtgeo.slam.window.sliding_window import Window, WindowPrior, marginalise_oldest
 
 KEYFRAMES, POINTS = 7, 12
 SOLVE = eqx.filter_jit(solve)

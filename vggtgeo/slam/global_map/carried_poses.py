@@ -1,4 +1,4 @@
-"""Poses of all frames, moved with their reference keyframes."""
+"""Poses of all frames, moved with their reference keyframes, and the velocities of the camera by these poses."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from vggtgeo.slam.tracking.tracker import FramePose
 GROSS = SHARED_ERRORS * AGREEMENT_GATE
 """Squared Mahalanobis distance between the tracked and the adjusted pose of a keyframe above which its tracking was an
 outlier: its correction is then not distributed over the frames before it."""
+MAX_GAP = 3.0
+"""Largest time to a neighbouring frame for a velocity, in usual intervals."""
 
 
 def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
@@ -38,9 +40,10 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             arrived = tracked @ slam.keyframes[reference].pose
             change = poses[row] @ rigid.invert(arrived)
             tie = ties.get((reference, record.reference))
-            gross = tie is not None and _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
-            # Without depth the length of its motion was a guess, which frames tracked by points do not share.
-            apart = gross or (tie is not None and tie.by_rays)
+            # By rays the length of its motion was a guess, which frames tracked by points do not share.
+            apart = tie is not None and (
+                tie.by_rays or _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
+            )
             between = [] if apart else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
             span = max(times[row] - times[last], 1e-9)
             for k in between:
@@ -62,3 +65,41 @@ def _made_its_keyframe(record: FramePose) -> bool:
     Decided by its relative pose: keyframes of a known map may have the same frame number.
     """
     return record.tracked and np.array_equal(record.relative, np.eye(4))
+
+
+def camera_motions(slam: Slam, room: int) -> np.ndarray:
+    """Return the velocity of the camera at each keyframe, float64 [room, 6], see `frame_motions`; zero beyond the
+    keyframes.
+    """
+    motions = np.zeros((room, lie.TANGENT))
+    row_of = {record.frame: row for row, record in enumerate(slam.frames)}
+    there = [(place, row_of[k.frame]) for place, k in enumerate(slam.keyframes) if k.frame in row_of]
+    if there:
+        places, rows = np.array(there).T
+        motions[places] = frame_motions(slam)[rows]
+    return motions
+
+
+def frame_motions(slam: Slam) -> np.ndarray:
+    """Return the velocity of the camera at each frame, float64 [n, 6]: the tangent of world -> camera a second.
+
+    Units of the map, then radians. From the frames before and after; zero without them.
+    """
+    times, poses = carried_poses(slam)
+    if len(times) < 2:
+        return np.zeros((len(times), lie.TANGENT))
+    rows = np.arange(len(times))
+    tracked = np.array([record.tracked for record in slam.frames])
+    near = lambda other: tracked[other] & (np.abs(times[other] - times) <= MAX_GAP * frame_interval(slam))
+    before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(times) - 1)
+    # A missing neighbour is replaced by the frame itself: a one-sided difference, or none.
+    before, after = np.where(near(before), before, rows), np.where(near(after), after, rows)
+    seconds = (times[after] - times[before])[:, None]
+    still = np.zeros((len(times), lie.TANGENT))
+    return np.divide(lie.steps(poses[before], poses[after]), seconds, out=still, where=seconds > 0)
+
+
+def frame_interval(slam: Slam) -> float:
+    """Return the median time between frames, s; 0 for fewer than two."""
+    times = np.array([record.timestamp for record in slam.frames])
+    return float(np.median(np.diff(times))) if len(times) > 1 else 0.0

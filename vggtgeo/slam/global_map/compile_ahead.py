@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +11,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.pixel_aspect import aspect_prior
+from vggtgeo.slam.global_map.depth_alignment import align_pairs
 from vggtgeo.slam.global_map.global_adjustment import shares_focal
 from vggtgeo.slam.global_map.global_shape import (
     EDGE_SHARES,
@@ -20,14 +20,13 @@ from vggtgeo.slam.global_map.global_shape import (
     SMALL,
     GlobalShape,
     global_solver,
-    padded_count,
     shape_for,
 )
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, factor_terms, surface_term
+from vggtgeo.slam.sparse_map.factors import factor_terms
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit, warm_up
 
@@ -77,10 +76,8 @@ class CompileAhead(Callback):
         ends = np.array([pair.key for pair in slam.map.pairs], int).reshape(-1, 2)
         edges = np.minimum(np.bincount(ends.ravel(), minlength=1), MAX_NEIGHBOURS).sum()
         expected = round(edges * keyframes / len(slam.keyframes))
-        if slam.metric:
-            return [shape_for(keyframes, expected, self._settings)]
-        more = min(round(GUIDED * expected), MAX_NEIGHBOURS * keyframes)
-        return [_without_depth(shape_for(keyframes, edges, self._settings)) for edges in (expected, more)]
+        more = [] if slam.metric else [min(round(GUIDED * expected), MAX_NEIGHBOURS * keyframes)]
+        return [shape_for(keyframes, count, self._settings, slam.metric) for count in (expected, *more)]
 
 
 def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | None:
@@ -103,12 +100,11 @@ def compile_global(
 
     Both programs are compiled at once, on two cores. metric: with surfaces, of measured depth.
     """
-    terms = factor_terms((), {}, shape.room, metric=metric)
+    terms = factor_terms((), {}, dict(shape.room), metric=metric)
     if not (metric or shared_focal):
         terms = (*terms, aspect_prior(np.ones(2)))
     if metric and settings.depth_terms.surface_points > 0:
-        nothing = np.zeros((shape.pairs, 6, 6)), np.zeros((shape.pairs, 6))
-        terms = (*terms, surface_term([(0, 0)] * shape.pairs, np.tile(np.eye(4), (shape.pairs, 1, 1)), *nothing))
+        terms = (*terms, align_pairs((), (), (), settings.depth_terms.surface_points, shape.pairs))
     problem, initial = smallest_problem(shape.size, settings, terms, shared_focal)
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         sigma = pool.submit(in_double_precision(keyframe_sigma), problem, initial, 1)
@@ -117,21 +113,14 @@ def compile_global(
 
 
 def compile_before_runs(settings: SlamSettings, width: int, height: int) -> None:
-    """Compile for maps of at most 64 keyframes, with depth and without, of a known camera; images of this size."""
+    """Compile for maps of at most 64 keyframes in one submap, with depth and without, of a known camera.
+
+    Without recorded poses; images of this size.
+    """
     compile_alignment(Camera.guess(width, height))
+    smallest, usual = SMALL
+    edges = [(smallest, 0), *((usual, int(share * MAX_NEIGHBOURS * usual)) for share in EDGE_SHARES)]
     for metric in (True, False):
         warm_up(settings, metric)
-        for shape in usual_shapes(settings, metric):
-            compile_global(shape, settings, metric=metric)
-
-
-def usual_shapes(settings: SlamSettings, metric: bool) -> list[GlobalShape]:
-    """Return the shapes of maps of at most 64 keyframes in one submap, without recorded poses."""
-    edges = [(SMALL[0], 0), *((SMALL[1], int(share * MAX_NEIGHBOURS * SMALL[1])) for share in EDGE_SHARES)]
-    shapes = [shape_for(*own, settings) for own in edges]
-    return shapes if metric else list(map(_without_depth, shapes))
-
-
-def _without_depth(shape: GlobalShape) -> GlobalShape:
-    """Return the shape of a map without measured depth: its first factor is the scale's anchor."""
-    return replace(shape, factors=((MeasuredBaseline, padded_count(1)), *shape.factors))
+        for keyframes, count in edges:
+            compile_global(shape_for(keyframes, count, settings, metric), settings, metric=metric)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -78,12 +79,9 @@ class Surface:
         return SurfaceRows(self.rows.points[:, good], self.rows.normals[:, good], self.rows.sigma[good])
 
 
-@dataclass(frozen=True, eq=False)
-class Alignment:
+class Alignment(NamedTuple):
     """Normal equations of one pair over the left tangent of `T_ji`, in units of the sensor's standard deviation."""
 
-    first: int
-    second: int
     hessian: np.ndarray
     gradient: np.ndarray
     points: int
@@ -120,7 +118,7 @@ def align(
     # Row of `n . (T p - q)` over the left tangent: `[n, p x n]`.
     jacobian = np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
     weighted = jacobian * weight
-    return Alignment(first, second, weighted @ jacobian.T, weighted @ residual, len(one))
+    return Alignment(weighted @ jacobian.T, weighted @ residual, len(one))
 
 
 def align_pairs(
@@ -128,13 +126,12 @@ def align_pairs(
     pairs: Sequence[tuple[int, int]],
     surfaces: Sequence[Surface],
     effective: float,
-    room: int | None = None,
+    room: int,
 ) -> SurfaceAlignment:
     """Return the alignments of all pairs at the current poses as one term; pairs without overlap have weight 0.
 
-    room: observations of the term, by default one a pair.
+    room: observations of the term.
     """
-    room = len(pairs) if room is None else room
     relative = np.tile(np.eye(4), (room, 1, 1))
     for row, (i, j) in enumerate(pairs):
         relative[row] = keyframes[j].pose @ rigid.invert(keyframes[i].pose)
@@ -143,7 +140,7 @@ def align_pairs(
     for row, pair in enumerate(pairs):
         alignment = align(*pair, surfaces, relative[row], effective)
         if alignment is not None:
-            hessians[row], gradients[row] = alignment.hessian, alignment.gradient
+            hessians[row], gradients[row], _ = alignment
     return surface_term([*pairs, *[(0, 0)] * (room - len(pairs))], relative, hessians, gradients)
 
 

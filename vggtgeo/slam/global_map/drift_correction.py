@@ -13,11 +13,17 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, PoseGraph, solve_pose_graph, squared_distance
-from vggtgeo.slam.global_map.scale_graph import ScaleRatio, solve_scales
-from vggtgeo.slam.sparse_map.connected import submap_of
+from vggtgeo.slam.global_map.pose_graph import (
+    LOOP_GATE,
+    PoseGraph,
+    ScaleRatio,
+    solve_pose_graph,
+    solve_scales,
+    squared_distance,
+)
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import tangent
@@ -69,17 +75,17 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     sure = consistent_loops(graph.loops, tracked, LOOP_GATE, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
-        return _noted(_without(slam, closing), len(loops) - len(agreeing), len(loops)), agreeing
+        return _with_refused(_without(slam, closing), len(loops) - len(agreeing), len(loops)), agreeing
     units = _units(slam, motions, tuple(compress(loops, sure[len(closing) :])))
-    found = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), units))
+    poses, fits = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), units))
     true = np.zeros(len(measured), bool)
-    true[sure] = found.accepted
-    dropped = [tie for tie, fits in zip(closing, true[: len(closing)], strict=True) if not fits]
-    moved = at_poses(_without(slam, dropped), found.poses, units)
+    true[sure] = fits
+    moved = at_poses(_without(slam, list(compress(closing, ~true[: len(closing)]))), poses, units)
     # A loop that took no part (refused, or alone) is used where the corrected map agrees with it.
     own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
     accepted = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
-    return _noted(moved, len(loops) - len(accepted), len(loops), slam), accepted
+    note = f"loop closures corrected the drift of the map, by up to {_largest_move(slam, moved)}"
+    return _with_refused(moved.with_notes(note), len(loops) - len(accepted), len(loops)), accepted
 
 
 def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelativePose]]:
@@ -127,8 +133,7 @@ def _graph(
     scaled_motions, scaled_loops = tuple(map(inside, motions)), tuple(map(inside, loops))
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])
-    whole = replace(slam, map=replace(slam.map, factors=(*slam.map.factors, *loops)))
-    label = submap_of(whole.map)
+    label = submap_of(slam.with_factors(*loops).map)
     held = np.zeros(len(poses), bool)
     held[np.unique(label, return_index=True)[1]] = True
     return PoseGraph(start, scaled_motions, scaled_loops, held)
@@ -145,51 +150,38 @@ def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[
 def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
     """Return the map without some of its tracked motions."""
     gone = {id(tie) for tie in ties}
-    return replace(
-        slam, map=replace(slam.map, factors=tuple(factor for factor in slam.map.factors if id(factor) not in gone))
-    )
+    return slam.with_map(factors=tuple(factor for factor in slam.map.factors if id(factor) not in gone))
 
 
 def at_poses(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
     """Return the map at other poses, lengths scaled keyframe by keyframe."""
     unit = lambda number: float(units[number])
-    factors = tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors)
-    return replace(
-        slam,
-        map=replace(
-            slam.map,
-            keyframes=tuple(
-                replace(scaled_keyframe(keyframe, unit(keyframe.number)), pose=rigid.orthonormal(pose))
-                for keyframe, pose in zip(slam.keyframes, poses, strict=True)
-            ),
-            factors=factors,
+    moved = slam.with_map(
+        keyframes=tuple(
+            replace(scaled_keyframe(keyframe, unit(keyframe.number)), pose=rigid.orthonormal(pose))
+            for keyframe, pose in zip(slam.keyframes, poses, strict=True)
         ),
-        tracker=replace(
-            slam.tracker, frames=tuple(scaled_record(record, unit(record.reference)) for record in slam.frames)
-        ),
-        window=replace(slam.window, prior=None, solved=None),
+        factors=tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors),
+    ).with_tracker(frames=tuple(scaled_record(record, unit(record.reference)) for record in slam.frames))
+    return moved.with_window(prior=None, solved=None)
+
+
+def _with_refused(slam: Slam, refused: int, proposed: int) -> Slam:
+    """Return the state with a note on the refused loops, if any."""
+    if not refused:
+        return slam
+    were = "loop closure was" if proposed == 1 else "loop closures were"
+    return slam.with_notes(
+        f"{refused} of {proposed} proposed {were} refused, since they contradict the rest of the map (other places "
+        "may look the same); the map does not use them"
     )
 
 
-def _noted(slam: Slam, refused: int, proposed: int, before: Slam | None = None) -> Slam:
-    """Return the state with notes for the user: the corrected drift since `before`, and the refused loops."""
-    notes = []
-    if before is not None:
-        notes.append(f"loop closures corrected the drift of the map, by up to {_largest_move(slam, before)}")
-    if refused:
-        were = "loop closure was" if proposed == 1 else "loop closures were"
-        notes.append(
-            f"{refused} of {proposed} proposed {were} refused, since they contradict the rest of the map (other places "
-            "may look the same); the map does not use them"
-        )
-    return replace(slam, notes=(*slam.notes, *notes))
-
-
-def _largest_move(slam: Slam, before: Slam) -> str:
+def _largest_move(before: Slam, after: Slam) -> str:
     """Return by how much a keyframe moved at most: metres, or a share of the path's extent if the scale is free."""
-    centres, old = (rigid.centres(np.array([one.pose for one in each.keyframes])) for each in (slam, before))
+    old, centres = (rigid.centres(np.array([one.pose for one in each.keyframes])) for each in (before, after))
     moved = float(np.linalg.norm(centres - old, axis=1).max())
-    if slam.metric:
+    if after.metric:
         return f"{moved:.2f} m"
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     return f"{100 * moved / max(extent, 1e-12):.0f} % of the extent of the path"

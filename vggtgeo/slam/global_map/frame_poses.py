@@ -17,17 +17,15 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.robust import sigma_by_median
 from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
-from vggtgeo.slam.global_map.carried_poses import carried_poses
-from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_motions
+from vggtgeo.slam.global_map.carried_poses import camera_motions, carried_poses, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.global_map.smooth_motion import smoothed
 from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
-from vggtgeo.slam.sparse_map.connected import submap_of
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.frame_refinement import tracked_information
-from vggtgeo.slam.tracking.tracker import FramePose
 
 MIN_POINTS = 20
 """With fewer points the pose stays as tracked."""
@@ -58,74 +56,55 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
 
 def _frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     times, poses = carried_poses(slam)
-    if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
+    rows = [row for row, record in enumerate(slam.frames) if record.seen is not None and record.tracked]
+    if not rows or not slam.map.finished:
         return times, poses
-    rows = _placed_by_points(slam)
-    if not rows:
-        return times, poses
-    motions = _motions(slam)
     # With metric depth the errors that frames share are in the tracked information already.
     as_one = 1.0 if slam.metric else SHARED_ERRORS
-    tracked = np.array([tracked_information(record.evidence) / as_one for record in slam.frames])
+    information = np.array([tracked_information(record.evidence) / as_one for record in slam.frames])
+    rolling = slam.camera.readout is not None
+    motions = (camera_motions(slam, len(slam.keyframes)), frame_motions(slam)) if rolling else None
 
     def placed(row: int) -> _Resected:
-        points, pixels = _sight(slam, row, poses[row], motions)
-        return _resected(points, pixels, poses[row], tracked[row], slam.intrinsics)
+        points, pixels = _seen_points(slam, row, poses[row], motions)
+        return _resected(points, pixels, poses[row], information[row], slam.intrinsics)
 
     found, resected = poses.copy(), map_in_threads(placed, rows)
     found[rows] = [one.pose for one in resected]
     noise = sigma_by_median(np.concatenate([one.residuals.ravel() for one in resected] + [np.full(1, MIN_NOISE)]))
     for row, one in zip(rows, resected, strict=True):
         if len(one.residuals):
-            tracked[row] = tracked[row] + one.information / (as_one * max(noise, MIN_NOISE) ** 2)
-    return times, found if slam.metric else _smoothed(slam, times, found, tracked)
-
-
-def _smoothed(slam: Slam, times: np.ndarray, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Return the poses of all frames, those between keyframes smoothed. information: [n, 6, 6], zero if unknown."""
+            information[row] = information[row] + one.information / (as_one * max(noise, MIN_NOISE) ** 2)
+    if slam.metric:
+        return times, found
     submap = submap_of(slam.map)
     label = np.array([submap[record.reference] if record.tracked else -1 for record in slam.frames])
-    apart = [not np.array_equal(record.relative, np.eye(4)) for record in slam.frames]
-    return smoothed(times, poses, information, np.array(apart) & information.any((1, 2)), label)
+    apart = np.array([not np.array_equal(record.relative, np.eye(4)) for record in slam.frames])
+    return times, smoothed(times, found, information, apart & information.any((1, 2)), label)
 
 
-def _placed_by_points(slam: Slam) -> list[int]:
-    return [row for row, record in enumerate(slam.frames) if record.seen is not None and record.tracked]
-
-
-def _motions(slam: Slam) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the velocities at all keyframes and at all frames if a readout time is known."""
-    return None if slam.camera.readout is None else (camera_motions(slam, len(slam.keyframes)), frame_motions(slam))
-
-
-def _sight(
+def _seen_points(
     slam: Slam, row: int, pose: np.ndarray, motions: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return world points [m, 3] of the matches of a frame near this pose, and their global-shutter pixels [m, 2]."""
-    record = slam.frames[row]
-    points, pixels = _landmarks(slam, record, None if motions is None else motions[0][record.reference])
-    if slam.camera.readout is not None and motions is not None:
-        inverse = 1.0 / (points @ pose[2, :3] + pose[2, 3])
-        size = slam.keyframes[record.reference].size
-        pixels = to_global_shutter(pixels, inverse, motions[1][row], slam.intrinsics, size, slam.camera.readout)
-    return points, pixels
+    """Return world points [m, 3] of the matches of a frame with a final depth, and their pixels in it, [m, 2].
 
-
-def _landmarks(slam: Slam, record: FramePose, motion: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return world points float64 [m, 3] of the matches of a frame with a final depth, and their pixels, float64 [m,
-    2].
-
-    motion: velocity at its keyframe if a readout time is known.
+    pose: near the frame's. motions: velocities at all keyframes and at all frames if a readout time is known; pixels
+    are then those of a global shutter.
     """
+    record, readout = slam.frames[row], slam.camera.readout
     assert record.seen is not None
     keyframe, slots = slam.keyframes[record.reference], record.seen.slots
     inverse = keyframe.points.inverse_depth[slots]
     known = np.isfinite(inverse) & (inverse > 1 / MAX_DEPTH)
-    inverse, pixels = inverse[known], keyframe.points.pixels[slots[known]]
-    if motion is not None and slam.camera.readout is not None:
-        pixels = to_global_shutter(pixels, inverse, motion, slam.intrinsics, keyframe.size, slam.camera.readout)
-    points = rigid.unproject(pixels, inverse, keyframe.pose, slam.intrinsics)
-    return points, record.seen.pixels[known].astype(np.float64)
+    inverse, own = inverse[known], keyframe.points.pixels[slots[known]]
+    pixels = record.seen.pixels[known].astype(np.float64)
+    if motions is None or readout is None:
+        return rigid.unproject(own, inverse, keyframe.pose, slam.intrinsics), pixels
+    shutter = slam.intrinsics, keyframe.size, readout
+    own = to_global_shutter(own, inverse, motions[0][record.reference], *shutter)
+    points = rigid.unproject(own, inverse, keyframe.pose, slam.intrinsics)
+    there = 1.0 / (points @ pose[2, :3] + pose[2, 3])
+    return points, to_global_shutter(pixels, there, motions[1][row], *shutter)
 
 
 class _Resected(NamedTuple):

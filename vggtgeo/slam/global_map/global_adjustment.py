@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.camera.given_camera import (
     RefinedCamera,
-    Solve,
     calibration_sigma,
     estimate_with_map,
     keyframe_pairs,
@@ -21,22 +21,22 @@ from vggtgeo.slam.camera.given_camera import (
     without_surfaces,
 )
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
-from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair
-from vggtgeo.slam.camera.pixel_aspect import are_square, aspect_prior, find_aspect
-from vggtgeo.slam.camera.rolling_shutter import find_readout, problem_to_global_shutter
+from vggtgeo.slam.camera.pixel_aspect import FoundAspect, are_square, aspect_prior, find_aspect
+from vggtgeo.slam.camera.rolling_shutter import FoundReadout, find_readout, problem_to_global_shutter
+from vggtgeo.slam.global_map.carried_poses import camera_motions, frame_interval
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
-from vggtgeo.slam.global_map.frame_motions import camera_motions, frame_interval
 from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS, GlobalShape, global_solver, shape_of
 from vggtgeo.slam.global_map.guided_matches import guided_pairs
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.sparse_map.covisibility import Directed, directions
+from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.factors import Factor, factor_terms
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import stretches
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge
-from vggtgeo.slam.window.sliding_window import solve_jit
+from vggtgeo.slam.window.sliding_window import solve_jit, window_edges
 
 ROUNDS = 3
 """Adjustments of the whole map: each relinearises the dense depth between keyframes, which was aligned at the poses of
@@ -49,6 +49,25 @@ DISTORTION_SIGMAS, MAX_WARP = 5.0, 3.0
 """Standard deviations, and pixels in the corners of the image, above which a distortion is reported."""
 
 
+class _Solved(NamedTuple):
+    """A state, the problem that it is the solution of, and this solution."""
+
+    slam: Slam
+    adjustment: Adjustment
+    state: State
+
+    @classmethod
+    def of(cls, slam: Slam, adjustment: Adjustment, state: State) -> Self:
+        """Write the result of an adjustment into the state."""
+        keyframes, intrinsics = write_back(slam.keyframes, adjustment, state)
+        adjusted = slam.with_map(keyframes=keyframes).with_camera(intrinsics=intrinsics).with_window(solved=None)
+        return cls(adjusted, adjustment, state)
+
+    def with_problem(self, found: FoundReadout | FoundAspect) -> Self:
+        """Take a changed problem and its solution."""
+        return self.of(self.slam, replace(self.adjustment, problem=found.problem), found.state)
+
+
 def adjust_all(slam: Slam, settings: SlamSettings, *, rounds: int = ROUNDS, uncertainty: bool = True) -> Slam:
     """Bundle-adjust every keyframe, with surfaces if there is metric depth, in a few rounds.
 
@@ -58,28 +77,27 @@ def adjust_all(slam: Slam, settings: SlamSettings, *, rounds: int = ROUNDS, unce
     """
     if len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA or not slam.map.pairs:
         return slam
-    shared, solved, described = _SharedByRounds.of(slam, settings), None, slam.map.pairs
+    shared, done, described = _SharedByRounds.of(slam, settings), None, slam.map.pairs
     for number in range(rounds):
         is_first = number == 0
         adjustment, notes = shared.adjustment(slam, settings, finds_camera=is_first and not slam.camera.calibrated)
-        slam = replace(slam, notes=(*slam.notes, *notes)) if is_first else slam
+        slam = slam.with_notes(*notes) if is_first else slam
         solution = solve_jit(adjustment.problem, adjustment.initial, global_solver(adjustment.problem))
         if not np.isfinite(float(solution.energy)):
-            return replace(slam, notes=(*slam.notes, f"global adjustment: {solution.message}"))
-        slam, solved = _apply_solution(slam, adjustment, solution.state), (adjustment.problem, solution.state)
+            return slam.with_notes(f"global adjustment: {solution.message}")
+        done = _Solved.of(slam, adjustment, solution.state)
+        slam = done.slam
         if is_first:
-            slam, adjustment, state = _try_rolling_shutter(slam, adjustment, solution.state, settings)
-            slam, shared = shared.try_camera(slam, adjustment, state, settings, last=rounds == 1)
-            solved, described = (adjustment.problem, state), slam.map.pairs
+            done = _try_rolling_shutter(done, settings)
+            slam, shared = shared.try_camera(done, settings, last=rounds == 1)
+            described = slam.map.pairs
         if not slam.metric and number < rounds - 1:
-            pairs = guided_pairs(replace(slam.map, pairs=described), slam.intrinsics)
-            slam = replace(slam, map=replace(slam.map, pairs=pairs))
+            slam = slam.with_map(pairs=guided_pairs(replace(slam.map, pairs=described), slam.intrinsics))
             shared = replace(_SharedByRounds.of(slam, settings), camera=shared.camera)
-    if not uncertainty:
+    if not uncertainty or done is None:
         return slam
-    sigma = None if solved is None else keyframe_sigma(*solved, len(slam.keyframes))
-    slam = replace(slam, map=replace(slam.map, pose_sigma=sigma))
-    return replace(slam, notes=(*slam.notes, *_uncertainty_notes(slam)))
+    slam = slam.with_map(pose_sigma=keyframe_sigma(done.adjustment.problem, done.state, len(slam.keyframes)))
+    return slam.with_notes(*_uncertainty_notes(slam))
 
 
 def _uncertainty_notes(slam: Slam) -> list[str]:
@@ -90,14 +108,13 @@ def _uncertainty_notes(slam: Slam) -> list[str]:
     # By time: keyframes of frames that were placed at the end have the last numbers.
     numbers = np.array([keyframe.frame for keyframe in slam.keyframes])
     order = np.argsort(numbers)
-    unknown = np.flatnonzero(np.isnan(sigma[order]).any(1))
-    if not len(unknown):
+    unknown = np.isnan(sigma[order]).any(1)
+    if not unknown.any():
         return []
-    stretches = np.split(numbers[order][unknown], np.flatnonzero(np.diff(unknown) > 1) + 1)
-    frames = [f"{own[0]} to {own[-1]}" for own in stretches]
+    frames = [f"{numbers[order[first]]} to {numbers[order[last]]}" for first, last in stretches(unknown)]
     more = f" and {len(frames) - MAX_NAMED} more" if len(frames) > MAX_NAMED else ""
     return [
-        f"the uncertainty of {len(unknown)} of {len(sigma)} keyframes is unknown (frames "
+        f"the uncertainty of {np.count_nonzero(unknown)} of {len(sigma)} keyframes is unknown (frames "
         f"{', '.join(frames[:MAX_NAMED])}{more}): the images hardly determine where they are in the map; do not rely "
         "on their positions"
     ]
@@ -140,26 +157,26 @@ class _SharedByRounds:
         problem = without_surfaces(adjustment.problem) if finds_camera else adjustment.problem
         problem, gauge = with_one_gauge(problem, adjustment.initial, len(slam.keyframes), slam.metric)
         notes = gauge_notes(gauge, adjustment.keyframes, "global adjustment")
-        return _to_global_shutter(slam, replace(adjustment, problem=problem)), notes
+        if slam.camera.readout is not None:
+            motions, size = camera_motions(slam, problem.num_keyframes), slam.keyframes[0].size
+            problem = problem_to_global_shutter(problem, adjustment.initial, motions, size, slam.camera.readout)
+        return replace(adjustment, problem=problem), notes
 
-    def try_camera(
-        self, slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings, *, last: bool
-    ) -> tuple[Slam, _SharedByRounds]:
+    def try_camera(self, done: _Solved, settings: SlamSettings, *, last: bool) -> tuple[Slam, _SharedByRounds]:
         """Return the state after trying to refine its camera, and the data for the following rounds.
 
         A guessed camera is fixed after its estimation (see `_factors_without_intrinsics`). last: no round follows.
         """
-        before = slam.intrinsics
-        if settings.camera.refine_intrinsics != "never":
-            slam = _try_camera(slam, adjustment, state, self.edges, settings)
-        if last or (slam.camera.calibrated and slam.intrinsics is before):
+        never = settings.camera.refine_intrinsics == "never"
+        slam = done.slam if never else _try_camera(done, self.edges, settings)
+        if last or (slam.camera.calibrated and slam.intrinsics is done.slam.intrinsics):
             return slam, self
         camera = replace(self.camera, mean=slam.intrinsics)
         if not slam.camera.calibrated:
             # Once estimated with all its matches, the camera must not be pulled back by motions tracked with the old
             # one.
-            held = KNOWN_SIGMA * slam.intrinsics[0]
-            camera = replace(camera, sigma=np.full(4, held), shared_focal=are_square(slam.intrinsics))
+            fixed = np.full(4, KNOWN_SIGMA * slam.intrinsics[0])
+            camera = replace(camera, sigma=fixed, shared_focal=are_square(slam.intrinsics))
         elif not slam.metric:
             # Later rounds have more matches: they estimate it again.
             camera = replace(self.camera, sigma=calibration_sigma(self.camera.mean))
@@ -171,74 +188,51 @@ def _solved(problem: Problem, state: State) -> State:
     return solve_jit(problem, state, global_solver(problem)).state
 
 
-def _to_global_shutter(slam: Slam, adjustment: Adjustment) -> Adjustment:
-    """Return the adjustment with matches corrected to global shutter if a readout time is known."""
-    if slam.camera.readout is None:
-        return adjustment
-    problem, initial = adjustment.problem, adjustment.initial
-    motions = camera_motions(slam, problem.num_keyframes)
-    return replace(
-        adjustment,
-        problem=problem_to_global_shutter(problem, initial, motions, slam.keyframes[0].size, slam.camera.readout),
-    )
-
-
-def _try_rolling_shutter(
-    slam: Slam, adjustment: Adjustment, state: State, settings: SlamSettings
-) -> tuple[Slam, Adjustment, State]:
-    """Return the state after a search for a rolling shutter, the last adjustment and its solution."""
+def _try_rolling_shutter(done: _Solved, settings: SlamSettings) -> _Solved:
+    """Return the solution with the rolling shutter removed, if there is one."""
+    slam = done.slam
     if slam.camera.readout is not None or not settings.refinement.rolling_shutter:
-        return slam, adjustment, state
-    motions = camera_motions(slam, adjustment.problem.num_keyframes)
-    size, longest = slam.keyframes[0].size, frame_interval(slam)
-    found = find_readout(adjustment.problem, state, motions, size, longest, _solved)
+        return done
+    problem = done.adjustment.problem
+    motions = camera_motions(slam, problem.num_keyframes)
+    found = find_readout(problem, done.state, motions, slam.keyframes[0].size, frame_interval(slam), _solved)
     if found is None or not found.is_significant:
-        return slam, adjustment, state
-    adjustment = replace(adjustment, problem=found.problem)
-    slam = _apply_solution(slam, adjustment, found.state)
-    return replace(slam, camera=replace(slam.camera, readout=found.readout)), adjustment, found.state
+        return done
+    done = done.with_problem(found)
+    return done._replace(slam=done.slam.with_camera(readout=found.readout))
 
 
-def _try_camera(
-    slam: Slam, adjustment: Adjustment, state: State, edges: list[Directed], settings: SlamSettings
-) -> Slam:
+def _try_camera(done: _Solved, edges: list[Directed], settings: SlamSettings) -> Slam:
     """Return the state after trying to refine a given camera, and to find a lens that no calibration tells."""
-    camera = slam.camera
-    if camera.calibrated and slam.metric:
-        found = refine_given_camera(_keyframe_pairs(slam, edges), adjustment.problem, state, _solved)
-        return _apply_refined_camera(slam, adjustment, found, settings)
-    refined = None
+    camera, refined = done.slam.camera, None
+    if camera.calibrated and done.slam.metric:
+        motions = None if camera.readout is None else camera_motions(done.slam, len(done.slam.keyframes))
+        pairs = keyframe_pairs(done.slam.map, camera, edges, motions)
+        found = refine_given_camera(pairs, done.adjustment.problem, done.state, _solved)
+        return _apply_refined_camera(done, found, settings)
     if camera.calibrated:
         # Focal length and lens are free together: either alone absorbs the other.
-        free, refined = estimate_with_map(adjustment.problem, state, _solved)
-        adjustment, state = replace(adjustment, problem=free), refined.state or state
-    else:
-        slam, adjustment, state = _try_pixel_aspect(slam, adjustment, state, _solved)
-    if camera.lens is None and not camera.given_lens and can_undistort(slam.keyframes):
-        lens = find_lens(adjustment.problem, state, slam.keyframes[0].size, _solved)
-        undistorting = _apply_lens(slam, adjustment, lens)
-        if undistorting is not slam:
+        free, refined = estimate_with_map(done.adjustment.problem, done.state, _solved)
+        done = done._replace(adjustment=replace(done.adjustment, problem=free), state=refined.state or done.state)
+    elif done.adjustment.problem.shared_focal:
+        done = _try_pixel_aspect(done)
+    if camera.lens is None and not camera.given_lens and can_undistort(done.slam.keyframes):
+        lens = find_lens(done.adjustment.problem, done.state, done.slam.keyframes[0].size, _solved)
+        undistorting = _apply_lens(done.slam, done.adjustment, lens)
+        if undistorting is not done.slam:
             return undistorting
-    return _apply_refined_camera(slam, adjustment, refined, settings)
+    return _apply_refined_camera(done, refined, settings)
 
 
-def _keyframe_pairs(slam: Slam, edges: list[Directed]) -> list[CameraPair]:
-    motions = None if slam.camera.readout is None else camera_motions(slam, len(slam.keyframes))
-    return keyframe_pairs(slam.map, slam.camera, edges, motions)
-
-
-def _try_pixel_aspect(slam: Slam, adjustment: Adjustment, state: State, solve: Solve) -> tuple[Slam, Adjustment, State]:
-    """Return the state after trying non-square pixels for a guessed camera, the last adjustment and its solution."""
-    if not adjustment.problem.shared_focal:
-        return slam, adjustment, state
-    found = find_aspect(adjustment.problem, state, solve)
+def _try_pixel_aspect(done: _Solved) -> _Solved:
+    """Return the solution with non-square pixels of a guessed camera, if it has such."""
+    found = find_aspect(done.adjustment.problem, done.state, _solved)
     if found is None or not found.is_significant:
-        return slam, adjustment, state
-    adjustment = replace(adjustment, problem=found.problem)
-    slam = _apply_solution(slam, adjustment, found.state)
-    fx, fy = slam.intrinsics[:2]
+        return done
+    done = done.with_problem(found)
+    fx, fy = done.slam.intrinsics[:2]
     note = f"the unknown camera was estimated with pixels that are not square: fx, fy = {fx:.1f}, {fy:.1f} px"
-    return replace(slam, notes=(*slam.notes, note)), adjustment, found.state
+    return done._replace(slam=done.slam.with_notes(note))
 
 
 def shares_focal(slam: Slam) -> bool:
@@ -250,9 +244,12 @@ def shares_focal(slam: Slam) -> bool:
 
 
 def _edges(slam: Slam) -> list[Directed]:
-    by_number = {keyframe.number: keyframe for keyframe in slam.keyframes}
-    edges = [edge for pair in slam.map.pairs for edge in directions(pair, by_number)]
-    return _thin(edges, len(slam.keyframes))
+    """Return both directions of all pairs; of each host the `MAX_NEIGHBOURS` with the most matches."""
+    edges, kept = window_edges(slam.map, range(len(slam.keyframes))), []
+    for host in range(len(slam.keyframes)):
+        own = sorted((edge for edge in edges if edge.host == host), key=lambda edge: -len(edge.slots))
+        kept += own[:MAX_NEIGHBOURS]
+    return kept
 
 
 def _surfaces(slam: Slam) -> list[Surface]:
@@ -260,45 +257,31 @@ def _surfaces(slam: Slam) -> list[Surface]:
     return map_in_threads(of, slam.keyframes) if slam.metric else []
 
 
-def _apply_solution(slam: Slam, adjustment: Adjustment, state: State) -> Slam:
-    """Return the state with the result of an adjustment."""
-    keyframes, intrinsics = write_back(slam.keyframes, adjustment, state)
-    return replace(
-        slam,
-        map=replace(slam.map, keyframes=keyframes),
-        camera=replace(slam.camera, intrinsics=intrinsics),
-        window=replace(slam.window, solved=None),
-    )
-
-
-def _apply_refined_camera(
-    slam: Slam, adjustment: Adjustment, found: RefinedCamera | None, settings: SlamSettings
-) -> Slam:
+def _apply_refined_camera(done: _Solved, found: RefinedCamera | None, settings: SlamSettings) -> Slam:
     """Return the state with a refined camera if it improves the fit or is required, and notes for the user."""
     if found is None:
-        return slam
-    notes = [*slam.notes, *_lens_note(found, slam.keyframes[0].size)]
+        return done.slam
+    slam = done.slam.with_notes(*_lens_note(found, done.slam.keyframes[0].size))
     always = settings.camera.refine_intrinsics == "always"
-    if found.state is not None and (found.is_significant or always):
-        slam = _apply_solution(slam, adjustment, found.state)
-        if found.change > REPORTED_CHANGE:
-            cameras = [", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted)]
-            change = 100 * found.change
-            notes.append(f"the camera was refined by {change:.1f} %: fx, fy, cx, cy = {cameras[0]} -> {cameras[1]} px")
-    return replace(slam, notes=tuple(notes))
+    if found.state is None or not (found.is_significant or always):
+        return slam
+    slam = _Solved.of(slam, done.adjustment, found.state).slam
+    if found.change <= REPORTED_CHANGE:
+        return slam
+    before, after = (", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted))
+    change = 100 * found.change
+    return slam.with_notes(f"the camera was refined by {change:.1f} %: fx, fy, cx, cy = {before} -> {after} px")
 
 
 def _apply_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> Slam:
     """Return the state with its distortion removed if that improves the fit, and a note."""
     if found is None or np.isinf(found.warp) or not found.is_significant:
         return slam
-    adjusted = undistorted(_apply_solution(slam, adjustment, found.state), found.camera)
     k1, k2, *_ = found.camera.distortion
-    note = (
+    return undistorted(_Solved.of(slam, adjustment, found.state).slam, found.camera).with_notes(
         f"the camera was estimated with lens distortion: k1 {k1:.3f}, k2 {k2:.3f} at a focal length of "
         f"{found.camera.intrinsics[0]:.1f} px, {found.warp:.1f} px at most; the images were undistorted"
     )
-    return replace(adjusted, notes=(*adjusted.notes, note))
 
 
 def undistorted(slam: Slam, lens: Camera) -> Slam:
@@ -309,13 +292,9 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
         else replace(record, seen=replace(record.seen, pixels=undistorted_pixels(record.seen.pixels, lens)))
         for record in slam.frames
     )
-    return replace(
-        slam,
-        map=undistorted_map(slam.map, lens),
-        tracker=replace(slam.tracker, frames=frames),
-        camera=replace(slam.camera, intrinsics=np.array(lens.intrinsics, np.float64), lens=lens),
-        window=replace(slam.window, solved=None, prior=None),
-    )
+    ideal = replace(slam, map=undistorted_map(slam.map, lens)).with_tracker(frames=frames)
+    ideal = ideal.with_camera(intrinsics=np.array(lens.intrinsics, np.float64), lens=lens)
+    return ideal.with_window(solved=None, prior=None)
 
 
 def _lens_note(found: RefinedCamera, shape: tuple[int, int]) -> list[str]:
@@ -333,7 +312,7 @@ def _terms(
 ) -> tuple[AbstractTerm, ...]:
     """Return the terms on poses besides matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
-    terms = factor_terms(factors, places, shape.room, metric=slam.metric)
+    terms = factor_terms(factors, places, dict(shape.room), metric=slam.metric)
     if slam.camera.calibrated and not slam.metric:
         terms = (*terms, aspect_prior(slam.camera.given))
     if not surfaces or settings.depth_terms.surface_points <= 0:
@@ -351,12 +330,3 @@ def _factors_without_intrinsics(slam: Slam) -> tuple[Factor, ...]:
     matched = {pair.key for pair in slam.map.pairs if len(pair.points)}
     tracked = {id(factor) for factor in slam.map.odometry_factors if tuple(sorted(factor.keyframes)) in matched}
     return tuple(factor for factor in slam.map.factors if id(factor) not in tracked)
-
-
-def _thin(edges: list[Directed], keyframes: int) -> list[Directed]:
-    """Return at most `MAX_NEIGHBOURS` edges a host: those with the most matches."""
-    kept = []
-    for host in range(keyframes):
-        own = sorted((edge for edge in edges if edge.host == host), key=lambda edge: -len(edge.slots))
-        kept += own[:MAX_NEIGHBOURS]
-    return kept

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose
-from vggtgeo.slam.window.sliding_window import window_size
+from vggtgeo.slam.sparse_map.factors import Factor, MeasuredBaseline, MeasuredRelativePose
+from vggtgeo.slam.window.sliding_window import TOLERANCE, window_size
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
 
@@ -37,26 +38,24 @@ MAX_ITERATIONS = 40
 """Iterations of an adjustment of the whole map, which mostly converges after fewer."""
 
 
-@dataclass(frozen=True)
-class GlobalShape:
-    """Padded size of landmarks and edges, and room for each kind of factor and for pairs of surfaces."""
+class GlobalShape(NamedTuple):
+    """Padded size of landmarks and edges, room for factors by their kind, and room for pairs of surfaces."""
 
     size: PaddedSize
-    factors: tuple[tuple[type, int], ...]
+    room: tuple[tuple[type, int], ...]
     pairs: int
 
-    @property
-    def room(self) -> dict[type, int]:
-        """Room for factors of each kind."""
-        return dict(self.factors)
 
+def shape_for(keyframes: int, edges: int, settings: SlamSettings, metric: bool = True) -> GlobalShape:
+    """Return the shape of a map of so many keyframes and edges, with odometry factors.
 
-def shape_for(keyframes: int, edges: int, settings: SlamSettings) -> GlobalShape:
-    """Return the shape of a map of so many keyframes and edges, with odometry factors and metric depth."""
+    Without metric depth the first factor is the baseline that fixes the scale.
+    """
     padded = padded_count(keyframes)
     stored = padded_edges(edges, padded)
     size = replace(window_size(settings), keyframes=padded, degree=MAX_NEIGHBOURS, edges=stored)
-    return GlobalShape(size, ((MeasuredRelativePose, TIES * padded),), PAIRS * padded)
+    baseline = () if metric else ((MeasuredBaseline, padded_count(1)),)
+    return GlobalShape(size, (*baseline, (MeasuredRelativePose, TIES * padded)), PAIRS * padded)
 
 
 def shape_of(
@@ -71,8 +70,9 @@ def shape_of(
     size = usual.size
     if keyframes > SMALL[-1] and padded_edges(edges, size.keyframes) > MAX_PADDING * edges:
         size = replace(size, keyframes=keyframes, degree=max(edges_of_host), edges=edges)
-    room = {kind: max(padded_count(count), usual.room.get(kind, 0)) for kind, count in counts.items()}
-    return GlobalShape(size, tuple(room.items()), max(padded_count(pairs), usual.pairs))
+    usual_room = dict(usual.room)
+    room = tuple((kind, max(padded_count(count), usual_room.get(kind, 0))) for kind, count in counts.items())
+    return GlobalShape(size, room, max(padded_count(pairs), usual.pairs))
 
 
 def padded_count(count: int) -> int:
@@ -100,6 +100,6 @@ def global_solver(problem: Problem) -> SchurLevenbergMarquardt:
     small = problem.num_keyframes <= MAX_DENSE
     return SchurLevenbergMarquardt(
         max_iterations=MAX_ITERATIONS,
-        rtol=1e-5,
+        rtol=TOLERANCE,
         reduced_solver=DenseCholesky() if small else choose_reduced_solver(problem),
     )

@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 from vggtgeo.models.classical import PatchAlignment, can_search, search_near, search_tree
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS
-from vggtgeo.slam.sparse_map.connected import submap_of
 from vggtgeo.slam.sparse_map.covisibility import (
     MIN_MATCHES,
     MIN_OVERLAP,
@@ -26,7 +25,7 @@ from vggtgeo.slam.sparse_map.covisibility import (
     without_matches,
 )
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.map import Map
+from vggtgeo.slam.sparse_map.map import Map, submap_of
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.map_points import MAX_TURN, expected_pixels
 

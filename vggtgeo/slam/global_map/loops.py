@@ -5,21 +5,19 @@ Proposed by the estimated poses and, whatever the drift, by appearance; verified
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import inverse_information
 from vggtgeo.models.classical import can_search, pose_information
-from vggtgeo.models.roles import GeometryResult, LineMatches, PoseQuery
+from vggtgeo.models.roles import GeometryResult, PoseQuery
 from vggtgeo.slam.global_map.drift_correction import Loop, correct_drift
-from vggtgeo.slam.global_map.scale_graph import ScaleRatio
+from vggtgeo.slam.global_map.pose_graph import ScaleRatio
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
-from vggtgeo.slam.sparse_map.connected import submap_of
-from vggtgeo.slam.sparse_map.covisibility import Pair, overlap, some_points
+from vggtgeo.slam.sparse_map.covisibility import NO_LINES, Pair, overlap, some_points
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.sparse_map.units import measured_ratio
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
@@ -45,32 +43,32 @@ def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
     If the loops contradict the map by more than its adjustment can correct, a pose graph corrects it first, and it is
     searched again.
     """
-    label, known = submap_of(slam.map), {pair.key for pair in slam.map.pairs}
+    known = {pair.key for pair in slam.map.pairs}
     proposed = list(dict.fromkeys([*_by_estimate(slam, settings, known), *_by_appearance(slam, settings, known)]))
-    found = _verified(slam, proposed, label, roles)
-    before, (corrected, accepted) = slam, correct_drift(slam, found)
-    slam = replace(corrected, map=replace(corrected.map, pairs=(*slam.map.pairs, *(loop.pair for loop in accepted))))
-    if corrected is before:
-        return slam
+    found = verified_loops(slam, _in_one_scale(slam, proposed), roles)
+    corrected, accepted = correct_drift(slam, found)
+    closed = corrected.with_map(pairs=(*slam.map.pairs, *(loop.pair for loop in accepted)))
+    if corrected is slam:
+        return closed
     known |= {loop.pair.key for loop in found}
-    more = _verified(slam, _by_estimate(slam, settings, known), submap_of(slam.map), roles)
-    return replace(
-        slam, map=replace(slam.map, pairs=(*slam.map.pairs, *(loop.pair for loop in more if loop.agrees(slam))))
-    )
+    more = verified_loops(closed, _in_one_scale(closed, _by_estimate(closed, settings, known)), roles)
+    return closed.with_map(pairs=(*closed.map.pairs, *(loop.pair for loop in more if loop.agrees(closed))))
 
 
-def _verified(slam: Slam, proposed: list[tuple[int, int]], label: np.ndarray, roles: Roles) -> list[Loop]:
-    """Return the verified ones of the proposed pairs.
+def _in_one_scale(slam: Slam, proposed: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the pairs whose keyframes have one scale: submaps without metric depth have one each."""
+    label = submap_of(slam.map)
+    return [(first, second) for first, second in proposed if slam.metric or label[first] == label[second]]
 
-    Submaps without metric depth have different scales and are not compared.
-    """
-    comparable = [(first, second) for first, second in proposed if slam.metric or label[first] == label[second]]
+
+def verified_loops(slam: Slam, proposed: list[tuple[int, int]], roles: Roles) -> list[Loop]:
+    """Return the verified ones of the proposed pairs."""
 
     def verified(pair: tuple[int, int]) -> Loop | None:
         first, second = (slam.keyframes[number] for number in pair)
         return verify(first, second, roles, slam.intrinsics)
 
-    loops = map_in_threads(verified, comparable, alone=not can_search(slam.keyframes[0].features))
+    loops = map_in_threads(verified, proposed, alone=not can_search(slam.keyframes[0].features))
     return [loop for loop in loops if loop is not None]
 
 
@@ -131,8 +129,8 @@ def verify(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarr
     guess = roles.geometry.locate(PoseQuery(second.image, intrinsics, points, matches.pixels_j, matches.confidence))
     if guess.result is not GeometryResult.SUCCESS or guess.inlier_count <= MIN_INLIERS:
         return None
-    agreed, empty = matches.select(guess.inliers), np.zeros(0, int)
-    pair = Pair(first.number, second.number, agreed, LineMatches(empty, empty, np.zeros(0)))
+    agreed = matches.select(guess.inliers)
+    pair = Pair(first.number, second.number, agreed, NO_LINES)
     relative = rigid.orthonormal(guess.pose @ rigid.invert(first.pose))
     information = pose_information(guess.pose, points[guess.inliers], intrinsics, PIXEL_SIGMA)
     # Covariances add: matching noise, and what all matches share.

@@ -1,6 +1,10 @@
-"""Pose graph of odometry factors and verified loops, for drift too large for bundle adjustment.
+"""Graphs of scales and poses, of odometry factors and verified loops, for drift too large for bundle adjustment.
 
 The matches of bundle adjustment converge only within a few pixels.
+
+In a map without metric depth the scales come first. Scale is a homomorphism of the similarities, so the scale part of a
+Sim(3) pose graph is a linear graph of its own over the logarithms of the scales. This neglects the information of
+motion lengths about scale, which is small around a loop. The pose graph is then over SE(3).
 
 Odometry factors are a tree: only loops contradict them, so they have no robust kernel. The factor on their covariance
 is estimated from the loops: the median over loops of the squared Mahalanobis distance between the loop and the odometry
@@ -12,11 +16,15 @@ false ones.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import spsolve
 from scipy.stats import chi2 as chi_square
 
 from vggtgeo.bundle.graduation import Graduation
@@ -32,7 +40,7 @@ from vggtgeo.geometry.robust import POSE_GATE
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.global_map.global_shape import padded_count
 from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, relative_pose_rows
-from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.evidence import STEP_GROWTH, tangent
 from vggtgeo.solvers.kernels import Cauchy
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced import DenseCholesky
@@ -41,12 +49,20 @@ LOOP_GATE = POSE_GATE
 """Squared Mahalanobis distance above which a loop is false: one true loop in 10,000 is lost."""
 GRADUATION = Graduation(factors=(256.0, 64.0, 16.0, 4.0), iterations=6)
 """A loop of 2 cm against 10 m of drift has a residual of 500 standard deviations, half of the first width."""
-ITERATIONS = 50
 ROOM = 32
 """Loops are padded to a multiple of this, and poses to `padded_count`: a graph of about the same size compiles
 nothing."""
 DENSE_POSES = 200
 """Poses up to which the factor is dense, for any loops; about 20 ms."""
+DRIFT = 0.01
+"""Standard deviation of the change of scale from one keyframe to the next."""
+GUESSED = STEP_GROWTH
+"""The same if the length of the motion between them was taken from the motion so far."""
+MIN_RATIO_ERROR = 0.03
+"""Smallest standard deviation of the logarithm of a measured ratio: what its points have in common."""
+WIDTHS = (1024.0, 256.0, 64.0, 16.0, 4.0, 2.5, 2.5, 2.5)
+"""Widths of the Cauchy kernel on ratios, one reweighting each, in standard deviations: graduated, since after a large
+drift true ratios have residuals as large as false ones."""
 
 
 def _solve_graph(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:
@@ -74,16 +90,11 @@ class PoseGraph:
     held: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class SolvedPoseGraph:
-    """Poses after the optimisation, and which loops agree with them, bool [loops]."""
+def solve_pose_graph(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
+    """Return the optimised poses [n, 4, 4], and which loops agree with them, bool [loops].
 
-    poses: np.ndarray
-    accepted: np.ndarray
-
-
-def solve_pose_graph(graph: PoseGraph) -> SolvedPoseGraph:
-    """Return the optimised poses; if the solve fails, the initial ones without loops."""
+    If the solve fails, the initial poses without loops.
+    """
     spread = drift_variance(graph)
     loosened = [replace(motion, information=motion.information / spread) for motion in graph.motions]
     count = len(graph.poses)
@@ -103,12 +114,12 @@ def solve_pose_graph(graph: PoseGraph) -> SolvedPoseGraph:
     )
     small = count <= DENSE_POSES
     reduced = DenseCholesky() if small else choose_reduced_solver(problem)
-    solver = SchurLevenbergMarquardt(max_iterations=ITERATIONS, rtol=1e-6, reduced_solver=reduced)
+    solver = SchurLevenbergMarquardt(rtol=1e-6, reduced_solver=reduced)
     solution = solve_graph_jit(problem, initial, solver)
     poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64)[:count])
     if not np.isfinite(poses).all():
-        return SolvedPoseGraph(graph.poses, np.zeros(len(graph.loops), bool))
-    return SolvedPoseGraph(poses, np.array([squared_distance(loop, poses) < LOOP_GATE for loop in graph.loops], bool))
+        return graph.poses, np.zeros(len(graph.loops), bool)
+    return poses, np.array([squared_distance(loop, poses) < LOOP_GATE for loop in graph.loops], bool)
 
 
 def squared_distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float:
@@ -165,3 +176,54 @@ def _no_observations() -> Observations:
         point_target=nowhere,
         point_weight=np.zeros(0),
     )
+
+
+@dataclass(frozen=True)
+class ScaleRatio:
+    """Factor `ratio` that converts lengths of keyframe `second` to the scale of keyframe `first`; error: the standard
+    error of its logarithm.
+    """
+
+    first: int
+    second: int
+    ratio: float
+    error: float = 0.0
+
+
+def solve_scales(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios: Sequence[ScaleRatio]) -> np.ndarray:
+    """Return the factor on the lengths of each keyframe, float64 [n]; that of the first is 1."""
+    if not ratios:
+        return np.ones(keyframes)
+    ends = [*(motion.keyframes for motion in motions), *((r.first, r.second) for r in ratios)]
+    first, second = np.array(ends, int).T
+    measured = np.concatenate([np.zeros(len(motions)), np.log([r.ratio for r in ratios])])
+    errors = [float(np.hypot(MIN_RATIO_ERROR, ratio.error)) for ratio in ratios]
+    sigma = np.array([*(scale_drift(motion) for motion in motions), *errors])
+    rows = np.repeat(np.arange(len(first)), 2)
+    shape = (len(first), keyframes)
+    logs, weight = np.zeros(keyframes), np.ones(len(first))
+    for width in WIDTHS:
+        values = np.tile([-1.0, 1.0], len(first)) * np.repeat(np.sqrt(weight) / sigma, 2)
+        design = coo_array((values, (rows, np.stack([first, second], 1).ravel())), shape).tocsc()
+        target = np.sqrt(weight) * measured / sigma
+        # The weak hold of every logarithm at 0 decides for keyframes that nothing ties to the first.
+        normal = design.T @ design + coo_array((np.full(keyframes, 1e-6), (np.arange(keyframes),) * 2)).tocsc()
+        logs = np.asarray(spsolve(normal, design.T @ target))
+        logs -= logs[0]
+        residual = (logs[second] - logs[first] - measured) / sigma
+        # Cauchy's weight, for the measured ratios only: nothing but them contradicts the drift model.
+        weight[len(motions) :] = 1.0 / (1.0 + (residual[len(motions) :] / width) ** 2)
+    return np.exp(logs)
+
+
+def scale_drift(motion: MeasuredRelativePose) -> float:
+    """Return the standard deviation of the change of scale along a tracked motion.
+
+    Points triangulated by the motion inherit the relative error of its length.
+    """
+    length = float(np.linalg.norm(motion.pose[:3, 3]))
+    if motion.by_rays or length == 0:
+        return GUESSED
+    along = motion.pose[:3, 3] / length
+    sigma = float(np.sqrt(along @ np.linalg.inv(motion.information)[:3, :3] @ along))
+    return min(math.hypot(DRIFT, sigma / length), GUESSED)

@@ -70,7 +70,7 @@ class PoseUncertainty(NamedTuple):
 
 def frame_uncertainty(slam: Slam, submap: int = 0) -> PoseUncertainty | None:
     """Return the uncertainty of the frames of `frame_trajectory(slam, submap)`; None without a last adjustment."""
-    if slam.map.pose_sigma is None or len(slam.map.pose_sigma) != len(slam.keyframes):
+    if slam.map.pose_sigma is None or not slam.map.finished:
         return None
     own = set(submaps_by_size(slam)[submap])
     records = [record for record in slam.frames if record.tracked and record.reference in own]
@@ -93,7 +93,7 @@ def frame_uncertainty(slam: Slam, submap: int = 0) -> PoseUncertainty | None:
     # What turns while it is read out is sheared and stretched, which looks like a motion at the scene's distance.
     sheared = rate * median_depths(slam)[[record.reference for record in records]]
     moved = np.sqrt(moved**2 + MOMENT**2 * (speed**2 + sheared**2))
-    angles = _angles(poses)
+    angles = _angles(poses[:, :3, :3] @ poses[:1, :3, :3].mT)
     # A rotation by `a` turned by a small `q` differs from itself by `2 q sin(a / 2)`.
     shared = np.hypot(FOCAL_SIGMA * angles, turn * 2 * np.sin(angles / 2))
     turned = np.sqrt(turned**2 + MOMENT**2 * rate**2 + shared**2)
@@ -119,17 +119,15 @@ def median_depths(slam: Slam) -> np.ndarray:
     return 1 / np.array([float(np.median(values)) if len(values) else every for values in each])
 
 
-def _angles(poses: np.ndarray) -> np.ndarray:
-    """Return the rotation of each of [n, 4, 4] relative to the first, rad."""
-    return Rotation.from_matrix(poses[:, :3, :3] @ poses[:1, :3, :3].mT).magnitude() if len(poses) else np.zeros(0)
+def _angles(motions: np.ndarray) -> np.ndarray:
+    return Rotation.from_matrix(motions[:, :3, :3]).magnitude() if len(motions) else np.zeros(0)
 
 
 def _speeds(times: np.ndarray, poses: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the speeds of the camera at each pose, units of the map and radians a second, from its neighbours."""
     before, after = np.maximum(np.arange(len(times)) - 1, 0), np.minimum(np.arange(len(times)) + 1, len(times) - 1)
     seconds = times[after] - times[before]
-    steps = poses[after] @ rigid.invert(poses[before])
-    turned = Rotation.from_matrix(steps[:, :3, :3]).magnitude() if len(steps) else np.zeros(0)
+    turned = _angles(poses[after] @ rigid.invert(poses[before]))
     moved = np.linalg.norm(places[after] - places[before], axis=1)
     a_second = lambda path: np.divide(path, seconds, out=np.zeros(len(path)), where=seconds > 0)
     return a_second(moved), a_second(turned)
@@ -187,7 +185,7 @@ def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.
         block = inverse.solve(columns)[at] * unit[at, None]
         worst[row] = [np.linalg.eigvalsh(block[part, part])[-1] for part in (slice(0, 3), slice(3, 6))]
     determined = landmarks + np.count_nonzero(diagonal > 0)
-    return worst, float(_factor_jit(problem, state, determined))
+    return worst, float(_factor_jit(prepared(problem), state, determined))
 
 
 @eqx.filter_jit
@@ -197,11 +195,7 @@ def _linearised_jit(problem: Problem, state: State) -> tuple[ArrowSystem, Array]
     return system, jnp.sum(moving_landmarks(system))
 
 
-@eqx.filter_jit
-def _factor_jit(problem: Problem, state: State, determined: Array) -> Array:
-    return variance_factor(prepared(problem), state, determined)
-
-
+_factor_jit = eqx.filter_jit(variance_factor)
 _reduced_jit = eqx.filter_jit(reduced_blocks)
 
 

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -136,16 +136,6 @@ class Perception:
         return f"the weights of {', '.join(self.random)} are random: this result means nothing"
 
 
-def _with_others(classical: Roles, parts: Mapping[str, str]) -> Roles:
-    """Return the caller's roles, with other classical implementations where chosen."""
-    if parts.get("points") == "orb":
-        classical = replace(classical, points=OrbMatcher())
-    if parts.get("geometry") == "constant-velocity":
-        # The ablation is a start by motion alone: nothing else may mend the pose before the window does.
-        classical = replace(classical, geometry=ConstantVelocity(), alignment=None)
-    return classical
-
-
 def perception(
     preset: str = "classical",
     classical: Roles | None = None,
@@ -185,24 +175,27 @@ def perception(
     if provider not in get_args(Provider):
         raise InputError(f"`provider` is {provider!r:.60}; it must be one of {', '.join(get_args(Provider))}")
     chosen = _parts(preset, mixed or {})
-    classical = _with_others(classical or Roles(), chosen)
+    classical = classical or Roles()
+    if chosen.get("points") == "orb":
+        classical = replace(classical, points=OrbMatcher())
+    if chosen.get("geometry") == "constant-velocity":
+        # The ablation is a start by motion alone: nothing else may mend the pose before the window does.
+        classical = replace(classical, geometry=ConstantVelocity(), alignment=None)
     parts = {role: name for role, name in chosen.items() if name not in ("classical", *_OTHERS.get(role, ()))}
     if not parts:
         return Perception(classical, {})
-    needed, place = _files(parts), networks_folder(folder)
-    _check_present(needed, place)
+    place = networks_folder(folder)
+    files = {name: place / NETWORKS[name].file for name in _files(parts)}
+    if missing := [file.name for file in files.values() if not file.is_file()]:
+        raise InputError(
+            f"what was chosen needs {', '.join(missing)}, not found in `{place}`; `vggtgeo models list` tells how to "
+            "get each"
+        )
+    limits: dict[str, Any] = {"provider": provider, "memory_limit_gb": memory_limit_gb}
     with as_input_errors():
-        for name in needed:
-            check_looks_like_onnx(place / NETWORKS[name].file)  # before gigabytes of others are read
-        networks = {
-            name: open_session(
-                place / NETWORKS[name].file,
-                NETWORKS[name].contract,
-                provider=provider,
-                memory_limit_gb=memory_limit_gb,
-            )
-            for name in needed
-        }
+        for file in files.values():
+            check_looks_like_onnx(file)  # before gigabytes of others are read
+        networks = {name: open_session(file, NETWORKS[name].contract, **limits) for name, file in files.items()}
         players, refusals = _players(parts, classical, networks, cache)
         for session in networks.values():
             session.warm_up()
@@ -227,46 +220,31 @@ def _players(
 
     One network in two roles answers both from one call.
     """
-    features = {
-        name: DinoFeatures(networks[name], _cache(cache)) for name in parts.values() if name.startswith("dinov3")
-    }
+
+    def store() -> OutputCache:
+        return MemoryCache() if cache is None else FolderCache(cache)
+
+    features = {name: DinoFeatures(networks[name], store()) for name in parts.values() if name.startswith("dinov3")}
 
     def player(role: str, name: str) -> Any:
         if name in features:
             return DenseLineMatcher(features[name]) if role == "line_matches" else features[name]
         if name == "mast3r":
-            return Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], _cache(cache))
-        return _KINDS[NETWORKS[name].contract_name](session=networks[name], cache=_cache(cache))
+            return Mast3rMatcher(networks["mast3r_encoder"], networks["mast3r_decoder"], store())
+        return _KINDS[NETWORKS[name].contract_name](session=networks[name], cache=store())
 
     bounded = {role: _BOUNDED[role](player(role, name)) for role, name in parts.items() if role in _BOUNDED}
     refusals = {role: part.refusals for role, part in bounded.items()}
     if "geometry" in parts:
-        model = _check_views(VggtWindow(networks[parts["geometry"]], _cache(cache)))
+        model = VggtWindow(networks[parts["geometry"]], store())
+        if model.views is not None and model.views < 2:
+            raise NetworkFileError(
+                f"`{model.session.path}` takes {model.views} image at a time, expected at least 2, a keyframe and the "
+                "frame; export it again with `--views 4`"
+            )
         window = BoundedWindow(model)
         bounded["geometry"] = WindowLocator(window, classical.geometry, views=model.views)
         refusals["geometry"] = window.refusals
     if parts.get("points") == "mast3r" or "geometry" in parts:  # these ask for every frame's own points
         bounded["flow"] = None
     return bounded, refusals
-
-
-def _cache(folder: Path | None) -> OutputCache:
-    return MemoryCache() if folder is None else FolderCache(folder)
-
-
-def _check_present(needed: Sequence[str], place: Path) -> None:
-    missing = [NETWORKS[name].file for name in needed if not (place / NETWORKS[name].file).is_file()]
-    if missing:
-        raise InputError(
-            f"what was chosen needs {', '.join(missing)} in `{place}`, found no such "
-            f"{'files' if len(missing) > 1 else 'file'}; `vggtgeo models list` tells how to get each"
-        )
-
-
-def _check_views(window: VggtWindow) -> VggtWindow:
-    if window.views is not None and window.views < 2:
-        raise NetworkFileError(
-            f"`{window.session.path}` takes {window.views} image at a time, expected at least 2, a keyframe and the "
-            "frame; export it again with `--views 4`"
-        )
-    return window

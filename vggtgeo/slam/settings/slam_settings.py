@@ -26,7 +26,6 @@ from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.perception.rgbd_alignment import RgbdAlignment
 from vggtgeo.slam.perception.static_overlay import StaticOverlay
 from vggtgeo.slam.settings.groups import (
-    SEGMENT_SAMPLES,
     CameraSettings,
     DepthSettings,
     GlobalMapSettings,
@@ -178,20 +177,9 @@ class SlamSettings:
     window: WindowSettings = field(default_factory=WindowSettings)
     refinement: GlobalMapSettings = field(default_factory=GlobalMapSettings)
 
-    @property
-    def padded_samples(self) -> int | None:
-        """Samples of a segment in a problem's padded size; None if each sample has its own inverse depth."""
-        return SEGMENT_SAMPLES if self.line.two_ends_lines else None
-
     def __post_init__(self) -> None:
         for entry in fields(self):
             kind: Any = entry.default_factory
             value = getattr(self, entry.name)
             if not isinstance(value, kind):
                 raise InputError(f"`{entry.name}` is {value!r}; it must be a `vggtgeo.{entry.type}`")
-        samples = self.padded_samples
-        if samples is not None and self.window.line_slots % samples:
-            raise InputError(
-                f"`window.line_slots` is {self.window.line_slots}; with `line.two_ends_lines` it must be a multiple "
-                f"of {samples}, the samples of a segment"
-            )

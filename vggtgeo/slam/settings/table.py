@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.slam.settings.checks import CheckedSettings
 from vggtgeo.slam.settings.groups import is_kernel
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
@@ -47,7 +46,10 @@ def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
             raise InputError(f"`{group}` is no group of settings; it must be one of {', '.join(GROUPS)}")
         for field in values:
             _check_name(f"{group}.{field}")
-        plain = {field: _value(f"{group}.{field}", value) for field, value in values.items()}
+        plain = {
+            field: _kernel(f"{group}.{field}", value) if field == "kernel" and isinstance(value, str) else value
+            for field, value in values.items()
+        }
         groups[group] = dataclasses.replace(getattr(settings, group), **plain)
     return dataclasses.replace(settings, **groups)
 
@@ -65,21 +67,19 @@ def parsed(assignment: str) -> Tables:
     _check_name(name)
     group, field = name.split(".")
     try:
-        read = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except ValueError:  # a word, or a number of more digits than Python reads
         value = text
-    except (ValueError, RecursionError) as error:  # more digits or brackets than Python reads
-        raise InputError(f"`{name}` cannot be read: {error}") from None
-    else:
-        if len(read) > 1:  # a line break begins another setting
-            raise InputError(f"`{name}` is set beside others, of {len(read)} lines; give each a `--set` of its own")
-        value = read["value"]
     return {group: {field: value}}
 
 
 def tables_of(settings: SlamSettings) -> dict[str, dict[str, Any]]:
     """Return every value in the form that `updated` takes, of types that TOML and JSON support."""
-    return {group: _plain(getattr(settings, group)) for group in GROUPS}
+    found: dict[str, dict[str, Any]] = {group: {} for group in GROUPS}
+    for name in names():
+        group, field = name.split(".")
+        found[group][field] = _plain(getattr(getattr(settings, group), field))
+    return found
 
 
 def changed(settings: SlamSettings) -> dict[str, dict[str, Any]]:
@@ -92,11 +92,11 @@ def changed(settings: SlamSettings) -> dict[str, dict[str, Any]]:
     return {group: values for group, values in different.items() if values}
 
 
-def _plain(group: CheckedSettings) -> dict[str, Any]:
-    values = {entry.name: getattr(group, entry.name) for entry in dataclasses.fields(group)}
-    texts = {name: _kernel_text(value) for name, value in values.items() if isinstance(value, AbstractKernel)}
-    numbers = {name: value.item() for name, value in values.items() if isinstance(value, np.generic)}
-    return {**values, **texts, **numbers}
+def _plain(value: Any) -> Any:
+    if isinstance(value, AbstractKernel):
+        numbers = (repr(float(getattr(value, entry.name))) for entry in dataclasses.fields(value))
+        return " ".join((type(value).__name__.lower(), *numbers))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _check_name(name: str) -> None:
@@ -106,10 +106,6 @@ def _check_name(name: str) -> None:
         same = [other for other in known if other.endswith(f".{field}")]
         nearest = (same or difflib.get_close_matches(name, known, 1, 0.0))[0]
         raise InputError(f"`{name}` is no setting; the nearest is `{nearest}`")
-
-
-def _value(name: str, value: Any) -> Any:
-    return _kernel(name, value) if name.endswith(".kernel") and isinstance(value, str) else value
 
 
 def _kernel(name: str, text: str) -> AbstractKernel:
@@ -124,8 +120,3 @@ def _kernel(name: str, text: str) -> AbstractKernel:
         expected = f"one of {', '.join(KERNELS)} and its numbers, the width above 0, such as `cauchy 2.0`"
         raise InputError(f"`{name}` is {text!r}; it must be {expected}")
     return kernel
-
-
-def _kernel_text(kernel: AbstractKernel) -> str:
-    fields = dataclasses.fields(kernel)
-    return " ".join((type(kernel).__name__.lower(), *(repr(float(getattr(kernel, entry.name))) for entry in fields)))

@@ -22,6 +22,8 @@ MIN_OVERLAP = 0.25
 """Share of a keyframe's points inside another's image required for matching."""
 GATE_SIGMA = 4.0
 """Standard deviations within the gate of matches."""
+SAMPLES = 64
+"""Key points, spread over the image, that an overlap is measured on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,7 @@ class Directed:
     line_confidence: np.ndarray
 
 
-def some_points(keyframe: Keyframe, intrinsics: np.ndarray, *, fill: bool = False, most: int = 64) -> np.ndarray:
+def some_points(keyframe: Keyframe, intrinsics: np.ndarray, *, fill: bool = False) -> np.ndarray:
     """Return world points of a few slots of known depth, spread over the image, float64 `[m, 3]`.
 
     fill: also slots of unknown depth, at the mean inverse depth of the others. In a turn without metric depth only the
@@ -67,19 +69,20 @@ def some_points(keyframe: Keyframe, intrinsics: np.ndarray, *, fill: bool = Fals
     if fill and known.any():
         inverse = np.where(known, inverse, np.mean(inverse[known]))
     rows = np.nonzero(np.isfinite(inverse))[0]
-    some = rows[:: max(len(rows) // most, 1)]
+    some = rows[:: max(len(rows) // SAMPLES, 1)]
     return rigid.unproject(keyframe.points.pixels[some], inverse[some], keyframe.pose, intrinsics)
 
 
 def overlap(points: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> float:
     """Return the share of world points inside the image of `keyframe`."""
-    if not len(points):
-        return 0.0
-    height, width = keyframe.size
+    return share_inside(rigid.project(points, keyframe.pose, intrinsics), keyframe) if len(points) else 0.0
+
+
+def share_inside(pixels: np.ndarray, keyframe: Keyframe) -> float:
+    """Return the share of pixels [m, 2] inside the image of `keyframe`; those behind the camera are NaN."""
+    (x, y), (height, width) = pixels.T, keyframe.size
     with np.errstate(invalid="ignore"):
-        x, y = rigid.project(points, keyframe.pose, intrinsics).T
-        inside = (x > 0) & (x < width) & (y > 0) & (y < height)
-    return float(np.mean(inside))
+        return float(np.mean((x > 0) & (x < width) & (y > 0) & (y < height)))
 
 
 def match_keyframes(
@@ -112,13 +115,13 @@ def match_keyframes(
     return Pair(first.number, second.number, points, lines)
 
 
-_NO_LINES = LineMatches(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+NO_LINES = LineMatches(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
 
 def without_matches(first: int, second: int) -> Pair:
     """Return a pair of keyframes that is known to overlap although nothing was matched."""
     none, nowhere = np.zeros(0, int), np.zeros((0, 2))
-    return Pair(first, second, PointMatches(none, none, nowhere, nowhere, np.zeros(0)), _NO_LINES)
+    return Pair(first, second, PointMatches(none, none, nowhere, nowhere, np.zeros(0)), NO_LINES)
 
 
 def directions(pair: Pair, keyframes: dict[int, Keyframe]) -> tuple[Directed, Directed]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.geometry import pinhole
 from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
 from vggtgeo.slam.perception.description import Description
@@ -141,9 +142,7 @@ def make_keyframe(
     ends = lines.segments.endpoints
     line_depths = segment_depths(ends, depth.depth) if len(ends) else np.zeros((0, 2))
     segment, pixels, fraction = sample_segments(ends, LINE_SPACING)
-    points = _slots_at(features.pixels, depth, confidence)
     samples = _slots_at(pixels, depth, confidence)
-    on_line = _along_segments(line_depths, segment, fraction)
     return Keyframe(
         number=number,
         frame=frame.index,
@@ -158,8 +157,8 @@ def make_keyframe(
         features=features,
         lines=lines,
         line_depths=line_depths,
-        points=points,
-        samples=_with_line_depth(samples, on_line),
+        points=_slots_at(features.pixels, depth, confidence),
+        samples=_with_line_depth(samples, along_segments(1.0 / line_depths, segment, fraction)),
         sample_segment=segment,
         place=place_vector(features),
     )
@@ -178,38 +177,29 @@ def find_lines(image: np.ndarray, roles: Roles, settings: SlamSettings) -> LineF
 
 def _slots_at(pixels: np.ndarray, depth: DepthEstimate, confidence: np.ndarray) -> Slots:
     measured = depth.depth, depth.sigma_rel, depth.confidence
-    z, sigma_rel, trust = (read_at(image, pixels).astype(np.float64) for image in measured)
-    inverse, seen = 1.0 / z, read_at(confidence, pixels).astype(np.float64)
+    z, sigma_rel, trust = (pinhole.at_pixels(image, pixels).astype(np.float64) for image in measured)
+    inverse, seen = 1.0 / z, pinhole.at_pixels(confidence, pixels).astype(np.float64)
     nothing = np.full(len(pixels), np.nan)
     return Slots(pixels, inverse, inverse, sigma_rel * inverse, np.nan_to_num(trust), seen, nothing)
 
 
-def read_at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return the value of the nearest pixel, [m] or [m, 3]; outside the image that of the border.
+def along_segments(inverse: np.ndarray, segment: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Return the inverse depth of each sample from those of its segment's ends [l, 2].
 
-    Undistortion may move key points outside.
+    Inverse depth is affine in the pixel along the image of a straight line.
     """
-    height, width = image.shape[:2]
-    columns, rows = np.rint(pixels).astype(int).T
-    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-
-
-def _along_segments(line_depths: np.ndarray, segment: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Return the inverse depth of each sample from its segment's ends: affine along the image of a straight line."""
-    inverse = 1.0 / line_depths[segment]
-    return inverse[:, 0] + fraction * (inverse[:, 1] - inverse[:, 0])
+    ends = inverse[segment]
+    return ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])
 
 
 def _with_line_depth(samples: Slots, on_line: np.ndarray) -> Slots:
     """Return the samples with depths of the line fit: at a depth edge a single pixel may be on either surface."""
     known = np.isfinite(on_line)
-    floor = 0.02 * on_line
-    return Slots(
-        pixels=samples.pixels,
-        inverse_depth=np.where(known, on_line, np.nan),
-        prior_mean=np.where(known, on_line, np.nan),
-        prior_sigma=np.where(known, np.fmax(np.nan_to_num(samples.prior_sigma), floor), np.nan),
+    inverse = np.where(known, on_line, np.nan)
+    return replace(
+        samples,
+        inverse_depth=inverse,
+        prior_mean=inverse,
+        prior_sigma=np.where(known, np.fmax(np.nan_to_num(samples.prior_sigma), 0.02 * on_line), np.nan),
         prior_confidence=np.where(known, np.maximum(samples.prior_confidence, 0.3), 0.0),
-        confidence=samples.confidence,
-        estimate_sigma=samples.estimate_sigma,
     )

@@ -19,14 +19,6 @@ MAX_SCALE_ERROR = 0.03
 """Largest standard error of that ratio; at 3 m it moves the joined part by 9 cm, which the adjustment corrects."""
 
 
-def ratio_of_units(
-    old: Keyframe, new: Keyframe, matches: PointMatches, relative: np.ndarray, intrinsics: np.ndarray
-) -> float | None:
-    """Return the factor of `measured_ratio`; None if its standard error exceeds `MAX_SCALE_ERROR`."""
-    ratio, error = measured_ratio(old, new, matches, relative, intrinsics)
-    return ratio if error < MAX_SCALE_ERROR else None
-
-
 def measured_ratio(
     old: Keyframe, new: Keyframe, matches: PointMatches, relative: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[float, float]:
@@ -61,13 +53,17 @@ def longer(motion: np.ndarray, ratio: float) -> np.ndarray:
 
 def scaled_keyframe(keyframe: Keyframe, ratio: float) -> Keyframe:
     """Return the keyframe with all lengths multiplied by `ratio`."""
-    nearer = lambda slots: replace(
-        slots, inverse_depth=slots.inverse_depth / ratio, estimate_sigma=slots.estimate_sigma / ratio
+
+    def scaled(slots: Slots) -> Slots:
+        return replace(slots, inverse_depth=slots.inverse_depth / ratio, estimate_sigma=slots.estimate_sigma / ratio)
+
+    return replace(
+        keyframe,
+        pose=longer(keyframe.pose, ratio),
+        points=scaled(keyframe.points),
+        samples=scaled(keyframe.samples),
+        line_depths=keyframe.line_depths * ratio,
     )
-    points: Slots = nearer(keyframe.points)
-    samples: Slots = nearer(keyframe.samples)
-    line_depths = keyframe.line_depths * ratio
-    return replace(keyframe, pose=longer(keyframe.pose, ratio), points=points, samples=samples, line_depths=line_depths)
 
 
 def scaled_factor(factor: Factor, ratio: float) -> Factor:

@@ -15,11 +15,9 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import line_coefficients
-from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.keyframe import LINE_SPACING, MAX_DEPTH_ERROR, Keyframe, Slots
-from vggtgeo.slam.window.line_support import sample_shares, supported
 from vggtgeo.slam.window.selection import Selection
 
 MIN_INVERSE_DEPTH = 1e-3
@@ -79,17 +77,15 @@ def build(
 ) -> Adjustment:
     """Pack `keyframes` (at most `size.keyframes`) and the directed edges between them.
 
-    terms: further terms on poses and pairs, by the position of a keyframe in `keyframes`. camera: prior of the
-    intrinsics; they start from `intrinsics`, fx, fy, cx, cy.
-
     At most `point_slots` key points (those with the most observations) and `line_slots` line samples of each host are
-    used.
+    used. terms: further terms on poses and pairs, by the position of a keyframe in `keyframes`. camera: prior of the
+    intrinsics; they start from `intrinsics`, fx, fy, cx, cy.
     """
-    local = {keyframe.number: i for i, keyframe in enumerate(keyframes)}
-    points = Selection.points(keyframes, edges, local, settings)
-    lines = Selection.lines(keyframes, edges, local, settings)
-    selected = points, lines
-    observations, depths, informed, estimate_sigma = _observed(keyframes, edges, local, selected, intrinsics, settings)
+    row = {keyframe.number: i for i, keyframe in enumerate(keyframes)}
+    edges = [replace(edge, host=row[edge.host], target=row[edge.target]) for edge in edges]
+    points = Selection.points(keyframes, edges, settings.window.point_slots)
+    lines = Selection.lines(keyframes, edges, settings.window.line_slots)
+    observations, depths, informed, estimate_sigma = _observed(keyframes, edges, points, lines, intrinsics, settings)
     problem, initial, index = pack(
         observations,
         rigid.to_quaternion(np.array([keyframe.pose for keyframe in keyframes])),
@@ -117,44 +113,6 @@ def build(
     )
 
 
-def _observed(
-    keyframes: Sequence[Keyframe],
-    edges: Sequence[Directed],
-    local: dict[int, int],
-    selected: tuple[Selection, Selection],
-    intrinsics: np.ndarray,
-    settings: SlamSettings,
-) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the observations of the selected points and line samples, their initial inverse depths, whether these are
-    constrained, and the standard deviations by views.
-    """
-    points, lines = selected
-    depths, informed, estimate_sigma = _initial_depths(keyframes, edges, local, points, intrinsics)
-    key_points, samples = [keyframe.points for keyframe in keyframes], [keyframe.samples for keyframe in keyframes]
-    read = lambda name: np.concatenate([points.read(key_points, name), lines.read(samples, name)])
-    prior, sigma = read("prior_mean"), read("prior_sigma")
-    has_prior = np.isfinite(prior) & np.isfinite(sigma)
-    depths = np.concatenate([depths, read("inverse_depth")[len(points.host) :]])
-    # A slot without a prior needs finite placeholders; weight 0 removes its residual.
-    weight = np.where(has_prior, _prior_trust(read("prior_confidence"), read("confidence"), settings), 0.0)
-    observations = Observations(
-        edges=np.array([[local[e.host], local[e.target]] for e in edges], int).reshape(-1, 2),
-        host=np.concatenate([points.host, lines.host]),
-        pixel=read("pixels").reshape(-1, 2),
-        **_point_rows(keyframes, edges, local, points, settings),
-        **_line_rows(keyframes, edges, local, lines, settings, len(points.host), intrinsics),
-        depth_mean=np.where(has_prior, prior, 1.0),
-        depth_sigma=np.where(has_prior, sigma, 1.0),
-        depth_weight=weight if settings.depth_terms.depth_weight > 0 else np.zeros_like(weight),
-        alpha=settings.depth_terms.depth_weight,
-        segment=_segments(keyframes, points, lines) if settings.line.two_ends_lines else None,
-        kernel=settings.window.kernel,
-    )
-    informed = np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
-    estimate_sigma = np.concatenate([estimate_sigma, np.full(len(lines.host), np.nan)])
-    return observations, depths, informed, np.where(has_prior, np.nan, estimate_sigma)
-
-
 def write_back(
     keyframes: Sequence[Keyframe], adjustment: Adjustment, state: State
 ) -> tuple[tuple[Keyframe, ...], np.ndarray]:
@@ -180,98 +138,119 @@ def _updated(slots: Slots, adjustment: Adjustment, depths: np.ndarray, here: np.
     return replace(slots, inverse_depth=inverse, estimate_sigma=estimate_sigma)
 
 
-def _segments(keyframes: Sequence[Keyframe], points: Selection, lines: Selection) -> np.ndarray:
-    """Return the segment of each landmark, numbered over all keyframes; -1 for points."""
-    first = np.cumsum([0, *(len(keyframe.lines) for keyframe in keyframes)])
-    own = [first[h] + keyframes[h].sample_segment[s] for h, s in zip(lines.host, lines.slot, strict=True)]
-    return np.concatenate([np.full(len(points.host), -1), np.array(own, int)])
-
-
-def _point_rows(
+def _observed(
     keyframes: Sequence[Keyframe],
     edges: Sequence[Directed],
-    local: dict[int, int],
     points: Selection,
-    settings: SlamSettings,
-) -> dict[str, np.ndarray]:
-    edge_ids, landmarks = [np.zeros(0, int)], [np.zeros(0, int)]
-    targets, weights = [np.zeros((0, 2))], [np.zeros(0)]
-    for number, edge in enumerate(edges):
-        host = local[edge.host]
-        landmark = points.table[host][edge.slots]
-        chosen = landmark >= 0
-        # A slot has one match on an edge; of two targets the last is kept.
-        edge_ids.append(np.full(np.count_nonzero(chosen), number))
-        landmarks.append(landmark[chosen])
-        targets.append(edge.pixels[chosen])
-        omega = keyframes[host].points.confidence[edge.slots[chosen]]
-        weights.append(settings.weights.weight(edge.confidence[chosen] * omega))
-    return {
-        "point_edge": np.concatenate(edge_ids),
-        "point_landmark": np.concatenate(landmarks),
-        "point_target": np.concatenate(targets),
-        "point_weight": np.concatenate(weights),
-    }
-
-
-def _line_rows(
-    keyframes: Sequence[Keyframe],
-    edges: Sequence[Directed],
-    local: dict[int, int],
     lines: Selection,
-    settings: SlamSettings,
-    offset: int,
     intrinsics: np.ndarray,
-) -> dict[str, np.ndarray]:
-    edge_ids, landmarks, coefficients, weights = (
-        [np.zeros(0, int)],
-        [np.zeros(0, int)],
-        [np.zeros((0, 3))],
-        [np.zeros(0)],
+    settings: SlamSettings,
+) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the observations of the selected points and line samples, their initial inverse depths, whether these are
+    constrained, and the standard deviations by views. Edges: by rows of `keyframes`.
+    """
+    depths, informed, estimate_sigma = _initial_depths(keyframes, edges, points, intrinsics)
+    key_points, samples = [keyframe.points for keyframe in keyframes], [keyframe.samples for keyframe in keyframes]
+    read = lambda name: np.concatenate([points.read(key_points, name), lines.read(samples, name)])
+    prior, sigma = read("prior_mean"), read("prior_sigma")
+    has_prior = np.isfinite(prior) & np.isfinite(sigma)
+    depths = np.concatenate([depths, read("inverse_depth")[len(points.host) :]])
+    trust = depth_trust(read("prior_confidence"), read("confidence"), settings)
+    # A slot without a prior needs finite placeholders; weight 0 removes its residual.
+    weight = np.where(has_prior & (settings.depth_terms.depth_weight > 0), trust, 0.0)
+    observations = Observations(
+        edges=np.array([[edge.host, edge.target] for edge in edges], int).reshape(-1, 2),
+        host=np.concatenate([points.host, lines.host]),
+        pixel=read("pixels").reshape(-1, 2),
+        **_point_rows(keyframes, edges, points, settings),
+        **_line_rows(keyframes, edges, lines, len(points.host), intrinsics, settings),
+        depth_mean=np.where(has_prior, prior, 1.0),
+        depth_sigma=np.where(has_prior, sigma, 1.0),
+        depth_weight=weight,
+        alpha=settings.depth_terms.depth_weight,
+        kernel=settings.window.kernel,
     )
-    for number, edge in enumerate(edges):
-        host, target = local[edge.host], keyframes[local[edge.target]]
-        # All samples of a segment have the match of the segment.
-        matched = np.full(len(keyframes[host].lines), -1)
-        matched[edge.line_slots] = np.arange(len(edge.line_slots))
-        of_sample = matched[keyframes[host].sample_segment]
-        chosen = np.nonzero((of_sample >= 0) & (lines.table[host] >= 0))[0]
-        if not len(chosen):
-            continue
-        samples = keyframes[host].samples
-        ends = target.lines.segments.endpoints
-        own_ends = ends[edge.line_targets[of_sample[chosen]]]
-        places = rigid.unproject(
-            samples.pixels[chosen], samples.inverse_depth[chosen], keyframes[host].pose, intrinsics
-        )
-        near = supported(places, target.pose, own_ends, intrinsics, reach=LINE_SPACING, gate=LINE_GATE)
-        edge_ids.append(np.full(len(chosen), number))
-        landmarks.append(offset + lines.table[host][chosen])
-        coefficients.append(line_coefficients(ends)[edge.line_targets[of_sample[chosen]]])
-        weight = settings.weights.weight(edge.line_confidence[of_sample[chosen]] * samples.confidence[chosen])
-        if settings.line.two_ends_lines:
-            weight = weight * sample_shares(keyframes[host].sample_segment, SEGMENT_SAMPLES)[chosen]
-        weights.append(np.where(near, weight * settings.line.line_weight, 0.0))
-    return {
-        "line_edge": np.concatenate(edge_ids),
-        "line_landmark": np.concatenate(landmarks),
-        "line_coefficients": np.concatenate(coefficients),
-        "line_weight": np.concatenate(weights),
-    }
+    informed = np.concatenate([informed, np.ones(len(lines.host), bool)]) | has_prior
+    estimate_sigma = np.concatenate([estimate_sigma, np.full(len(lines.host), np.nan)])
+    return observations, depths, informed, np.where(has_prior, np.nan, estimate_sigma)
 
 
-def _prior_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
+def depth_trust(own: np.ndarray, saliency: np.ndarray, settings: SlamSettings) -> np.ndarray:
+    """Return the factor on the information of each depth, by the settings `depth_trust` and `confidence`."""
     if settings.weights.confidence == "none":
         return np.ones_like(own)
     return {"own": own, "saliency": saliency, "complement": 1.0 - saliency}[settings.depth_terms.depth_trust]
 
 
-def _initial_depths(
+def _point_rows(
+    keyframes: Sequence[Keyframe], edges: Sequence[Directed], points: Selection, settings: SlamSettings
+) -> dict[str, np.ndarray]:
+    rows = []
+    for number, edge in enumerate(edges):
+        # A slot has one match on an edge; of two targets the last is kept.
+        landmark, chosen = points.landmarks(edge)
+        omega = keyframes[edge.host].points.confidence[edge.slots[chosen]]
+        weight = settings.weights.weight(edge.confidence[chosen] * omega)
+        rows.append((np.full(len(landmark), number), landmark, edge.pixels[chosen], weight))
+    none, nowhere = np.zeros(0, int), np.zeros((0, 2))
+    return _columns(rows, point_edge=none, point_landmark=none, point_target=nowhere, point_weight=np.zeros(0))
+
+
+def _line_rows(
     keyframes: Sequence[Keyframe],
     edges: Sequence[Directed],
-    local: dict[int, int],
-    points: Selection,
+    lines: Selection,
+    offset: int,
     intrinsics: np.ndarray,
+    settings: SlamSettings,
+) -> dict[str, np.ndarray]:
+    rows = []
+    for number, edge in enumerate(edges):
+        host, target = keyframes[edge.host], keyframes[edge.target]
+        # All samples of a segment have the match of the segment.
+        matched = np.full(len(host.lines), -1)
+        matched[edge.line_slots] = np.arange(len(edge.line_slots))
+        of_sample, landmark, samples = matched[host.sample_segment], lines.table[edge.host], host.samples
+        chosen = np.flatnonzero((of_sample >= 0) & (landmark >= 0))
+        if not len(chosen):
+            continue
+        match, ends = of_sample[chosen], target.lines.segments.endpoints
+        places = rigid.unproject(samples.pixels[chosen], samples.inverse_depth[chosen], host.pose, intrinsics)
+        near = supported(places, target.pose, ends[edge.line_targets[match]], intrinsics)
+        weight = settings.weights.weight(edge.line_confidence[match] * samples.confidence[chosen])
+        weight = np.where(near, weight * settings.line.line_weight, 0.0)
+        coefficients = line_coefficients(ends)[edge.line_targets[match]]
+        rows.append((np.full(len(chosen), number), offset + landmark[chosen], coefficients, weight))
+    none, nothing = np.zeros(0, int), np.zeros((0, 3))
+    return _columns(rows, line_edge=none, line_landmark=none, line_coefficients=nothing, line_weight=np.zeros(0))
+
+
+def _columns(rows: Sequence[tuple[np.ndarray, ...]], **empty: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the concatenated columns of some rows by name. empty: columns without a row, for shape and type."""
+    columns = zip(empty.values(), *rows, strict=True)
+    return {name: np.concatenate(parts) for name, parts in zip(empty, columns, strict=True)}
+
+
+def supported(points: np.ndarray, pose: np.ndarray, endpoints: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Return whether each world point [m, 3] projects next to its matched segment [m, 2, 2], pixels, bool [m].
+
+    A segment constrains points along its own length: beyond its ends the error of its direction grows with the
+    distance, and points behind the camera have no valid projection. pose: world -> camera of the view.
+    """
+    pixels = rigid.project(points, pose, intrinsics)
+    along = endpoints[:, 1] - endpoints[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    # Degenerate segments have a length of zero.
+    direction = along / np.maximum(length, 1e-9)[:, None]
+    offset = pixels - endpoints[:, 0]
+    place = (offset * direction).sum(1)
+    distance = np.abs(offset[:, 0] * direction[:, 1] - offset[:, 1] * direction[:, 0])
+    # A comparison with NaN (behind the camera) is false.
+    return (place > -LINE_SPACING) & (place < length + LINE_SPACING) & (distance < LINE_GATE)
+
+
+def _initial_depths(
+    keyframes: Sequence[Keyframe], edges: Sequence[Directed], points: Selection, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the inverse depth of each point (estimated, else triangulated), whether views constrain it, and its
     standard deviation by views.
@@ -281,7 +260,7 @@ def _initial_depths(
     """
     slots = [keyframe.points for keyframe in keyframes]
     current, before = points.read(slots, "inverse_depth"), points.read(slots, "estimate_sigma")
-    triangulated, information, longest = _triangulated(keyframes, edges, local, points, intrinsics)
+    triangulated, information, longest = _triangulated(keyframes, edges, points, intrinsics)
     seen = information > 0
     estimate_sigma = np.where(seen, 1.0 / np.sqrt(np.maximum(information, 1e-12)), np.nan)
     determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (estimate_sigma < MAX_DEPTH_ERROR * triangulated)
@@ -298,24 +277,18 @@ def _initial_depths(
 
 
 def _triangulated(
-    keyframes: Sequence[Keyframe],
-    edges: Sequence[Directed],
-    local: dict[int, int],
-    points: Selection,
-    intrinsics: np.ndarray,
+    keyframes: Sequence[Keyframe], edges: Sequence[Directed], points: Selection, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the mean triangulated inverse depth of each point, its information, and its longest baseline."""
     weighted, information, longest = np.zeros((3, len(points.host)))
     for edge in edges:
-        host, target = keyframes[local[edge.host]], keyframes[local[edge.target]]
-        landmark = points.table[local[edge.host]][edge.slots]
-        chosen = landmark >= 0
+        host, target = keyframes[edge.host], keyframes[edge.target]
+        landmark, chosen = points.landmarks(edge)
         relative = target.pose @ rigid.invert(host.pose)
-        value, weight = rigid.triangulate(
-            host.features.pixels[edge.slots[chosen]], edge.pixels[chosen], relative, intrinsics
-        )
-        np.add.at(weighted, landmark[chosen], weight * value)
-        np.add.at(information, landmark[chosen], weight)
-        np.maximum.at(longest, landmark[chosen], float(np.linalg.norm(relative[:3, 3])))
+        pixels = host.features.pixels[edge.slots[chosen]], edge.pixels[chosen]
+        value, weight = rigid.triangulate(*pixels, relative, intrinsics)
+        np.add.at(weighted, landmark, weight * value)
+        np.add.at(information, landmark, weight)
+        np.maximum.at(longest, landmark, float(np.linalg.norm(relative[:3, 3])))
     # Mean by information in inverse depth, where the error of a triangulation is nearly Gaussian.
     return weighted / np.maximum(information, 1e-12), information, longest

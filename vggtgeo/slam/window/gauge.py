@@ -20,6 +20,7 @@ from vggtgeo.bundle.terms.image import PointTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import PairTerm
 from vggtgeo.geometry import lie, rigid
+from vggtgeo.slam.sparse_map.map import by_first_member
 
 TINY = float(np.finfo(np.float64).tiny)
 STILL = 1e-6
@@ -48,10 +49,9 @@ def with_one_gauge(problem: Problem, state: State, keyframes: int, metric: bool)
     With metric depth, the first fixed pose of a component stays fixed. Without, several fixed poses of a component
     define its scale, and stay fixed. A marginal prior on absolute poses fixes its component, too.
     """
-    known = _PriorKnowledge.of(problem, state, keyframes)
-    label = _labels(problem, keyframes, known)
-    fixed = np.array(problem.fixed_pose)
-    sized = _sized(problem, keyframes, known, label)
+    tied, placed = _known_by_prior(problem, state, keyframes)
+    label, fixed = _labels(problem, keyframes, tied), np.array(problem.fixed_pose)
+    sized = _sized(problem, keyframes, tied, label)
     components: list[tuple[int, ...]] = []
     free: list[tuple[int, ...]] = []
     loose: list[tuple[int, ...]] = []
@@ -62,7 +62,7 @@ def with_one_gauge(problem: Problem, state: State, keyframes: int, metric: bool)
         if metric:
             # With a known scale a second fixed pose would keep the error between both.
             fixed[held[1:]] = False
-        if not len(held) and not known.placed[component].any():
+        if not len(held) and not placed[component].any():
             fixed[component[0]] = True
             free.append(rows)
         if len(component) > 1 and not sized[label[component[0]]] and np.count_nonzero(fixed[component]) < 2:
@@ -79,14 +79,11 @@ def gauge_notes(gauge: Gauge, numbers: tuple[int, ...], problem_name: str) -> tu
     """Return warnings for the user; `numbers` are those of the keyframes by row."""
     name = lambda component: ", ".join(str(numbers[row]) for row in component)
     # A single keyframe is a component by itself and needs no fixed pose.
-    alone = len(numbers) == 1
-    free = (
-        ()
-        if alone
-        else (f"{problem_name}: keyframes {name(p)} are not connected to the map; fixed" for p in gauge.free)
+    free = gauge.free if len(numbers) > 1 else ()
+    return (
+        *(f"{problem_name}: keyframes {name(rows)} are not connected to the map; fixed" for rows in free),
+        *(f"{problem_name}: the scale of keyframes {name(rows)} is not observable; fixed" for rows in gauge.loose),
     )
-    loose = (f"{problem_name}: the scale of keyframes {name(p)} is not observable; fixed" for p in gauge.loose)
-    return (*free, *loose)
 
 
 def _without_links(problem: Problem, label: np.ndarray) -> Problem:
@@ -105,32 +102,25 @@ def _without_links(problem: Problem, label: np.ndarray) -> Problem:
     return problem
 
 
-def _labels(problem: Problem, keyframes: int, known: _PriorKnowledge) -> np.ndarray:
-    """Return the connected component of each keyframe, int [n], numbered by their first members."""
+def _labels(problem: Problem, keyframes: int, by_prior: np.ndarray) -> np.ndarray:
+    """Return the connected component of each keyframe, int [n], numbered by their first members.
+
+    by_prior: relative poses that a prior constrains, bool [n, n].
+    """
     ends, equations = _links(problem, keyframes)
     # Components are merged until nothing changes: two weak links may connect only after their ends were merged.
-    label = np.arange(keyframes)
+    label, (first, second) = np.arange(keyframes), np.nonzero(by_prior)
     while True:
         # Enough equations between two components connect them, whatever keyframes they are between.
         between = label[ends]
         total = coo_array((equations, tuple(between.T)), (keyframes, keyframes)).tocsr()
         total = total + total.T
-        tied = (total >= lie.TANGENT).astype(int) + coo_array(_permuted(known.tied, label)).tocsr()
-        _, joined = connected_components(tied, directed=False)
+        tied = coo_array((np.ones(len(first)), (label[first], label[second])), (keyframes, keyframes)).tocsr()
+        _, joined = connected_components((total >= lie.TANGENT).astype(int) + tied, directed=False)
         merged = joined[label]
         if len(np.unique(merged)) == len(np.unique(label)):
-            break
+            return by_first_member(label)
         label = merged
-    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
-    return np.asarray(np.argsort(np.argsort(first))[inverse])
-
-
-def _permuted(tied: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Return pairs of keyframes as pairs of their labels."""
-    result = np.zeros_like(tied, int)
-    first, second = np.nonzero(tied)
-    result[label[first], label[second]] = 1
-    return result
 
 
 def _links(problem: Problem, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -166,49 +156,43 @@ def _rank(pair: PairTerm) -> np.ndarray:
     root = getattr(pair, "root", None)
     if root is None:
         return np.ones(len(np.asarray(pair.weight)))
-    # Columns of unit length, for the same reason as in `_PriorKnowledge.of`.
+    # Columns of unit length, for the same reason as in `_known_by_prior`.
     scaled = np.asarray(root) / np.maximum(np.linalg.norm(root, axis=1, keepdims=True), TINY)
     return np.asarray(np.linalg.matrix_rank(scaled, tol=NULL**0.5))
 
 
-@dataclass(frozen=True, eq=False)
-class _PriorKnowledge:
-    """Constraints of a marginal prior. tied: bool [n, n], relative poses. placed: bool [n], absolute poses."""
+def _known_by_prior(problem: Problem, state: State, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the relative poses, bool [n, n], and the absolute ones, bool [n], that a marginal prior constrains.
 
-    tied: np.ndarray
-    placed: np.ndarray
-
-    @classmethod
-    def of(cls, problem: Problem, state: State, keyframes: int) -> _PriorKnowledge:
-        """Find the poses and relative poses that no direction of the information's null space changes."""
-        nothing = cls(np.zeros((keyframes, keyframes), bool), np.zeros(keyframes, bool))
-        prior = next((term for term in problem.dense_terms if isinstance(term, MarginalPrior)), None)
-        if prior is None or not np.any(np.asarray(prior.root)):
-            return nothing
-        # The intrinsics do not connect poses.
-        root = np.asarray(prior.root, np.float64)[:, : lie.TANGENT * keyframes]
-        information = root.T @ root
-        fixed = np.asarray(problem.fixed_pose)[:keyframes]
-        scale = np.sqrt(np.diag(information))
-        spoken = scale.reshape(keyframes, -1).max(1) > 0
-        about = (scale > 0) & np.repeat(~fixed, lie.TANGENT)
-        safe = np.where(scale > 0, scale, 1.0)
-        # Balanced by the diagonal: metres and radians would otherwise decide what counts as zero.
-        values, vectors = np.linalg.eigh((information / np.outer(safe, safe))[np.ix_(about, about)])
-        null = np.zeros((len(scale), np.count_nonzero(values < NULL * values.max(initial=TINY))))
-        null[about] = vectors[:, : null.shape[1]] / safe[about, None]
-        null /= np.maximum(np.linalg.norm(null, axis=0), TINY)
-        moved = null.reshape(keyframes, lie.TANGENT, -1)
-        world = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64)[:keyframes])
-        # Left tangents in world coordinates, where a common rigid motion is the same for all.
-        common = np.stack([rigid.adjoint(rigid.invert(pose)) @ own for pose, own in zip(world, moved, strict=True)])
-        apart = np.linalg.norm(common[:, None] - common[None], axis=2).max(2, initial=0.0)
-        still: np.ndarray = np.linalg.norm(moved, axis=1).max(1, initial=0.0) < STILL
-        tied = (apart < STILL) & spoken[:, None] & spoken[None]
-        return cls(tied & ~np.eye(keyframes, dtype=bool), still & spoken)
+    Those that no direction of the null space of its information changes.
+    """
+    prior = next((term for term in problem.dense_terms if isinstance(term, MarginalPrior)), None)
+    if prior is None or not np.any(np.asarray(prior.root)):
+        return np.zeros((keyframes, keyframes), bool), np.zeros(keyframes, bool)
+    # The intrinsics do not connect poses.
+    root = np.asarray(prior.root, np.float64)[:, : lie.TANGENT * keyframes]
+    information = root.T @ root
+    fixed = np.asarray(problem.fixed_pose)[:keyframes]
+    scale = np.sqrt(np.diag(information))
+    spoken = scale.reshape(keyframes, -1).max(1) > 0
+    about = (scale > 0) & np.repeat(~fixed, lie.TANGENT)
+    safe = np.where(scale > 0, scale, 1.0)
+    # Balanced by the diagonal: metres and radians would otherwise decide what counts as zero.
+    values, vectors = np.linalg.eigh((information / np.outer(safe, safe))[np.ix_(about, about)])
+    null = np.zeros((len(scale), np.count_nonzero(values < NULL * values.max(initial=TINY))))
+    null[about] = vectors[:, : null.shape[1]] / safe[about, None]
+    null /= np.maximum(np.linalg.norm(null, axis=0), TINY)
+    moved = null.reshape(keyframes, lie.TANGENT, -1)
+    world = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64)[:keyframes])
+    # Left tangents in world coordinates, where a common rigid motion is the same for all.
+    common = np.stack([rigid.adjoint(rigid.invert(pose)) @ own for pose, own in zip(world, moved, strict=True)])
+    apart = np.linalg.norm(common[:, None] - common[None], axis=2).max(2, initial=0.0)
+    still: np.ndarray = np.linalg.norm(moved, axis=1).max(1, initial=0.0) < STILL
+    tied = (apart < STILL) & spoken[:, None] & spoken[None]
+    return tied & ~np.eye(keyframes, dtype=bool), still & spoken
 
 
-def _sized(problem: Problem, keyframes: int, known: _PriorKnowledge, label: np.ndarray) -> np.ndarray:
+def _sized(problem: Problem, keyframes: int, by_prior: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Return whether the scale of each component is constrained: by a depth, a length, or a prior."""
     constrained = np.zeros(keyframes, bool)
     for slot_term in problem.slot_terms:
@@ -217,7 +201,7 @@ def _sized(problem: Problem, keyframes: int, known: _PriorKnowledge, label: np.n
         if isinstance(pair, PairTerm):
             first = np.asarray(pair.first)[np.asarray(pair.present())]
             constrained[first[first < keyframes]] = True
-    constrained |= known.tied.any(1)
+    constrained |= by_prior.any(1)
     return np.array([constrained[label == number].any() for number in range(label.max(initial=-1) + 1)])
 
 

@@ -3,7 +3,7 @@
 The segment matched in another view, with line `l`, spans a plane through that camera, of normal `m = K^T l`. A ray `r`
 of an end in the host, carried there by `q = R r`, meets it at the inverse depth
 
-    d = -(m . q) / (m . t)      with weight    (m . t)^2 / (z^2 sigma^2),   z = (q + d t)_z
+    d = -(m . q) / (m . t)      with weight    (m . t)^2 / z^2,   z = (q + d t)_z,   for a noise of one pixel
 
 (the plane form of line triangulation, Hartley and Zisserman 2004, section 14.2). One view fits any depth exactly, so at
 least two must agree (chi-square). Lines along the motion are parallel to these planes: their weight is small, and their
@@ -21,10 +21,9 @@ from scipy.stats import chi2 as chi_square
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.sparse_map.covisibility import Directed
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, along_segments
+from vggtgeo.slam.window.adjustment import MIN_INVERSE_DEPTH
 
-PIXELS = 1.0
-"""Standard deviation of the distance of an endpoint from its line in another view, pixels."""
 MAX_SIGMA = 0.05
 """Largest relative standard deviation of a depth that counts as known."""
 MIN_VIEWS = 2
@@ -67,7 +66,7 @@ def _triangulated(
     # Weighted sum of squared residuals about the mean: chi-square with `views - 1` degrees of freedom.
     spread = second - total * mean**2
     agree = spread < chi_square.ppf(CHANCE, np.maximum(views - 1, 1))
-    known = (views >= MIN_VIEWS) & agree & (mean > 1e-3) & (sigma < MAX_SIGMA * mean)
+    known = (views >= MIN_VIEWS) & agree & (mean > MIN_INVERSE_DEPTH) & (sigma < MAX_SIGMA * mean)
     # One end alone does not give a line in space.
     both = known.all(1, keepdims=True)
     return np.where(both, mean, np.nan), np.where(both, sigma, np.nan)
@@ -87,7 +86,7 @@ def _intersected(
     value = -(turned * normal[:, None]).sum(2) / safe
     z = turned[..., 2] + value * relative[2, 3]
     ahead = z > 0.05
-    weight = np.where(ahead & (value > 0), (lever[:, None] / np.where(ahead, z, 1.0) / PIXELS) ** 2, 0.0)
+    weight = np.where(ahead & (value > 0), (lever[:, None] / np.where(ahead, z, 1.0)) ** 2, 0.0)
     return value, weight
 
 
@@ -97,9 +96,7 @@ def _with_depths(keyframe: Keyframe, new: np.ndarray, inverse: np.ndarray, sigma
     ends, samples, segment = keyframe.lines.segments.endpoints, keyframe.samples, keyframe.sample_segment
     along = ends[:, 1] - ends[:, 0]
     fraction = ((samples.pixels - ends[segment, 0]) * along[segment]).sum(1) / (along**2).sum(1)[segment]
-    # Inverse depth is affine in the pixel along the image of a straight line.
-    on_line = inverse[segment, 0] + fraction * (inverse[segment, 1] - inverse[segment, 0])
-    here = new[segment]
+    here, on_line = new[segment], along_segments(inverse, segment, fraction)
     own = replace(
         samples,
         inverse_depth=np.where(here, on_line, samples.inverse_depth),

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vggtgeo.slam.settings.groups import SEGMENT_SAMPLES
-from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.window.line_support import spread_samples
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Chosen slots, sorted by host, and a table from (host, slot) to landmark, -1 = not chosen."""
+    """Chosen slots, sorted by host, and a table from (host, slot) to landmark, -1 = not chosen.
+
+    Hosts, and the ends of edges, are rows of the adjusted keyframes.
+    """
 
     host: np.ndarray
     slot: np.ndarray
@@ -27,6 +27,12 @@ class Selection:
         ends = np.cumsum(np.bincount(self.host, minlength=len(slots)))
         own = np.split(self.slot, ends[:-1])
         return np.concatenate([getattr(of_host, name)[chosen] for of_host, chosen in zip(slots, own, strict=True)])
+
+    def landmarks(self, edge: Directed) -> tuple[np.ndarray, np.ndarray]:
+        """Return the landmarks of the chosen point matches of an edge, and which matches these are, bool [matches]."""
+        landmark = self.table[edge.host][edge.slots]
+        chosen = landmark >= 0
+        return landmark[chosen], chosen
 
     @classmethod
     def of(cls, chosen: list[np.ndarray], sizes: list[int]) -> Selection:
@@ -40,42 +46,32 @@ class Selection:
         return cls(host, np.concatenate([*chosen, np.zeros(0, int)]).astype(int), tuple(tables))
 
     @classmethod
-    def points(
-        cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], local: dict[int, int], settings: SlamSettings
-    ) -> Selection:
-        """Select at most `point_slots` key points of each keyframe."""
+    def points(cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], most: int) -> Selection:
+        """Select at most so many key points of each keyframe."""
         counts = [np.zeros(len(keyframe.features)) for keyframe in keyframes]
         for edge in edges:
-            counts[local[edge.host]][edge.slots] += _rank(edge.confidence)
+            counts[edge.host][edge.slots] += _rank(edge.confidence)
         chosen = []
         for count in counts:
-            order = np.argsort(-count, kind="stable")[: settings.window.point_slots]
+            order = np.argsort(-count, kind="stable")[:most]
             # A slot without a match has only its prior, which is its optimum.
             chosen.append(np.sort(order[count[order] > 0]))
         return cls.of(chosen, [len(c) for c in counts])
 
     @classmethod
-    def lines(
-        cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], local: dict[int, int], settings: SlamSettings
-    ) -> Selection:
-        """Select at most `line_slots` samples of each keyframe, of whole segments."""
+    def lines(cls, keyframes: Sequence[Keyframe], edges: Sequence[Directed], most: int) -> Selection:
+        """Select at most so many line samples of each keyframe, of whole segments."""
         counts = [np.zeros(len(keyframe.lines)) for keyframe in keyframes]
         for edge in edges:
-            counts[local[edge.host]][edge.line_slots] += _rank(edge.line_confidence)
+            counts[edge.host][edge.line_slots] += _rank(edge.line_confidence)
         chosen = []
         for keyframe, count in zip(keyframes, counts, strict=True):
             known = np.isfinite(keyframe.samples.inverse_depth)
-            taken = np.ones(len(known), bool)
-            if settings.line.two_ends_lines:
-                taken = spread_samples(keyframe.sample_segment, SEGMENT_SAMPLES)
-            length = np.bincount(keyframe.sample_segment[taken], minlength=len(count))
-            if settings.line.two_ends_lines:
-                # With two unknowns a segment, every segment takes the same room in the padded arrays.
-                length = np.full_like(length, SEGMENT_SAMPLES)
+            length = np.bincount(keyframe.sample_segment, minlength=len(count))
             order = np.argsort(-count, kind="stable")
             order = order[count[order] > 0]
-            order = order[np.cumsum(length[order]) <= settings.window.line_slots]
-            chosen.append(np.nonzero(np.isin(keyframe.sample_segment, order) & known & taken)[0])
+            order = order[np.cumsum(length[order]) <= most]
+            chosen.append(np.flatnonzero(np.isin(keyframe.sample_segment, order) & known))
         return cls.of(chosen, [len(keyframe.sample_segment) for keyframe in keyframes])
 
 

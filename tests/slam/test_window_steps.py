@@ -5,19 +5,17 @@ from __future__ import annotations
 import copy
 import pickle
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from changed import changed
 
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.pending_window import LAG, begin_window, is_due, merge_pending_window
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracker import FramePose
-from vggtgeo.slam.window.window import Window
+from vggtgeo.slam.window.sliding_window import Window
+from vggtgeo.slam.window_steps import LAG, begin_window, is_due, merge_pending_window
 
 CAMERA = np.array([100.0, 100.0, 50.0, 50.0])
 STATE = Slam(
@@ -35,24 +33,11 @@ def _tie(first: int, second: int) -> MeasuredRelativePose:
 def test_what_was_noted_meanwhile_is_kept() -> None:
     """Window, camera and notes of the adjustment, and the frames, factors and notes of tracking; oracle: by hand."""
     early, found, late = _tie(0, 1), _tie(1, 2), _tie(0, 2)
-    begun = changed(STATE, "map", factors=(early,))
-    slam = begin_window(
-        begun,
-        lambda: replace(
-            begun,
-            camera=replace(begun.camera, intrinsics=2 * CAMERA),
-            window=replace(begun.window, members=(1, 2)),
-            map=replace(begun.map, factors=(early, found)),
-            notes=("before", "adjusted"),
-        ),
-    )
+    begun = STATE.with_map(factors=(early,))
+    adjusted = begun.with_camera(intrinsics=2 * CAMERA).with_window(members=(1, 2))
+    slam = begin_window(begun, lambda: adjusted.with_factors(found).with_notes("adjusted"))
     frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
-    slam = replace(
-        slam,
-        tracker=replace(slam.tracker, frames=(frame,)),
-        map=replace(slam.map, factors=(*slam.map.factors, late)),
-        notes=(*slam.notes, "tracked"),
-    )
+    slam = slam.with_tracker(frames=(frame,)).with_factors(late).with_notes("tracked")
     after = merge_pending_window(slam)
     assert after.pending is None
     assert after.window.members == (1, 2)
@@ -68,23 +53,16 @@ def test_it_is_due_by_the_number_of_frames() -> None:
     slam = begin_window(STATE, lambda: STATE)
     slam.pending.result.result()
     frame = FramePose(0, 0.0, 0, np.eye(4), True, 50)
-    assert [is_due(changed(slam, "tracker", frames=(frame,) * count)) for count in (1, LAG, LAG + 1)] == [
-        False,
-        False,
-        True,
-    ]
+    due = [is_due(slam.with_tracker(frames=(frame,) * count)) for count in (1, LAG, LAG + 1)]
+    assert due == [False, False, True]
     assert not is_due(merge_pending_window(slam))
 
 
 @pytest.mark.parametrize("again", [lambda slam: pickle.loads(pickle.dumps(slam)), copy.deepcopy])
 def test_a_state_that_waits_for_a_window_pickles_and_copies(again: Callable[[Slam], Slam]) -> None:
     """A Future has a lock, which does neither: the copy has the result. Oracle: that of the state itself."""
-    slam = begin_window(
-        STATE,
-        lambda: replace(
-            STATE, camera=replace(STATE.camera, intrinsics=2 * CAMERA), window=replace(STATE.window, members=(1, 2))
-        ),
-    )
+    adjusted = STATE.with_camera(intrinsics=2 * CAMERA).with_window(members=(1, 2))
+    slam = begin_window(STATE, lambda: adjusted)
     found = again(slam)
     assert found.pending.due == slam.pending.due
     after = merge_pending_window(found)

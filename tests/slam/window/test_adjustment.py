@@ -8,8 +8,7 @@ import pytest
 from vggtgeo.io.errors import InputError
 from vggtgeo.slam.settings.groups import DepthSettings, WeightSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.window.adjustment import _prior_trust
-from vggtgeo.slam.window.line_support import sample_shares, spread_samples, supported
+from vggtgeo.slam.window.adjustment import depth_trust, supported
 
 INTRINSICS = np.array([300.0, 300.0, 160.0, 120.0])
 # Along the optical axis' right: pixels (160 + 30 k, 120) for points (0.1 k * 3, 0, 3).
@@ -20,7 +19,7 @@ SEGMENT = np.array([[130.0, 120.0], [220.0, 120.0]])
 def support(points: np.ndarray, pose: np.ndarray | None = None, segment: np.ndarray = SEGMENT) -> list[bool]:
     ends = np.tile(segment, (len(points), 1, 1))
     pose = np.eye(4) if pose is None else pose
-    return supported(points, pose, ends, INTRINSICS, reach=10.0, gate=12.0).tolist()
+    return supported(points, pose, ends, INTRINSICS).tolist()
 
 
 def test_a_segment_speaks_for_its_own_length() -> None:
@@ -53,21 +52,8 @@ def test_the_depth_prior_follows_the_chosen_confidence() -> None:
     expected = {"own": own, "saliency": saliency, "complement": 1 - saliency}
     for name, values in expected.items():
         settings = SlamSettings(depth_terms=DepthSettings(depth_trust=name))
-        np.testing.assert_array_equal(_prior_trust(own, saliency, settings), values)
+        np.testing.assert_array_equal(depth_trust(own, saliency, settings), values)
         without = replace(settings, weights=WeightSettings(confidence="none"))
-        np.testing.assert_array_equal(_prior_trust(own, saliency, without), 1.0)
+        np.testing.assert_array_equal(depth_trust(own, saliency, without), 1.0)
     with pytest.raises(InputError, match="depth_trust` is 'omega'"):
         DepthSettings(depth_trust="omega")
-
-
-def test_spread_samples_are_even_and_hold_both_ends() -> None:
-    """At most so many samples of a segment, its first and last among them, and shares that add up to all of them.
-
-    Oracle: counted by hand.
-    """
-    segment = np.repeat(np.arange(5), [1, 2, 5, 7, 23])
-    taken = spread_samples(segment, 6)
-    ranks = [np.nonzero(taken[segment == number])[0].tolist() for number in range(5)]
-    assert ranks == [[0], [0, 1], [0, 1, 2, 3, 4], [0, 1, 2, 4, 5, 6], [0, 4, 9, 13, 18, 22]]
-    total = np.bincount(segment[taken], sample_shares(segment, 6)[taken])
-    np.testing.assert_allclose(total, [1, 2, 5, 7, 23])
