@@ -241,17 +241,23 @@ def _calibrate(
     end = start + count * stride
     refused = {role: replace(counts) for role, counts in perception.refusals.items()}
 
-    def progress(passes: int, done: int | None) -> None:
+    shown = 0
+
+    def progress(passes: int, frame: int | None) -> None:
+        nonlocal shown
         name = f"camera calibration, pass {passes}"
-        if not done:
-            hooks.each("on_stage", f"{name}: adjusting" if done is None else f"{name} of at most {MAX_PASSES}")
-        if done is not None:
-            hooks.each("on_stage_frame", done, count)
+        if frame is None:
+            hooks.each("on_stage", f"{name}: adjusting")
+        else:
+            if shown != passes:
+                hooks.each("on_stage", f"{name} of at most {MAX_PASSES}")
+            shown = passes
+            hooks.each("on_stage_frame", (frame - start) // stride + 1, count)
 
     with hooks.clock.measure("self-calibration"), stop.at_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        frames = lambda: source.frames.frames(start, end, stride)
-        found = self_calibrate(frames, source.camera, perception.roles, settings, progress)
+        frames = lambda every: source.frames.frames(start, end, stride * every)
+        found = self_calibrate(frames, count, source.camera, perception.roles, settings, progress)
     for role, counts in refused.items():
         vars(perception.refusals[role]).update(vars(counts))
     return found

@@ -27,6 +27,9 @@ from vggtgeo.slam.state import Slam
 CALIBRATION_FRAMES = 150
 """Frames that a run calibrates an unknown camera on. Where frames cannot be read twice (a live camera, a stream), it is
 estimated while tracking."""
+FRAMES_PER_PASS = 50
+"""Frames, evenly spread over these, that are enough to link the keyframes, which are what determines the camera. If
+tracking is lost between them, all are tracked."""
 MIN_KEYFRAMES = 10
 """Keyframes that self-calibration without depth needs; as many as a window has: a smaller map is adjusted as a whole
 while tracking, and its few keyframes have little parallax. With depth, as many as the last adjustment needs."""
@@ -38,25 +41,41 @@ MIN_TRACKED = 0.5
 
 
 def self_calibrate(
+    frames: Callable[[int], Iterable[Frame]],
+    count: int,
+    camera: Camera,
+    roles: Roles,
+    settings: SlamSettings,
+    progress: Callable[[int, int | None], None] = lambda passes, frame: None,
+) -> Slam | None:
+    """Return the state before the first frame with a self-calibrated camera; None if the frames do not determine it.
+
+    While the camera changes much from one pass to the next, the frames that became keyframes are tracked again.
+
+    frames: returns every n-th of the calibration frames, each time it is called with n. count: of these frames.
+    camera: the initial guess. progress: called with the number of the pass, and the index of its newest frame; None:
+    its map is adjusted now.
+    """
+    for stride in sorted({max(count // FRAMES_PER_PASS, 1), 1}, reverse=True):
+        found = _calibrated_by(lambda stride=stride: frames(stride), camera, roles, settings, progress)
+        if found is not None:
+            return found
+    return None
+
+
+def _calibrated_by(
     frames: Callable[[], Iterable[Frame]],
     camera: Camera,
     roles: Roles,
     settings: SlamSettings,
-    progress: Callable[[int, int | None], None] = lambda passes, done: None,
+    progress: Callable[[int, int | None], None],
 ) -> Slam | None:
-    """Return the state before the first frame with a self-calibrated camera; None if the frames do not determine it.
-
-    The frames are tracked again while the camera changes much from one pass to the next.
-
-    frames: returns the calibration frames, from the first on, each time it is called. camera: the initial guess.
-    progress: called with the number of the pass, and of its frames that are tracked; None: they are adjusted now.
-    """
-    before = None
+    before, keyframes = None, frozenset[int]()
     for passes in range(1, MAX_PASSES + 1):
-        progress(passes, 0)
+        chosen = (frame for frame in frames() if passes == 1 or frame.index in keyframes)
         last = None
-        for done, slam in enumerate(run_frames(frames(), camera, roles, settings, Clock(), before), 1):
-            progress(passes, done)
+        for slam in run_frames(chosen, camera, roles, settings, Clock(), before):
+            progress(passes, slam.frames[-1].frame)
             last = slam
         if last is None or not _determines_camera(last):
             return None
@@ -71,6 +90,7 @@ def self_calibrate(
         moved = np.abs(own[:2] / last.intrinsics[:2] - 1).max()
         if moved < SETTLED and (lens is None) == (last.camera.lens is None):
             break
+        keyframes = frozenset(keyframe.frame for keyframe in last.keyframes)
     return before
 
 
