@@ -5,7 +5,6 @@ import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -216,12 +215,3 @@ def test_every_mixture_of_roles_is_reached_from_the_command_line(
     assert run("--preset", "light", "--no-lines", "--no-confidence") == {"moge2-small"}
     assert run("--preset", "light", "--no-lines") == {"moge2-small", "dinov3-small"}
     assert called["roles"].flow is None or called["roles"].follows is False
-
-
-def test_the_flags_name_those_who_can_play() -> None:
-    # Proves that the names of the flags are those of the roles. Oracle: the registry.
-    hints = get_type_hints(importlib.import_module("vggtgeo.cli.run").run)
-    for role, flag in FLAGS.items():
-        choice = get_args(hints[flag.lstrip("-").replace("-", "_")])[0]
-        assert set(get_args(choice)) == set(CHOICES[role]), flag
-    assert set(FLAGS) == set(CHOICES)
