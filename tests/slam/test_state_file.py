@@ -48,7 +48,7 @@ def full(slam: Slam) -> Slam:
     """The state with something in every field that a good run leaves empty."""
     frame = recorded_run().frames[MIDDLE]
     newest = slam.keyframes[-1]
-    waiting = UnplacedFrame(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
+    lost = UnplacedFrame(frame.index, frame.timestamp, frame.image, newest.features, frame.depth)
     compressed = (slam.keyframes[0].compressed(), *slam.keyframes[1:])
     slam = merge_pending_window(slam)
     adjustment, state = slam.window.solved
@@ -59,9 +59,7 @@ def full(slam: Slam) -> Slam:
     seen = SeenPoints(np.zeros(1, np.int32), np.ones((1, 2), np.float32))
     return replace(
         slam,
-        tracker=replace(
-            slam.tracker, frames=(*slam.frames[:-1], replace(slam.frames[-1], seen=seen)), waiting=(waiting,)
-        ),
+        tracker=replace(slam.tracker, frames=(*slam.frames[:-1], replace(slam.frames[-1], seen=seen)), waiting=(lost,)),
         map=replace(
             slam.map,
             keyframes=compressed,

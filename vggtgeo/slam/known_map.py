@@ -20,6 +20,7 @@ from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
+from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
@@ -31,9 +32,8 @@ MIN_REDESCRIBED = 0.2
 0.7 or more, others nearly none."""
 FEW = 20
 """Number of key points below which this is not checked."""
-SAME_CAMERA = 0.02
-"""Largest relative difference of focal lengths and principal point between calibrations of one camera: twice the
-standard deviation of a calibration (`PRIOR` in `camera/given_camera.py`)."""
+SAME_CAMERA = 2 * FOCAL_SIGMA
+"""Largest relative difference of focal lengths and principal point between calibrations of one camera."""
 
 
 def as_map(slam: Slam) -> Slam:

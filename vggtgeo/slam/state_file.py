@@ -43,20 +43,8 @@ from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(
-        Slam,
-        Map,
-        CameraEstimate,
-        Readout,
-        Camera,
-        Tracker,
-        FramePose,
-        SecondMotion,
-        SeenPoints,
-        UnplacedFrame,
-        Evidence,
-    ),
-    *(Window, WindowPrior, PendingWindow, Keyframe, Slots, KeyframeImages, CompressedImage),
+    *(Slam, Map, CameraEstimate, Readout, Camera, Keyframe, Slots, KeyframeImages, CompressedImage),
+    *(Tracker, FramePose, SecondMotion, SeenPoints, UnplacedFrame, Evidence, Window, WindowPrior, PendingWindow),
     *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
     *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, MarginalPrior),
     *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),

@@ -71,13 +71,12 @@ def _check_asked(
         global_adjustment.adjust_all(_with_or_without_depth(metric), settings)
 
 
-@pytest.mark.parametrize("metric", [True, False])
-def test_the_programs_of_the_end_are_compiled_before(monkeypatch: pytest.MonkeyPatch, metric: bool) -> None:
-    # Proves that the last adjustment of a map with depth and of one without asks for a program that was compiled.
-    # Oracle: structure and shapes of what the adjustment of a recorded run solves.
+def test_the_program_of_the_end_is_compiled_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Proves that the last adjustment of a map with depth asks for a program that was compiled. Oracle: structure and
+    # shapes of what the adjustment of a recorded run solves.
     compiled = _compiled(monkeypatch)
     compile_before_runs(SETTINGS, 320, 240)
-    _check_asked(monkeypatch, compiled, metric, SETTINGS)
+    _check_asked(monkeypatch, compiled, metric=True, settings=SETTINGS)
 
 
 @pytest.mark.parametrize("metric", [True, False])

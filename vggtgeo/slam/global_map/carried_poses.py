@@ -45,10 +45,10 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
                 tie.by_rays or _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
             )
             between = [] if apart else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
-            span = max(times[row] - times[last], 1e-9)
             for k in between:
                 # Along the screw motion of the change, in proportion to time.
-                poses[k] = rigid.fraction(change, (times[k] - times[last]) / span) @ poses[k]
+                share = (times[k] - times[last]) / (times[row] - times[last])
+                poses[k] = rigid.fraction(change, share) @ poses[k]
         last = row
     return times, by_both(slam.map, slam.frames, poses)
 

@@ -45,8 +45,6 @@ REPORTED_CHANGE = 0.01
 """Relative change of the camera above which the user is informed."""
 MAX_NAMED = 4
 """Stretches of frames that a note names."""
-DISTORTION_SIGMAS, MAX_WARP = 5.0, 3.0
-"""Standard deviations, and pixels in the corners of the image, above which a distortion is reported."""
 
 
 class _Solved(NamedTuple):
@@ -261,11 +259,10 @@ def _apply_refined_camera(done: _Solved, found: RefinedCamera | None, settings: 
     """Return the state with a refined camera if it improves the fit or is required, and notes for the user."""
     if found is None:
         return done.slam
-    slam = done.slam.with_notes(*_lens_note(found, done.slam.keyframes[0].size))
     always = settings.camera.refine_intrinsics == "always"
     if found.state is None or not (found.is_significant or always):
-        return slam
-    slam = _Solved.of(slam, done.adjustment, found.state).slam
+        return done.slam
+    slam = _Solved.of(done.slam, done.adjustment, found.state).slam
     if found.change <= REPORTED_CHANGE:
         return slam
     before, after = (", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted))
@@ -295,16 +292,6 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
     ideal = replace(slam, map=undistorted_map(slam.map, lens)).with_tracker(frames=frames)
     ideal = ideal.with_camera(intrinsics=np.array(lens.intrinsics, np.float64), lens=lens)
     return ideal.with_window(solved=None, prior=None)
-
-
-def _lens_note(found: RefinedCamera, shape: tuple[int, int]) -> list[str]:
-    """Return a note on a significant distortion that moves the corners of the image beyond the noise of matches."""
-    (k1, sigma), focal = found.distortion, float(found.given[0])
-    # Displacement of a corner at normalised radius `r`: `f k1 r^3`.
-    warp = abs(k1) * (float(np.hypot(shape[0], shape[1])) / 2 / focal) ** 3 * focal
-    if abs(k1) < DISTORTION_SIGMAS * sigma or warp < MAX_WARP:
-        return []
-    return [f"the lens distorts, and the calibration does not say so: k1 about {k1:.3f}, {warp:.0f} px in the corners"]
 
 
 def _terms(

@@ -6,6 +6,7 @@ the program of the padded shape can be compiled during the run (`compile_ahead.p
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -76,15 +77,9 @@ def shape_of(
 
 
 def padded_count(count: int) -> int:
-    """Return the smallest of 16, 64, 96, 128, 192, 256, ... that is at least `count`."""
-    for small in SMALL:
-        if count <= small:
-            return small
-    power = SMALL[-1]
-    while power < count:
-        power *= 2
-    # Powers of two and their three quarters: at most a third of the rows is padding.
-    return 3 * power // 4 if 3 * power // 4 >= count else power
+    """Return the smallest of 16, 64, 96, 128, 192, 256, ... that is at least `count`: at most a third is padding."""
+    larger = (size << doubled for doubled in itertools.count() for size in (96, 128))
+    return next(size for size in itertools.chain(SMALL, larger) if size >= count)
 
 
 def padded_edges(edges: int, keyframes: int) -> int:

@@ -68,10 +68,10 @@ def join_submaps(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettin
     motion = rigid.invert(slam.keyframes[-1].pose) @ place.pose
     prior = None if slam.window.prior is None else _moved_prior(slam.window.prior, motion)
     joined = moved_submap(slam, numbers, motion).with_window(held=fixed, prior=prior, solved=None)
+    tie = MeasuredRelativePose(old.number, new.number, place.relative, place.information)
     began = slam.keyframes[min(numbers)].frame
-    return joined.with_factors(
-        MeasuredRelativePose(old.number, new.number, place.relative, place.information)
-    ).with_notes(f"the submap that began at frame {began} is joined to the one before at frame {new.frame}")
+    note = f"the submap that began at frame {began} is joined to the one before at frame {new.frame}"
+    return joined.with_factors(tie).with_notes(note)
 
 
 def scale_submap(slam: Slam, ratio: float, numbers: Collection[int]) -> Slam:
@@ -80,13 +80,14 @@ def scale_submap(slam: Slam, ratio: float, numbers: Collection[int]) -> Slam:
     Without its own scale anchor (the baseline): the rest of the map fixes the scale.
     """
     own = lambda factor: all(number in numbers for number in factor.keyframes)
-    factors = tuple(scaled_factor(factor, ratio) if own(factor) else factor for factor in slam.map.factors)
+    factors = [scaled_factor(factor, ratio) if own(factor) else factor for factor in slam.map.factors]
+    kept = tuple(factor for factor in factors if not (isinstance(factor, MeasuredBaseline) and own(factor)))
+    keyframes = tuple(scaled_keyframe(k, ratio) if k.number in numbers else k for k in slam.keyframes)
     frames = tuple(scaled_record(record, ratio) if record.reference in numbers else record for record in slam.frames)
-    newest, velocity = len(slam.keyframes) - 1, slam.tracker.velocity
-    scaled = slam.with_map(
-        keyframes=tuple(scaled_keyframe(k, ratio) if k.number in numbers else k for k in slam.keyframes),
-        factors=tuple(f for f in factors if not (isinstance(f, MeasuredBaseline) and own(f))),
-    ).with_tracker(frames=frames, velocity=longer(velocity, ratio) if newest in numbers else velocity)
+    velocity = slam.tracker.velocity
+    if len(keyframes) - 1 in numbers:
+        velocity = longer(velocity, ratio)
+    scaled = slam.with_map(keyframes=keyframes, factors=kept).with_tracker(frames=frames, velocity=velocity)
     return scaled.with_window(prior=None, solved=None)
 
 

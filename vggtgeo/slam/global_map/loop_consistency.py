@@ -122,13 +122,8 @@ class _Tests:
 
 def _clusters(tests: _Tests, among: np.ndarray, gate: float) -> list[np.ndarray]:
     """Return the loops of `among` grouped by consistency with one near by."""
-    first: list[int] = []
-    second: list[int] = []
-    for row, number in enumerate(among):
-        near = among[row + 1 :][(np.abs(tests.ends[among[row + 1 :]] - tests.ends[number]) <= NEAR).all(1)]
-        first += [number] * len(near)
-        second += near.tolist()
-    pairs = np.array([first, second], int)
+    near = (np.abs(tests.ends[among, None] - tests.ends[among]) <= NEAR).all(2)
+    pairs = among[np.array(np.nonzero(np.triu(near, 1)))]
     pairs = pairs[:, tests.between(*pairs) < gate]
     count = len(tests.ends)
     _, label = connected_components(coo_array((np.ones(pairs.shape[1]), tuple(pairs)), (count, count)), directed=False)

@@ -66,7 +66,7 @@ def verified_loops(slam: Slam, proposed: list[tuple[int, int]], roles: Roles) ->
 
     def verified(pair: tuple[int, int]) -> Loop | None:
         first, second = (slam.keyframes[number] for number in pair)
-        return verify(first, second, roles, slam.intrinsics)
+        return _verified(first, second, roles, slam.intrinsics)
 
     loops = map_in_threads(verified, proposed, alone=not can_search(slam.keyframes[0].features))
     return [loop for loop in loops if loop is not None]
@@ -79,10 +79,8 @@ def _by_estimate(slam: Slam, settings: SlamSettings, known: set[tuple[int, int]]
     for second in slam.keyframes:
         scored = []
         for first in slam.keyframes[: max(second.number - settings.window.size, 0)]:
-            if (first.number, second.number) in known:
-                continue
             turned = rigid.angle_between(first.pose, second.pose)
-            if turned >= MAX_TURN:
+            if turned >= MAX_TURN or (first.number, second.number) in known:
                 continue
             share = overlap(samples[first.number], second, slam.intrinsics)
             if share > MIN_VISIBLE:
@@ -97,12 +95,11 @@ def _by_appearance(slam: Slam, settings: SlamSettings, known: set[tuple[int, int
 
     This threshold adapts to the image: a wall resembles any wall, a shelf no other.
     """
-    seen = [keyframe for keyframe in slam.keyframes if keyframe.place is not None]
-    if not seen:
+    place = {keyframe.number: keyframe.place for keyframe in slam.keyframes if keyframe.place is not None}
+    if not place:
         return []
+    numbers, places = np.array(list(place)), np.stack(list(place.values()))
     similarity = np.full((len(slam.keyframes),) * 2, -np.inf)
-    numbers = np.array([keyframe.number for keyframe in seen])
-    places = np.stack([keyframe.place for keyframe in seen if keyframe.place is not None])
     similarity[np.ix_(numbers, numbers)] = places @ places.T
     neighbours: dict[int, list[int]] = {}
     for first, second in known:
@@ -119,7 +116,7 @@ def _by_appearance(slam: Slam, settings: SlamSettings, known: set[tuple[int, int
     return chosen
 
 
-def verify(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarray) -> Loop | None:
+def _verified(first: Keyframe, second: Keyframe, roles: Roles, intrinsics: np.ndarray) -> Loop | None:
     """Return the matches that agree on one pose of the second keyframe relative to the first one's points."""
     matches = roles.points.match(first.features, second.features)
     inverse = first.points.inverse_depth[matches.index_i]
