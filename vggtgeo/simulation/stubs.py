@@ -17,14 +17,15 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PointMatches, Segments, WindowGuess
 
 from vggtgeo.geometry import pinhole
+from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PointMatches, Segments, WindowGuess
+from vggtgeo.simulation.oracle import SimulatedOracle
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class SimulatedMoge:
     deviation of a frame's scale. The estimate states sqrt(sigma^2 + wobble^2) and a confidence error / sigma(u).
     """
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     error: float = 0.05
     weak: float = 0.6
@@ -73,7 +74,7 @@ class SimulatedDino:
     floor: least saliency. share: weight of texture against structure. reach: pixels. patch: side of a patch, pixels.
     """
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     noise: float = 0.08
     floor: float = 0.10
@@ -137,7 +138,7 @@ class SmoothField:
         return cv2.resize(coarse.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def weakness(oracle: Oracle, index: int) -> np.ndarray:
+def weakness(oracle: SimulatedOracle, index: int) -> np.ndarray:
     """Return the lack of texture, float32 [H, W] in [0, 1]: 1 on a plain wall, 0 from a strength of 0.25."""
     texture = oracle.texture(index).astype(np.float32)
     around = cv2.GaussianBlur(texture, (0, 0), max(1.0, texture.shape[1] / 53))
@@ -159,7 +160,7 @@ class SimulatedMast3r:
     simulated: ClassVar[bool] = True
     """Its descriptors are numbers of frames, which mean nothing in another run."""
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     count: int = 1500
     spread: float = 0.10
@@ -213,7 +214,7 @@ class SimulatedLetr:
     [0.7, 0.85] for false ones (LETR's own threshold is 0.7), so that a score tells a little and no more.
     """
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     across: float = 0.7
     along: float = 3.0
@@ -274,7 +275,7 @@ class SimulatedVggt:
     focal length is guessed with the relative error `focal`.
     """
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     rotation: float = 0.002
     translation: float = 0.02
@@ -362,57 +363,3 @@ def _tree(overlap: np.ndarray, least: float) -> list[tuple[int, int, float]]:
         placed.append(-view)
         waiting.remove(-view)
     return branches
-
-
-class VisibleSegments(Protocol):
-    """Visible straight edges. pixels: float [L, 2, 2] (segment, end, xy). contrast: float [L], grey levels a pixel."""
-
-    @property
-    def pixels(self) -> np.ndarray: ...
-
-    @property
-    def contrast(self) -> np.ndarray: ...
-
-
-@runtime_checkable
-class Oracle(Protocol):
-    """Knows each image that its scene has given. `index` is the frame's number."""
-
-    @property
-    def intrinsics(self) -> np.ndarray:
-        """fx, fy, cx, cy, float [4], pixels."""
-        ...
-
-    def index_of(self, image: np.ndarray) -> int:
-        """Return the frame whose image this is; raises ValueError for any other image."""
-        ...
-
-    def timestamp(self, index: int) -> float:
-        """Return the time, seconds."""
-        ...
-
-    def pose(self, index: int) -> np.ndarray:
-        """Return world -> camera, float [4, 4]."""
-        ...
-
-    def depth(self, index: int) -> np.ndarray:
-        """Return float [H, W], metres, NaN = none."""
-        ...
-
-    def glass(self, index: int) -> np.ndarray:
-        """Return bool [H, W], pixels seen through glass."""
-        ...
-
-    def texture(self, index: int) -> np.ndarray:
-        """Return float [H, W] in [0, 1), strength of texture."""
-        ...
-
-    def edges(self, index: int) -> Any:
-        """Return the `VisibleSegments` of the frame."""
-        ...
-
-    def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where pixels [n, 2] of frame i are in frame j, float [n, 2], and whether they are seen there, bool
-        [n].
-        """
-        ...

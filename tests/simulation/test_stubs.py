@@ -5,7 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from vggtgeo.models.roles import DenseConfidence, LineDetector, MetricDepth, PointMatcher, WindowGeometry
-from vggtgeo.models.stubs import (
+
+from vggtgeo.geometry.pinhole import at_pixels
+from vggtgeo.simulation import IDEAL, SimulatedOracle, simulate
+from vggtgeo.simulation.stubs import (
     SimulatedDino,
     SimulatedLetr,
     SimulatedMast3r,
@@ -14,9 +17,6 @@ from vggtgeo.models.stubs import (
     SmoothField,
     weakness,
 )
-
-from vggtgeo.geometry.pinhole import at_pixels
-from vggtgeo.simulation import IDEAL, SimulatedOracle, simulate
 
 SIZE = (160, 120)
 EVERY = 4  # frames between images
