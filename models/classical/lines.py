@@ -47,11 +47,22 @@ class BandLineMatcher:
     ) -> LineMatches:
         """Return the matches from view i to view j; see `LineMatcher.match`."""
         similarity = features_i.descriptors @ features_j.descriptors.T
-        ends_i, ends_j = features_i.segments.endpoints, features_j.segments.endpoints
-        allowed = allowed_pairs(ends_i, ends_j, relative)
-        similarity[~allowed] = -np.inf
-        index_i, index_j, clarity = mutual_nearest(similarity, self.ratio, self.similarity)
-        return LineMatches(index_i, index_j, np.clip(1.0 - clarity**2, 0.05, 1.0))
+        return match_segments(similarity, features_i, features_j, relative, self.ratio, self.similarity)
+
+
+def match_segments(
+    similarity: np.ndarray,
+    features_i: LineFeatures,
+    features_j: LineFeatures,
+    relative: RelativeView | None,
+    ratio: float,
+    floor: float,
+) -> LineMatches:
+    """Return the mutual nearest neighbours by `similarity` [L_i, L_j], overwritten, that the geometry allows."""
+    allowed = allowed_pairs(features_i.segments.endpoints, features_j.segments.endpoints, relative)
+    similarity[~allowed] = -np.inf
+    index_i, index_j, clarity = mutual_nearest(similarity, ratio, floor)
+    return LineMatches(index_i, index_j, np.clip(1.0 - clarity**2, 0.05, 1.0))
 
 
 def _strips(gray: np.ndarray, endpoints: np.ndarray, width: int, samples: int = 24) -> np.ndarray:

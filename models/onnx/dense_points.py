@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_image
-from vggtgeo.models.classical.nearest import unit
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher, spread
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
+from vggtgeo.models.onnx.fit import vectors_at
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Features
 
@@ -49,7 +49,7 @@ class DensePointMatcher(PixelMatcher):
         pixels = fit.to_image(places)
         inside = np.flatnonzero(fit.inside(pixels))
         keep = inside[spread(pixels[inside], strength[inside], self.count, image.shape[1::-1])]
-        vectors = vectors_at(maps[descriptors][0], places[keep], fit.network_size)
+        vectors = vectors_at(maps[descriptors][0].transpose(1, 2, 0), places[keep], fit.network_size)
         return {"pixels": pixels[keep], "scores": strength[keep], "vectors": vectors}
 
 
@@ -72,21 +72,3 @@ def peaks(scores: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
     good = (bend > 0).all(axis=1)
     step = 0.5 * (after - before)[good] / bend[good]  # within half a pixel, as the middle one is highest
     return np.stack([x, y], axis=1)[good] + step, top[good]
-
-
-def vectors_at(descriptors: np.ndarray, places: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return unit vectors float32 [M, C] of a map float [C, h, w] at `places` (x, y), float [M, 2], between its pixels
-    linear.
-
-    size: (height, width) of the network's input, which `places` are pixels of; the map may be coarser.
-    """
-    scale = np.array(descriptors.shape[:0:-1]) / np.array(size[::-1])
-    last = np.array(descriptors.shape[:0:-1]) - 1
-    at = np.clip(scale * (places + 0.5) - 0.5, 0.0, last)
-    low = np.minimum(np.floor(at).astype(np.int64), np.maximum(last - 1, 0))
-    high = np.minimum(low + 1, last)
-    (u, v), (x0, y0), (x1, y1) = (at - low).T.astype(np.float32), low.T, high.T
-    above = descriptors[:, y0, x0] * (1 - u) + descriptors[:, y0, x1] * u
-    below = descriptors[:, y1, x0] * (1 - u) + descriptors[:, y1, x1] * u
-    mixed = (above * (1 - v) + below * v).T.astype(np.float32)
-    return unit(mixed)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields, check_image
-from vggtgeo.models.classical.lines import allowed_pairs
-from vggtgeo.models.classical.nearest import mutual_nearest, unit
+from vggtgeo.models.classical.lines import match_segments
+from vggtgeo.models.classical.nearest import unit
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import DINOV3
-from vggtgeo.models.onnx.fit import Fit
+from vggtgeo.models.onnx.fit import Fit, vectors_at
 from vggtgeo.models.onnx.session import NetworkValueError, Session
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
 
@@ -25,22 +25,10 @@ class DescriptorGrid:
 
     grid: np.ndarray
     fit: Fit
-    patch: int
 
     def at(self, pixels: np.ndarray) -> np.ndarray:
-        """Return descriptors float32 [n, C], of unit length, at image pixels float [n, 2]: bilinear between patch
-        centres.
-        """
-        place = (self.fit.to_network(np.asarray(pixels, np.float64)) + 0.5) / self.patch - 0.5
-        height, width = self.grid.shape[:2]
-        place = np.clip(place, 0.0, [width - 1, height - 1])
-        low = np.minimum(place.astype(np.int64), np.maximum([width - 2, height - 2], 0))
-        high = np.minimum(low + 1, [width - 1, height - 1])
-        part = (place - low).astype(np.float32)
-        (x0, y0), (x1, y1), (fx, fy) = low.T, high.T, part.T[..., None]
-        top = (1 - fx) * self.grid[y0, x0] + fx * self.grid[y0, x1]
-        bottom = (1 - fx) * self.grid[y1, x0] + fx * self.grid[y1, x1]
-        return unit((1 - fy) * top + fy * bottom)
+        """Return unit descriptors float32 [n, C] at image pixels float [n, 2]."""
+        return vectors_at(self.grid, self.fit.to_network(pixels), self.fit.network_size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +53,7 @@ class DinoFeatures:
         """Return descriptors of the patches of `image`, less their mean, which all patches of an image share."""
         outputs, fit = self._outputs(image)
         grid = outputs["patch_descriptors"].astype(np.float32)
-        return DescriptorGrid(unit(grid - grid.mean(axis=0)).reshape(*_grid(fit), -1), fit, DINOV3.multiple)
+        return DescriptorGrid(unit(grid - grid.mean(axis=0)).reshape(*_grid(fit), -1), fit)
 
     def _outputs(self, image: np.ndarray) -> tuple[Outputs, Fit]:
         check_image("image", image)
@@ -129,11 +117,8 @@ class DenseLineMatcher:
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
         """Return the matches from view i to view j; see `LineMatcher.match`."""
-        ends_i, ends_j = features_i.segments.endpoints, features_j.segments.endpoints
-        allowed = allowed_pairs(ends_i, ends_j, relative)
-        similarity = np.where(allowed, segment_similarity(features_i.descriptors, features_j.descriptors), -np.inf)
-        index_i, index_j, clarity = mutual_nearest(similarity, self.ratio, self.similarity)
-        return LineMatches(index_i, index_j, np.clip(1.0 - clarity**2, 0.05, 1.0))
+        similarity = segment_similarity(features_i.descriptors, features_j.descriptors)
+        return match_segments(similarity, features_i, features_j, relative, self.ratio, self.similarity)
 
 
 def segment_similarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:

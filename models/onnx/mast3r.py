@@ -12,7 +12,7 @@ from vggtgeo.models.classical.pixel_matcher import refined
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
-from vggtgeo.models.onnx.file_checks import NetworkFileError
+from vggtgeo.models.onnx.contracts import NetworkFileError
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Features, PointMatches

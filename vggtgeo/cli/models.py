@@ -115,7 +115,7 @@ def verify(
 
 
 def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
-    from vggtgeo.models.onnx.file_checks import has_random_weights
+    from vggtgeo.models.onnx.contracts import has_random_weights
 
     made = f"{network.export_command}  # {network.publication.code}; weights: {network.weights}"
     return {

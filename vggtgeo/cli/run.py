@@ -84,7 +84,7 @@ def run(
         check_selection(sequence.name, len(sequence), given.start, given.end, given.stride)
     if perception.provider == "cuda":
         from vggtgeo.io.network_files import as_input_errors
-        from vggtgeo.models.onnx.providers import choose_provider
+        from vggtgeo.models.onnx.session import choose_provider
 
         with as_input_errors():
             choose_provider("cuda")  # is there a GPU?

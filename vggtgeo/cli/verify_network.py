@@ -10,15 +10,12 @@ import typer
 
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.network_files import as_input_errors
+from vggtgeo.io.network_files import as_input_errors, network_named
 from vggtgeo.models.onnx import verification
 from vggtgeo.models.onnx.bounds import BoundedDepth, BoundedWindow
-from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, PARITY_SUFFIX
-from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
+from vggtgeo.models.onnx.contracts import PARITY_SUFFIX
 from vggtgeo.models.onnx.moge2 import MogeDepth
-from vggtgeo.models.onnx.providers import Provider
-from vggtgeo.models.onnx.registry import NETWORKS
-from vggtgeo.models.onnx.session import Session, open_session, read_signature
+from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
 
 
@@ -53,7 +50,8 @@ def verify_file(
     beside = file.with_name(file.name + PARITY_SUFFIX)
     record = against or (beside if beside.is_file() else None)
     with as_input_errors():
-        session = open_session(file, CONTRACTS[_contract_name(file, network)], provider=provider)
+        contract = None if network is None else network_named(network).contract
+        session = open_session(file, contract, provider=provider)
         # Before the image: an invalid record is found at once, but the default image takes seconds to render.
         parity = verification.parity(session, record) if record else {}
         shown = shown_image(image)
@@ -130,20 +128,3 @@ def _depth_pixels(session: Session, image: np.ndarray) -> int | None:
     else:
         return None
     return int(np.isfinite(depth).sum())
-
-
-def _contract_name(file: Path, asked: str | None) -> str:
-    """Return the contract of the requested network, else by the file's metadata, else by its signature."""
-    if asked is not None:
-        if asked not in NETWORKS:
-            raise InputError(f"`--network` must be one of {', '.join(NETWORKS)}, got {asked!r}")
-        return NETWORKS[asked].contract_name
-    inputs, outputs, metadata = read_signature(file)
-    named = metadata.get(METADATA_NETWORK)
-    if named in CONTRACTS:
-        return named
-    like = recognise(inputs, outputs)
-    if not like:
-        listing = ", ".join(f"`{name}` {signature}" for name, signature in {**inputs, **outputs}.items())
-        raise NetworkFileError(f"`{file}` matches no known network ({', '.join(CONTRACTS)}); it has {listing}")
-    return like[0]

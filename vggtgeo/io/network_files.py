@@ -13,7 +13,7 @@ from typing import Any
 import platformdirs
 
 from vggtgeo.io.errors import InputError, install_hint
-from vggtgeo.models.onnx.file_checks import NetworkFileError
+from vggtgeo.models.onnx.contracts import NetworkFileError
 from vggtgeo.models.onnx.registry import NETWORKS, HubFile, Network
 from vggtgeo.models.onnx.session import NetworkRunError
 

@@ -10,10 +10,10 @@ import tiny_networks as tiny
 from reported import raises
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
-from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks, vectors_at
-from vggtgeo.models.onnx.dinov3 import DescriptorGrid, DinoFeatures, saliency
-from vggtgeo.models.onnx.file_checks import NetworkFileError
-from vggtgeo.models.onnx.fit import Fit
+from vggtgeo.models.onnx.contracts import NetworkFileError
+from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks
+from vggtgeo.models.onnx.dinov3 import DinoFeatures, saliency
+from vggtgeo.models.onnx.fit import vectors_at
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher, corners, nearest, reciprocal
 from vggtgeo.models.onnx.session import Session, open_session
 from vggtgeo.models.roles import DenseConfidence, PointMatcher
@@ -80,21 +80,27 @@ def test_key_points_of_maps_follow_the_known_motion(tmp_path: Path, size: tuple)
     assert len(matcher.match(blank, described[0])) == len(matcher.match(described[0], blank)) == 0
 
 
-def test_peaks_and_vectors_lie_between_pixels() -> None:
-    # Proves the place of a maximum between pixels, the least score, and vectors of a map as large as the image and of
-    # one 8 times coarser. Oracle: a bell at a known place, a map that is linear in the place.
+def test_peaks_lie_between_pixels() -> None:
+    # Proves the place of a maximum between pixels, and the least score. Oracle: a bell at a known place.
     y, x = np.mgrid[:64, :96].astype(np.float64)
     bell = np.exp(-0.5 * ((x - 40.3) ** 2 + (y - 20.8) ** 2) / 4) + 0.3 * (np.hypot(x - 70, y - 30) < 0.5)
     places, values = peaks(bell, 0.2)
     np.testing.assert_allclose(places[values.argmax()], [40.3, 20.8], atol=0.05)
     assert len(places) == 2
     assert len(peaks(bell, 0.5)[0]) == 1
-    for step in (1, 8):
-        rows, columns = (np.arange(0, side, step) + 0.5 * (step - 1) for side in (64, 96))
-        grid = np.stack(np.broadcast_arrays(columns[None, :], rows[:, None], 50.0))
-        found = vectors_at(grid, np.array([[40.3, 20.8], [12.0, 9.5]]), (64, 96))
-        for vector, place in zip(found, ((40.3, 20.8, 50.0), (12.0, 9.5, 50.0)), strict=True):
-            np.testing.assert_allclose(vector, np.array(place) / np.linalg.norm(place), atol=1e-5)
+
+
+@pytest.mark.parametrize("step", [1, 8, 64])
+def test_vectors_are_interpolated_between_the_centres_of_cells(step: int) -> None:
+    # Proves vectors of a map as large as the network's input, of one 8 times coarser and of a single cell, and beyond
+    # the outermost centres. Oracle: a map that is linear in the place.
+    rows, columns = (np.arange(0, side, step) + 0.5 * (step - 1) for side in (64, 128))
+    grid = np.stack(np.broadcast_arrays(columns[None, :], rows[:, None], 50.0), axis=-1).astype(np.float32)
+    pixels = np.array([[40.3, 20.8], [12.0, 9.5], [-0.4, 63.4], [127.0, 0.0]])
+    x, y = (np.clip(place, edge[0], edge[-1]) for place, edge in zip(pixels.T, (columns, rows), strict=True))
+    expected = np.column_stack([x, y, np.full(4, 50.0)])
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(vectors_at(grid, pixels, (64, 128)), expected, atol=1e-5)
 
 
 def test_xfeat_s_blocks_have_vectors(tmp_path: Path) -> None:
@@ -194,28 +200,6 @@ def test_confidence_is_high_where_the_network_looks(tmp_path: Path) -> None:
     means = [part.mean() for half in np.split(omega, 2, axis=0) for part in np.split(half, 2, axis=1)]
     assert np.argmax(means) == 1, means
     assert means[1] > 1.5 * max(means[0], means[2], means[3]), means
-
-
-def test_descriptors_are_interpolated_between_patch_centres() -> None:
-    # Proves where patches lie and how descriptors between them come about. Oracle: a grid that is linear in x and y.
-    fit = Fit.of((96, 128), (48, 64))
-    y, x = np.mgrid[:3, :4]
-    grid = np.stack([x, y, np.full(x.shape, 5.0)], axis=-1).astype(np.float32)
-    pixels = np.random.default_rng(0).uniform((16, 16), (111, 79), (50, 2))
-    place = ((pixels + 0.5) / 2) / 16 - 0.5
-    expected = np.column_stack([place, np.full(50, 5.0)])
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    np.testing.assert_allclose(DescriptorGrid(grid, fit, 16).at(pixels), expected, atol=1e-5)
-
-
-def test_pixels_beyond_the_outermost_centres_take_those(tmp_path: Path) -> None:
-    # Proves that no pixel of the image is out of reach, even on one patch. Oracle: the corner patches.
-    fit = Fit.of((32, 48), (32, 48))
-    grid = np.eye(6, dtype=np.float32).reshape(2, 3, 6)
-    corner = DescriptorGrid(grid, fit, 16).at(np.array([[0.0, 0], [47, 0], [0, 31], [47, 31]]))
-    np.testing.assert_allclose(corner, np.eye(6)[[0, 2, 3, 5]])
-    lonely = DescriptorGrid(grid[:1, :1], Fit.of((16, 16), (16, 16)), 16).at(np.array([[3.0, 9.0]]))
-    np.testing.assert_allclose(lonely, np.eye(6)[:1])
 
 
 # --- the cache ---------------------------------------------------------------------------------------------------

@@ -31,15 +31,14 @@ from vggtgeo.models.onnx.bounds import (
     Refusals,
 )
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
+from vggtgeo.models.onnx.contracts import NetworkFileError
 from vggtgeo.models.onnx.dense_points import DensePointMatcher
 from vggtgeo.models.onnx.dinov3 import DenseLineMatcher, DinoFeatures
-from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
 from vggtgeo.models.onnx.line_detectors import LetrDetector, MlsdDetector
 from vggtgeo.models.onnx.mast3r import Mast3rMatcher
 from vggtgeo.models.onnx.moge2 import MogeDepth
-from vggtgeo.models.onnx.providers import Provider
 from vggtgeo.models.onnx.registry import NETWORKS, files_of, players
-from vggtgeo.models.onnx.session import Session, open_session
+from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.slam.settings.slam_settings import Roles
@@ -192,8 +191,6 @@ def perception(
     needed, place = _files(parts), networks_folder(folder)
     _check_present(needed, place)
     with as_input_errors():
-        for name in needed:
-            check_looks_like_onnx(place / NETWORKS[name].file)  # before gigabytes of others are read
         networks = {
             name: open_session(
                 place / NETWORKS[name].file,
