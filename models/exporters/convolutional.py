@@ -1,8 +1,7 @@
 """Small convolutional networks, exported as published: M-LSD tiny (Gu et al., AAAI 2022), ALIKE (Zhao et al., IEEE
 Transactions on Multimedia 2022) and XFeat (Potje et al., CVPR 2024).
 
-ALIKE asks torchvision for two kinds of convolution, which are made here instead. Key points are taken of the maps by
-the adapter, so that their number is no part of the file.
+Key points are taken of the maps by the adapter, so that their number is no part of the file.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from vggtgeo.models.exporters.request import Graph, Request, load, stand_in
+from vggtgeo.models.exporters.request import Graph, Request, load
 from vggtgeo.models.exporters.weights import fill
 
 _FOURTH_CHANNEL = 1 / 127.5 - 1
@@ -39,14 +38,7 @@ def build_mlsd(request: Request) -> Graph:
 def build_alike(request: Request) -> Graph:
     """Return the network for one image of the request's size: a map of scores and one of unit descriptors."""
     torch = load("torch")
-
-    def convolution(side: int) -> Any:
-        return lambda inputs, outputs, stride=1: torch.nn.Conv2d(
-            inputs, outputs, side, stride, padding=side // 2, bias=False
-        )
-
-    torchvision = stand_in("torchvision.models.resnet", conv3x3=convolution(3), conv1x1=convolution(1))
-    with torchvision, request.code() as imported:
+    with request.code() as imported:
         network = imported("alnet").ALNet(*_ALIKE_SIZES[request.variant], single_head=request.variant != "large")
     fill(network, request, f"ALIKE {request.variant}")
 

@@ -46,13 +46,12 @@ class Recipe:
         """Return the request with defaults filled in; `ExportError` for what this network cannot be."""
         height, width = height or self.size[0], width or self.size[1]
         for option, size, default in zip(("--height", "--width"), (height, width), self.size, strict=True):
-            if option in self.fixed and size != default:
-                raise ExportError(f"`{option}` is {size}; {self.network} takes {default} alone, leave it out")
-            if size < 1 or size % self.multiple:
-                near = max(self.multiple, round(size / self.multiple) * self.multiple)
-                raise ExportError(
-                    f"`{option}` is {size}; {self.network} takes multiples of {self.multiple}: {near}, for instance"
-                )
+            if size < 1 or size % self.multiple or (option in self.fixed and size != default):
+                allowed = f"{default} alone" if option in self.fixed else f"multiples of {self.multiple}"
+                raise ExportError(f"`{option}` is {size}; {self.network} takes {allowed}")
+        for option, value, default in (("--views", views, self.views), ("--tokens", tokens, self.tokens)):
+            if value is not None and (value < 1 or not default):
+                raise ExportError(f"`{option}` is {value}; {self.network} takes {'at least 1' if default else 'none'}")
         if variant is not None and variant not in self.variants:
             raise ExportError(
                 f"`--variant` {variant} is not known for {self.network}; expected one of {', '.join(self.variants)}"
@@ -68,18 +67,11 @@ class Recipe:
             height=height,
             width=width,
             variant=variant or self.variants[0],
-            views=self._only_where("--views", views, self.views) or 1,
-            tokens=self._only_where("--tokens", tokens, self.tokens),
+            views=views or self.views or 1,
+            tokens=tokens or self.tokens,
             half=half,
             allow_extra=allow_extra,
         )
-
-    def _only_where(self, option: str, value: int | None, default: int) -> int:
-        if value is not None and not default:
-            raise ExportError(f"`{option}` means nothing to {self.network}; leave it out")
-        if value is not None and value < 1:
-            raise ExportError(f"`{option}` is {value}, expected at least 1")
-        return default if value is None else value
 
 
 _NEEDS = "install einops and huggingface-hub"

@@ -11,9 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -105,27 +103,6 @@ class Checkout:
 def _provides(entry: str, packages: Sequence[str]) -> bool:
     folder = Path(entry or ".")
     return any((folder / name).is_dir() or (folder / f"{name}.py").is_file() for name in packages)
-
-
-@contextlib.contextmanager
-def stand_in(name: str, **attributes: Any) -> Iterator[None]:
-    """Let `import name` give an empty module with `attributes` in the block.
-
-    For packages that the published code imports at the top and does not need for the forward pass.
-    """
-    parts = [".".join(name.split(".")[: depth + 1]) for depth in range(name.count(".") + 1)]
-    previous = {part: sys.modules.pop(part, None) for part in parts}
-    sys.modules.update({part: ModuleType(part) for part in parts})
-    for parent, child in pairwise(parts):
-        setattr(sys.modules[parent], child.rsplit(".", 1)[1], sys.modules[child])
-    vars(sys.modules[name]).update(attributes)
-    try:
-        yield
-    finally:
-        for part, module in previous.items():
-            sys.modules.pop(part, None)
-            if module is not None:
-                sys.modules[part] = module
 
 
 @dataclass(frozen=True)

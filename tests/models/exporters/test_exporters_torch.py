@@ -87,9 +87,10 @@ def test_a_file_gives_what_the_published_code_gives(network: str, checkouts: Pat
     assert said["vggtgeo.network"] == network
     assert said["vggtgeo.weights"] == "random"
     assert {key.split(".")[0] for key in said} == {"vggtgeo"}
-    graph = report.path.read_bytes()
+    model = onnx.load(report.path, load_external_data=False)
+    del model.graph.initializer[:]  # bytes of weights may spell anything
     for path in (str(checkouts), str(tmp_path), "site-packages", ".py"):
-        assert path.encode() not in graph
+        assert path.encode() not in model.SerializeToString()
     left = {file.name for file in tmp_path.iterdir()}
     assert {"file.onnx", "file.onnx.parity.npz"} <= left <= {"file.onnx", "file.onnx.parity.npz", "file.onnx.data"}
 
