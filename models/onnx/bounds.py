@@ -7,7 +7,8 @@ no segment, no view), and counted for the verdict. A network that fails to run s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -32,8 +33,9 @@ from vggtgeo.models.roles import (
     WindowGuess,
 )
 
+from vggtgeo.geometry.camera import Camera
+
 _Role = TypeVar("_Role")
-_Answer = TypeVar("_Answer")
 NEAREST, FARTHEST = 0.05, 100.0
 """Minimum and maximum depth of an indoor world, a sports hall included, metres."""
 AVERAGE = 0.5
@@ -72,13 +74,13 @@ class _Bounded(Generic[_Role]):
     source: _Role
     refusals: Refusals = field(default_factory=Refusals)
 
-    def _asked(self, ask: Callable[[], _Answer], values: int = 1) -> _Answer | None:
-        """Return an answer; None, with so many values counted as refused, if the network gives none."""
+    @contextmanager
+    def _failure_counted(self, values: int = 1) -> Iterator[None]:
+        """Leave the block where the network gives no valid answer, with so many values counted as refused."""
         try:
-            return ask()
+            yield
         except NetworkValueError:
             self.refusals.note(values, values, left=False)
-            return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,21 +93,21 @@ class BoundedDepth(_Bounded[MetricDepth]):
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        found = self._asked(lambda: self.source.estimate(image, sensor_depth, intrinsics), image[..., 0].size)
-        if found is None:
-            return no_depth(image.shape[:2])
-        with np.errstate(invalid="ignore"):
-            given = np.isfinite(found.depth)
-            good = given & (found.depth >= NEAREST) & (found.depth <= FARTHEST) & (found.sigma_rel > 0)
-        self.refusals.note(int(given.sum()), int(given.sum() - good.sum()), left=bool(good.any()))
-        if (good == given).all():
-            return found
-        nothing = np.float32(np.nan)
-        return DepthEstimate(
-            np.where(good, found.depth, nothing).astype(np.float32),
-            np.where(good, found.confidence, 0.0).astype(np.float32),
-            np.where(good, found.sigma_rel, nothing).astype(np.float32),
-        )
+        with self._failure_counted(image[..., 0].size):
+            found = self.source.estimate(image, sensor_depth, intrinsics)
+            with np.errstate(invalid="ignore"):
+                given = np.isfinite(found.depth)
+                good = given & (found.depth >= NEAREST) & (found.depth <= FARTHEST) & (found.sigma_rel > 0)
+            self.refusals.note(int(given.sum()), int(given.sum() - good.sum()), left=bool(good.any()))
+            if (good == given).all():
+                return found
+            nothing = np.float32(np.nan)
+            return DepthEstimate(
+                np.where(good, found.depth, nothing).astype(np.float32),
+                np.where(good, found.confidence, 0.0).astype(np.float32),
+                np.where(good, found.sigma_rel, nothing).astype(np.float32),
+            )
+        return no_depth(image.shape[:2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +116,13 @@ class BoundedConfidence(_Bounded[DenseConfidence]):
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         average = np.full(image.shape[:2], AVERAGE, np.float32)
-        found = self._asked(lambda: self.source.confidence(image), average.size)
-        if found is None:
-            return average
-        with np.errstate(invalid="ignore"):
-            good = np.isfinite(found) & (found >= 0) & (found <= 1)
-        self.refusals.note(found.size, int(found.size - good.sum()), left=bool(good.any()))
-        return found if good.all() else np.where(good, found, average).astype(np.float32)
+        with self._failure_counted(average.size):
+            found = self.source.confidence(image)
+            with np.errstate(invalid="ignore"):
+                good = np.isfinite(found) & (found >= 0) & (found <= 1)
+            self.refusals.note(found.size, int(found.size - good.sum()), left=bool(good.any()))
+            return np.where(good, found, average).astype(np.float32)
+        return average
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,13 +130,13 @@ class BoundedLines(_Bounded[LineDetector]):
     """A `LineDetector` with segments inside the image."""
 
     def detect(self, image: np.ndarray) -> Segments:
-        found = self._asked(lambda: self.source.detect(image))
-        if found is None:
-            return _NO_SEGMENTS
-        inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
-        good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
-        self.refusals.note(len(found), int(len(found) - good.sum()), left=True)  # an image may have no line
-        return found if good.all() else Segments(found.endpoints[good], found.scores[good])
+        with self._failure_counted():
+            found = self.source.detect(image)
+            inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
+            good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
+            self.refusals.note(len(found), int(len(found) - good.sum()), left=True)  # an image may have no line
+            return Segments(found.endpoints[good], found.scores[good])
+        return _NO_SEGMENTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +144,11 @@ class BoundedLineMatcher(_Bounded[LineMatcher]):
     """A `LineMatcher` without segments for an image on which its network failed."""
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
-        found = self._asked(lambda: self.source.describe(image, segments))
-        if found is None:
-            return LineFeatures(_NO_SEGMENTS)
-        self.refusals.note(1, 0, left=True)
-        return found
+        with self._failure_counted():
+            found = self.source.describe(image, segments)
+            self.refusals.note(1, 0, left=True)
+            return found
+        return LineFeatures(_NO_SEGMENTS)
 
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
@@ -161,17 +163,18 @@ class BoundedPoints(_Bounded[PointMatcher]):
     """A `PointMatcher` without matches if its network fails; bounds are checked by `PointMatches`."""
 
     def describe(self, image: np.ndarray) -> Features:
-        found = self._asked(lambda: self.source.describe(image))
-        return Features(np.zeros((0, 2)), np.zeros(0)) if found is None else found
+        with self._failure_counted():
+            return self.source.describe(image)
+        return Features(np.zeros((0, 2)), np.zeros(0))
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
         if not (len(features_i) and len(features_j)):
             return PointMatches.none()
-        found = self._asked(lambda: self.source.match(features_i, features_j, predicted))
-        if found is None:
-            return PointMatches.none()
-        self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
-        return found
+        with self._failure_counted():
+            found = self.source.match(features_i, features_j, predicted)
+            self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
+            return found
+        return PointMatches.none()
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,18 +182,17 @@ class BoundedWindow(_Bounded[WindowGeometry]):
     """A `WindowGeometry` that fails for values that are not finite; views with values out of bounds are not found."""
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
-        count, size = len(images), images[0].shape[:2]
-        found = self._asked(lambda: self.source.window(images, intrinsics), count)
-        if found is None:
-            focal, (height, width) = float(max(size)), size
-            camera = np.array([focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)])
-            return WindowGuess(
-                np.tile(np.eye(4), (count, 1, 1)),
-                camera if intrinsics is None else np.asarray(intrinsics, np.float64),
-                np.full((count, *size), np.nan, np.float32),
-                np.zeros((count, *size), np.float32),
-                np.zeros(count, bool),
-                result=GeometryResult.DEGENERATE,
-            )
-        self.refusals.note(count, int(count - found.found.sum()), left=bool(found.found.any()))
-        return found
+        count, (height, width) = len(images), images[0].shape[:2]
+        with self._failure_counted(count):
+            found = self.source.window(images, intrinsics)
+            self.refusals.note(count, int(count - found.found.sum()), left=bool(found.found.any()))
+            return found
+        camera = Camera.guess(width, height).intrinsics if intrinsics is None else intrinsics
+        return WindowGuess(
+            np.tile(np.eye(4), (count, 1, 1)),
+            np.array(camera, np.float64),
+            np.full((count, height, width), np.nan, np.float32),
+            np.zeros((count, height, width), np.float32),
+            np.zeros(count, bool),
+            result=GeometryResult.DEGENERATE,
+        )

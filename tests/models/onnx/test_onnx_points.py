@@ -7,10 +7,8 @@ import numpy as np
 import plane_views as views
 import pytest
 import tiny_networks as tiny
-from reported import raises
 from vggtgeo.models.onnx import contracts
-from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
-from vggtgeo.models.onnx.contracts import NetworkFileError
+from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks
 from vggtgeo.models.onnx.dinov3 import DinoFeatures, saliency
 from vggtgeo.models.onnx.fit import vectors_at
@@ -104,13 +102,11 @@ def test_vectors_are_interpolated_between_the_centres_of_cells(step: int) -> Non
 
 
 def test_xfeat_s_blocks_have_vectors(tmp_path: Path) -> None:
-    # Proves the adapter on the other contract, and that the two are told apart by their signatures. Oracle: shapes.
+    # Proves the adapter on the other contract. Oracle: shapes.
     file = tiny.xfeat(tmp_path / "xfeat.onnx")
     features = DensePointMatcher(session=open_session(file, contracts.XFEAT)).describe(views.texture(0, (128, 96)))
     assert features.descriptors.vectors.shape == (len(features), 64)
     assert len(features) > 20
-    with raises("xfeat", error=NetworkFileError):
-        open_session(file, contracts.ALIKE)
 
 
 def test_an_image_is_encoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,7 +224,8 @@ def test_what_was_asked_before_is_not_computed_again(tmp_path: Path, session: Se
     other = image.copy()
     other[0, 0, 0] ^= 1
     compute, calls = _counted({"a": np.arange(6.0).reshape(2, 3), "b": np.array(3, np.float16)})
-    questions = [(("x", 1), (image,)), (("x", 2), (image,)), (("x", 1), (other,)), (("x", 1), (image, other))]
+    images = [(image,), (other,), (image, other), (image.reshape(64, 48, 3),)]  # the last has the bytes of the first
+    questions = [(("x", 2), (image,)), *((("x", 1), given) for given in images)]
     for count, (settings, images) in enumerate(questions, start=1):
         for _ in range(2):
             found = cache.get((session,), settings, images, compute)
@@ -246,13 +243,6 @@ def test_another_file_is_another_network(tmp_path: Path, session: Session) -> No
     for network, count in ((session, 1), (other, 2), (again, 2)):
         cache.get((network,), (), (), compute)
         assert len(calls) == count
-
-
-def test_the_key_separates_shape_from_content() -> None:
-    # Proves that two images with the same bytes differ by their shape. Oracle: a reshaped array.
-    image = np.zeros((4, 6, 3), np.uint8)
-    assert key_of(("n",), (), (image,)) != key_of(("n",), (), (image.reshape(6, 4, 3),))
-    assert key_of(("n",), (), (image,)) == key_of(("n",), (), (np.asfortranarray(image),))
 
 
 def test_the_memory_forgets_the_oldest(session: Session) -> None:
