@@ -7,8 +7,7 @@ no segment, no view), and counted for the verdict. A network that fails to run s
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -61,6 +60,10 @@ class Refusals:
         self.refused += refused
         self.without += not left
 
+    def note_failure(self, values: int = 1) -> None:
+        """Count an answer that is not valid at all, of so many values."""
+        self.note(values, values, left=False)
+
     @property
     def share(self) -> float:
         """Return the rejected share, of answers or of values, whichever is larger."""
@@ -74,14 +77,6 @@ class _Bounded(Generic[_Role]):
     source: _Role
     refusals: Refusals = field(default_factory=Refusals)
 
-    @contextmanager
-    def _failure_counted(self, values: int = 1) -> Iterator[None]:
-        """Leave the block where the network gives no valid answer, with so many values counted as refused."""
-        try:
-            yield
-        except NetworkValueError:
-            self.refusals.note(values, values, left=False)
-
 
 @dataclass(frozen=True, eq=False)
 class BoundedDepth(_Bounded[MetricDepth]):
@@ -93,21 +88,23 @@ class BoundedDepth(_Bounded[MetricDepth]):
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        with self._failure_counted(image[..., 0].size):
+        try:
             found = self.source.estimate(image, sensor_depth, intrinsics)
-            with np.errstate(invalid="ignore"):
-                given = np.isfinite(found.depth)
-                good = given & (found.depth >= NEAREST) & (found.depth <= FARTHEST) & (found.sigma_rel > 0)
-            self.refusals.note(int(given.sum()), int(given.sum() - good.sum()), left=bool(good.any()))
-            if (good == given).all():
-                return found
-            nothing = np.float32(np.nan)
-            return DepthEstimate(
-                np.where(good, found.depth, nothing).astype(np.float32),
-                np.where(good, found.confidence, 0.0).astype(np.float32),
-                np.where(good, found.sigma_rel, nothing).astype(np.float32),
-            )
-        return no_depth(image.shape[:2])
+        except NetworkValueError:
+            self.refusals.note_failure(image[..., 0].size)
+            return no_depth(image.shape[:2])
+        with np.errstate(invalid="ignore"):
+            given = np.isfinite(found.depth)
+            good = given & (found.depth >= NEAREST) & (found.depth <= FARTHEST) & (found.sigma_rel > 0)
+        self.refusals.note(int(given.sum()), int(given.sum() - good.sum()), left=bool(good.any()))
+        if (good == given).all():
+            return found
+        nothing = np.float32(np.nan)
+        return DepthEstimate(
+            np.where(good, found.depth, nothing).astype(np.float32),
+            np.where(good, found.confidence, 0.0).astype(np.float32),
+            np.where(good, found.sigma_rel, nothing).astype(np.float32),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +113,15 @@ class BoundedConfidence(_Bounded[DenseConfidence]):
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         average = np.full(image.shape[:2], AVERAGE, np.float32)
-        with self._failure_counted(average.size):
+        try:
             found = self.source.confidence(image)
-            with np.errstate(invalid="ignore"):
-                good = np.isfinite(found) & (found >= 0) & (found <= 1)
-            self.refusals.note(found.size, int(found.size - good.sum()), left=bool(good.any()))
-            return np.where(good, found, average).astype(np.float32)
-        return average
+        except NetworkValueError:
+            self.refusals.note_failure(average.size)
+            return average
+        with np.errstate(invalid="ignore"):
+            good = np.isfinite(found) & (found >= 0) & (found <= 1)
+        self.refusals.note(found.size, int(found.size - good.sum()), left=bool(good.any()))
+        return np.where(good, found, average).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,13 +129,15 @@ class BoundedLines(_Bounded[LineDetector]):
     """A `LineDetector` with segments inside the image."""
 
     def detect(self, image: np.ndarray) -> Segments:
-        with self._failure_counted():
+        try:
             found = self.source.detect(image)
-            inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
-            good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
-            self.refusals.note(len(found), int(len(found) - good.sum()), left=True)  # an image may have no line
-            return Segments(found.endpoints[good], found.scores[good])
-        return _NO_SEGMENTS
+        except NetworkValueError:
+            self.refusals.note_failure()
+            return _NO_SEGMENTS
+        inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
+        good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
+        self.refusals.note(len(found), int(len(found) - good.sum()), left=True)  # an image may have no line
+        return Segments(found.endpoints[good], found.scores[good])
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,11 +145,13 @@ class BoundedLineMatcher(_Bounded[LineMatcher]):
     """A `LineMatcher` without segments for an image on which its network failed."""
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
-        with self._failure_counted():
+        try:
             found = self.source.describe(image, segments)
-            self.refusals.note(1, 0, left=True)
-            return found
-        return LineFeatures(_NO_SEGMENTS)
+        except NetworkValueError:
+            self.refusals.note_failure()
+            return LineFeatures(_NO_SEGMENTS)
+        self.refusals.note(1, 0, left=True)
+        return found
 
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
@@ -163,18 +166,22 @@ class BoundedPoints(_Bounded[PointMatcher]):
     """A `PointMatcher` without matches if its network fails; bounds are checked by `PointMatches`."""
 
     def describe(self, image: np.ndarray) -> Features:
-        with self._failure_counted():
+        try:
             return self.source.describe(image)
-        return Features(np.zeros((0, 2)), np.zeros(0))
+        except NetworkValueError:
+            self.refusals.note_failure()
+            return Features(np.zeros((0, 2)), np.zeros(0))
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
         if not (len(features_i) and len(features_j)):
             return PointMatches.none()
-        with self._failure_counted():
+        try:
             found = self.source.match(features_i, features_j, predicted)
-            self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
-            return found
-        return PointMatches.none()
+        except NetworkValueError:
+            self.refusals.note_failure()
+            return PointMatches.none()
+        self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,16 +190,18 @@ class BoundedWindow(_Bounded[WindowGeometry]):
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
         count, (height, width) = len(images), images[0].shape[:2]
-        with self._failure_counted(count):
+        try:
             found = self.source.window(images, intrinsics)
-            self.refusals.note(count, int(count - found.found.sum()), left=bool(found.found.any()))
-            return found
-        camera = Camera.guess(width, height).intrinsics if intrinsics is None else intrinsics
-        return WindowGuess(
-            np.tile(np.eye(4), (count, 1, 1)),
-            np.array(camera, np.float64),
-            np.full((count, height, width), np.nan, np.float32),
-            np.zeros((count, height, width), np.float32),
-            np.zeros(count, bool),
-            result=GeometryResult.DEGENERATE,
-        )
+        except NetworkValueError:
+            self.refusals.note_failure(count)
+            camera = Camera.guess(width, height).intrinsics if intrinsics is None else intrinsics
+            return WindowGuess(
+                np.tile(np.eye(4), (count, 1, 1)),
+                np.array(camera, np.float64),
+                np.full((count, height, width), np.nan, np.float32),
+                np.zeros((count, height, width), np.float32),
+                np.zeros(count, bool),
+                result=GeometryResult.DEGENERATE,
+            )
+        self.refusals.note(count, int(count - found.found.sum()), left=bool(found.found.any()))
+        return found

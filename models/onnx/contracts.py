@@ -252,13 +252,13 @@ def check_signature(path: Path, contract: Contract, inputs: Signatures, outputs:
     wrong = _faults(contract, inputs, outputs)
     if wrong:
         like = recognise(inputs, outputs)
-        hint = f"it looks like a file of `{like[0]}`" if like else "export it again for this contract"
+        hint = f"it looks like a file of `{like.network}`" if like else "export it again for this contract"
         raise NetworkFileError(f"`{path}` is not a file of `{contract.network}`: {'; '.join(wrong)}; {hint}")
 
 
-def recognise(inputs: Signatures, outputs: Signatures) -> list[str]:
-    """Return names of the networks whose contract a file with this signature keeps."""
-    return [name for name, contract in CONTRACTS.items() if not _faults(contract, inputs, outputs)]
+def recognise(inputs: Signatures, outputs: Signatures) -> Contract | None:
+    """Return the contract that a file with this signature fulfils, or None."""
+    return next((contract for contract in _ALL if not _faults(contract, inputs, outputs)), None)
 
 
 def _faults(contract: Contract, inputs: Signatures, outputs: Signatures) -> list[str]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_image
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher, spread
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.fit import vectors_at
@@ -35,7 +34,6 @@ class DensePointMatcher(PixelMatcher):
 
     def describe(self, image: np.ndarray) -> Features:
         """Return key points and unit vectors of `image` (uint8 [H, W, 3]); none where no score is high enough."""
-        check_image("image", image)
         settings = ("key points", self.count, self.score)
         found = self.cache.get((self.session,), settings, (image,), lambda: self._run(image))
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields, check_image
+from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.lines import match_segments
 from vggtgeo.models.classical.nearest import unit
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
@@ -56,7 +56,6 @@ class DinoFeatures:
         return DescriptorGrid(unit(grid - grid.mean(axis=0)).reshape(*_grid(fit), -1), fit)
 
     def _outputs(self, image: np.ndarray) -> tuple[Outputs, Fit]:
-        check_image("image", image)
         fit = self.session.fit(image)
         return self.cache.get((self.session,), ("features",), (image,), lambda: self._run(image, fit)), fit
 

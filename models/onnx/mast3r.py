@@ -7,8 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields, check_image
-from vggtgeo.models.classical.pixel_matcher import refined
+from vggtgeo.models.checks import check_fields
+from vggtgeo.models.classical.pixel_matcher import verified
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
@@ -69,7 +69,6 @@ class Mast3rMatcher:
 
     def describe(self, image: np.ndarray) -> Features:
         """Return key points of `image` (uint8 [H, W, 3]); the network runs when they are matched."""
-        check_image("image", image)
         fit = Fit.of(image.shape[:2], self.size)
         starts, strength = corners(fit.resize(image), self.spacing, self.corner)
         pixels = fit.to_image(starts.astype(np.float64))
@@ -92,9 +91,8 @@ class Mast3rMatcher:
             pixels_j[index],
             confidence_of(found["certainty"][index]),
         )
-        matches = matches.select(self.verifier.inliers(matches.pixels_i, matches.pixels_j))
         gray_i, gray_j = (cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY) for view in (first, second))
-        return refined(self.refinement, gray_i, gray_j, matches)
+        return verified(matches, self.verifier, self.refinement, gray_i, gray_j)
 
     def _run(self, first: Mast3rView, second: Mast3rView) -> Outputs:
         if not len(first.starts):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import least_squares
-from vggtgeo.models.checks import check_fields, check_image
+from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.sensor_depth import no_depth
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.fit import Fit
@@ -41,7 +41,6 @@ class MogeDepth:
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
         """Return metric depth; with `intrinsics` only the shift is recovered, without them the focal length too."""
-        check_image("image", image)
         fit = self.session.fit(image)
         outputs = self.cache.get((self.session,), ("depth", self.tokens), (image,), lambda: self._run(image, fit))
         mask = fit.map_to_image(outputs["mask"][0])

@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import onnxruntime
+from vggtgeo.models.checks import check_image
 from vggtgeo.models.onnx.contracts import (
     CONTRACTS,
     METADATA_NETWORK,
@@ -107,6 +108,7 @@ class Session:
 
     def prepare(self, image: np.ndarray, fit: Fit) -> np.ndarray:
         """Return `image` (uint8 [H, W, 3]) as input, resized and normalised, float32 [1, 3, *fit.network_size]."""
+        check_image("image", image)
         return self.contract.normalisation.apply(fit.resize(image))[None]
 
     def run(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, np.ndarray]:
@@ -208,12 +210,10 @@ def open_session(
     )
     properties = opened.get_modelmeta().custom_metadata_map
     if contract is None:
-        named = properties.get(METADATA_NETWORK)
-        like = [named] if named in CONTRACTS else recognise(inputs, outputs)
-        if not like:
-            listing = ", ".join(f"`{name}` {signature}" for name, signature in {**inputs, **outputs}.items())
-            raise NetworkFileError(f"`{path}` matches no known network ({', '.join(CONTRACTS)}); it has {listing}")
-        contract = CONTRACTS[like[0]]
+        contract = CONTRACTS.get(properties.get(METADATA_NETWORK, "")) or recognise(inputs, outputs)
+    if contract is None:
+        listing = ", ".join(f"`{name}` {signature}" for name, signature in {**inputs, **outputs}.items())
+        raise NetworkFileError(f"`{path}` matches no known network ({', '.join(CONTRACTS)}); it has {listing}")
     check_signature(path, contract, inputs, outputs)
     return Session(path, contract, used, inputs, outputs, properties, opened)
 
