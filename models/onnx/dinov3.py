@@ -19,21 +19,9 @@ PREFIX = 5
 """Tokens before the patches: the class token and four registers."""
 
 
-@dataclass(frozen=True)
-class DescriptorGrid:
-    """Unit descriptors of patches, float32 [h, w, C], and the fit of the image."""
-
-    grid: np.ndarray
-    fit: Fit
-
-    def at(self, pixels: np.ndarray) -> np.ndarray:
-        """Return unit descriptors float32 [n, C] at image pixels float [n, 2]."""
-        return vectors_at(self.grid, self.fit.to_network(pixels), self.fit.network_size)
-
-
 @dataclass(frozen=True, eq=False)
 class DinoFeatures:
-    """The network on one image: saliency Omega (a `DenseConfidence`) and the grid of descriptors.
+    """The network on one image: saliency Omega (a `DenseConfidence`) and descriptors.
 
     Omega = s / (1 + s), with s the attention of the class token to a patch, mean over the heads of the last block, in
     units of the mean over patches: 1/2 where a patch gets as much as on average.
@@ -49,11 +37,14 @@ class DinoFeatures:
         fine = cv2.resize(omega, fit.network_size[::-1], interpolation=cv2.INTER_LINEAR)
         return fit.map_to_image(fine)
 
-    def describe(self, image: np.ndarray) -> DescriptorGrid:
-        """Return descriptors of the patches of `image`, less their mean, which all patches of an image share."""
+    def descriptors(self, image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """Return unit descriptors float32 [n, C] at `pixels` [n, 2] of `image`: those of the patches, less their mean,
+        which all patches of an image share.
+        """
         outputs, fit = self._outputs(image)
-        grid = outputs["patch_descriptors"].astype(np.float32)
-        return DescriptorGrid(unit(grid - grid.mean(axis=0)).reshape(*_grid(fit), -1), fit)
+        patches = outputs["patch_descriptors"].astype(np.float32)
+        grid = unit(patches - patches.mean(axis=0)).reshape(*_grid(fit), -1)
+        return vectors_at(grid, fit.to_network(pixels), fit.network_size)
 
     def _outputs(self, image: np.ndarray) -> tuple[Outputs, Fit]:
         fit = self.session.fit(image)
@@ -109,7 +100,7 @@ class DenseLineMatcher:
         place = ((np.arange(self.samples) + 0.5) / self.samples)[:, None]
         ends = segments.endpoints
         pixels = ends[:, None, 0] + place * (ends[:, None, 1] - ends[:, None, 0])
-        vectors = self.features.describe(image).at(pixels.reshape(-1, 2))
+        vectors = self.features.descriptors(image, pixels.reshape(-1, 2))
         return LineFeatures(segments, vectors.reshape(len(segments), self.samples, -1).astype(np.float16))
 
     def match(

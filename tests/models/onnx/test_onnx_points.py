@@ -12,70 +12,9 @@ from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Out
 from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks
 from vggtgeo.models.onnx.dinov3 import DinoFeatures, saliency
 from vggtgeo.models.onnx.fit import vectors_at
-from vggtgeo.models.onnx.mast3r import Mast3rMatcher, corners, nearest, reciprocal
+from vggtgeo.models.onnx.mast3r import nearest, reciprocal
 from vggtgeo.models.onnx.session import Session, open_session
-from vggtgeo.models.roles import DenseConfidence, PointMatcher
-
-MOTION = views.pose((1.0, -2.0, 3.0), (0.1, -0.05, 0.05))
-SIZE = (240, 320)
-
-
-def _matcher(folder: Path, **settings: object) -> Mast3rMatcher:
-    encoder = tiny.mast3r_encoder(folder / "encoder.onnx", SIZE)
-    decoder = tiny.mast3r_decoder(folder / "decoder.onnx", SIZE)
-    return Mast3rMatcher(
-        open_session(encoder, contracts.MAST3R_ENCODER), open_session(decoder, contracts.MAST3R_DECODER), **settings
-    )
-
-
-def test_matches_follow_the_known_motion(tmp_path: Path) -> None:
-    # Proves encoder, decoder, reciprocal search and refinement together: the tiny decoder's descriptors are filters
-    # of the image, so that matches can be judged. Oracle: the homography between two views of a plane.
-    first, second, homography = views.plane_pair(MOTION)
-    matcher = _matcher(tmp_path)
-    assert isinstance(matcher, PointMatcher)
-    matches = matcher.match(matcher.describe(first), matcher.describe(second))
-    errors = np.linalg.norm(views.move(homography, matches.pixels_i) - matches.pixels_j, axis=1)
-    measured = f"{len(matches)} matches, median error {np.median(errors):.3f} px, {np.mean(errors > 3):.1%} wrong"
-    assert len(matches) > 200, measured
-    assert np.median(errors) < 0.15, measured
-    assert np.mean(errors > 3) < 0.03, measured
-    assert (matches.index_j == -1).all()
-    assert len(np.unique(matches.index_i)) == len(matches)
-
-
-def test_blank_images_have_no_key_points(tmp_path: Path) -> None:
-    # Proves that a blank image costs nothing and matches nothing. Oracle: there is nothing to find.
-    matcher = _matcher(tmp_path)
-    blank = matcher.describe(np.full((*SIZE, 3), 90, np.uint8))
-    full = matcher.describe(views.plane_pair(MOTION)[0])
-    assert len(blank) == 0
-    assert len(matcher.match(blank, full)) == 0
-    assert len(matcher.match(full, blank)) == 0
-
-
-@pytest.mark.parametrize("size", [SIZE, ("H", "W")], ids=["fixed", "open"])
-def test_key_points_of_maps_follow_the_known_motion(tmp_path: Path, size: tuple) -> None:
-    # Proves key points, their vectors and their matches, of a file with the size of the images (no multiple of 32, so
-    # that they are resized) fixed or open: the tiny network's maps are filters of the image. Oracle: the homography
-    # between two views of a plane; a blank image.
-    fixed = (256, 320) if size == SIZE else size
-    session = open_session(tiny.alike(tmp_path / "alike.onnx", fixed), contracts.ALIKE)
-    matcher = DensePointMatcher(session=session)
-    assert isinstance(matcher, PointMatcher)
-    first, second, homography = views.plane_pair(MOTION)
-    described = matcher.describe(first), matcher.describe(second)
-    assert np.allclose(np.linalg.norm(described[0].descriptors.vectors, axis=1), 1.0, atol=1e-5)
-    matches = matcher.match(*described)
-    errors = np.linalg.norm(views.move(homography, matches.pixels_i) - matches.pixels_j, axis=1)
-    measured = f"{len(matches)} matches, median error {np.median(errors):.3f} px, {np.mean(errors > 3):.1%} wrong"
-    assert len(matches) > 150, measured
-    assert np.median(errors) < 0.2, measured
-    assert np.mean(errors > 3) < 0.03, measured
-    assert (described[1].pixels[matches.index_j] - matches.pixels_j).max() < 3
-    blank = matcher.describe(np.full((*SIZE, 3), 90, np.uint8))
-    assert len(blank) == 0
-    assert len(matcher.match(blank, described[0])) == len(matcher.match(described[0], blank)) == 0
+from vggtgeo.models.roles import DenseConfidence
 
 
 def test_peaks_lie_between_pixels() -> None:
@@ -107,35 +46,6 @@ def test_xfeat_s_blocks_have_vectors(tmp_path: Path) -> None:
     features = DensePointMatcher(session=open_session(file, contracts.XFEAT)).describe(views.texture(0, (128, 96)))
     assert features.descriptors.vectors.shape == (len(features), 64)
     assert len(features) > 20
-
-
-def test_an_image_is_encoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that the encoder runs once an image, not once a pair, until `kept` others came. Oracle: a count.
-    matcher = _matcher(tmp_path, cache=MemoryCache(0), kept=3)
-    real, runs = Session.run_on_device, []
-
-    def run(self: Session, inputs: dict, wanted: object = None) -> object:
-        runs.extend([self] if self is matcher.encoder else [])
-        return real(self, inputs, wanted)
-
-    monkeypatch.setattr(Session, "run_on_device", run)
-    pictures = [views.texture(seed, (320, 240)) for seed in range(4)]
-    described = [matcher.describe(picture) for picture in pictures]
-    assert runs == []
-    for first, second, expected in ((0, 1, 2), (1, 2, 3), (0, 2, 3), (0, 3, 4), (1, 0, 5)):
-        matcher.match(described[first], described[second])
-        assert len(runs) == expected, (first, second)
-
-
-def test_the_strongest_corner_of_each_cell_is_taken() -> None:
-    # Proves that corners cover the image and blank cells have none. Oracle: an image with one known corner in a cell.
-    image = np.zeros((64, 96, 3), np.uint8)
-    image[20:40, 30:] = 200
-    pixels, strength = corners(image, 16, 1e-5)
-    assert len(np.unique(pixels // 16, axis=0)) == len(pixels)
-    best = pixels[strength.argmax()]
-    assert np.abs(best - [30, 20]).max() <= 2 or np.abs(best - [30, 39]).max() <= 2
-    assert (pixels[:, 0] > 20).all()
 
 
 def _smooth_grid(seed: int, shape: tuple[int, int] = (24, 30)) -> np.ndarray:
