@@ -12,7 +12,7 @@ from functools import cache, cached_property
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
-from vggtgeo.models.checks import check_array, check_fields, check_image
+from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.nearest import distance_ratio, exclude_far, mutual_nearest
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
@@ -51,7 +51,6 @@ class PixelMatcher:
         second: PixelDescriptors = features_j.descriptors
         similarity = first.vectors @ second.vectors.T
         if predicted is not None:
-            check_array("predicted", predicted, (len(features_i), 2), finite=False)
             exclude_far(similarity, predicted, features_j.pixels, self.radius)
         index_i, index_j, clarity = mutual_nearest(similarity, self.ratio)
         pixels_i, pixels_j = features_i.pixels[index_i], features_j.pixels[index_j]

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.checks import check_array
 from vggtgeo.models.classical.verification import SampleOrder
 from vggtgeo.models.roles import GeometryResult, StartGuess
 
@@ -40,8 +39,6 @@ class TwoViewStart:
 
     def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
         """Return motion and structure from matches float [n, 2] each; see `InitialGeometry.start`."""
-        check_array("pixels_i", pixels_i, (None, 2))
-        check_array("pixels_j", pixels_j, (len(pixels_i), 2))
         if len(pixels_i) < self.least:
             return _failed(len(pixels_i), GeometryResult.TOO_FEW_MATCHES)
         rays_i, rays_j = _rays(pixels_i, intrinsics), _rays(pixels_j, intrinsics)

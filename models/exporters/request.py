@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import io
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -77,9 +75,7 @@ class Checkout:
         sys.path[:] = [str(root), *(entry for entry in search_path if not _provides(entry, self.packages))]
         importlib.invalidate_caches()
         try:
-            with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-                warnings.simplefilter("ignore")
-                yield
+            yield
         finally:
             sys.path[:] = search_path
 
