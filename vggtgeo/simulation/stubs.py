@@ -27,6 +27,38 @@ from vggtgeo.geometry import pinhole
 from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PointMatches, Segments, WindowGuess
 from vggtgeo.simulation.oracle import SimulatedOracle
 
+_WAVES = 24
+_FULL_TEXTURE = 0.25
+"""Strength from which a region counts as well textured."""
+
+
+def stream(seed: int, role: str, *indices: int) -> np.random.Generator:
+    """Return the random stream of one answer."""
+    return np.random.default_rng([seed, zlib.crc32(role.encode()), *indices])
+
+
+def smooth_field(
+    rng: np.random.Generator, shape: tuple[int, int], time: float, cycles: float, memory: float
+) -> np.ndarray:
+    """Return a Gaussian-like field over a picture that drifts with time, float32 [H, W]: mean 0, variance 1 everywhere.
+
+    f(x, y, t) = sqrt(2 / K) sum_k cos(2 pi (a_k x + b_k y) + c_k t + phase_k), x and y in [0, 1]; a, b normal with
+    deviation `cycles` waves a picture, c normal with deviation 1 / `memory` (seconds). Equal streams give one field.
+    """
+    across, down = rng.normal(0, cycles, (2, _WAVES))
+    phase = rng.uniform(0, 2 * np.pi, _WAVES) + time * rng.normal(0, 1 / memory, _WAVES)
+    y, x = np.mgrid[0:49, 0:65]
+    angle = 2 * np.pi * (across * (x / 64)[..., None] + down * (y / 48)[..., None]) + phase
+    coarse = np.sqrt(2 / _WAVES) * np.cos(angle).sum(axis=-1)
+    return cv2.resize(coarse.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+
+
+def weakness(oracle: SimulatedOracle, index: int) -> np.ndarray:
+    """Return the lack of texture, float32 [H, W] in [0, 1]: 1 on a plain wall, 0 from a strength of 0.25."""
+    texture = oracle.texture(index).astype(np.float32)
+    around = cv2.GaussianBlur(texture, (0, 0), max(1.0, texture.shape[1] / 53))
+    return np.clip(1.0 - around / _FULL_TEXTURE, 0.0, 1.0)
+
 
 @dataclass(frozen=True)
 class SimulatedMoge:
@@ -55,9 +87,10 @@ class SimulatedMoge:
         depth = self.oracle.depth(index)
         sigma = self.error * (1 + self.weak * weakness(self.oracle, index))
         sigma = sigma * np.where(self.oracle.glass(index), self.glass, 1.0)
-        field = SmoothField(self.seed, "moge", self.cycles, self.memory)
+        time = self.oracle.timestamp(index)
+        field = smooth_field(stream(self.seed, "moge"), depth.shape, time, self.cycles, self.memory)
         scale = self.wobble * stream(self.seed, "moge", index).standard_normal()
-        log_error = sigma * field.sample(depth.shape, self.oracle.timestamp(index)) + scale
+        log_error = sigma * field + scale
         confidence = np.where(np.isfinite(depth), self.error / np.maximum(sigma, 1e-12), 0.0)
         stated = np.where(np.isfinite(depth), np.maximum(np.hypot(sigma, self.wobble), 1e-6), np.nan)
         return DepthEstimate(
@@ -103,46 +136,6 @@ class SimulatedDino:
             cv2.line(canvas, tuple(start), tuple(end), 0, 1)
         distance = cv2.distanceTransform(canvas, cv2.DIST_L2, 3)
         return np.exp(-distance / self.reach)
-
-
-_WAVES = 24
-_FULL_TEXTURE = 0.25  # strength from which a region counts as well textured
-
-
-def stream(seed: int, role: str, *indices: int) -> np.random.Generator:
-    """Return the random stream of one answer."""
-    return np.random.default_rng([seed, zlib.crc32(role.encode()), *indices])
-
-
-@dataclass(frozen=True)
-class SmoothField:
-    """A Gaussian-like field over the picture that drifts with time: mean 0, variance 1 at every place and time.
-
-    f(x, y, t) = sqrt(2 / K) sum_k cos(2 pi (a_k x + b_k y) + c_k t + phase_k), x and y in [0, 1]; a, b normal with
-    deviation `cycles` waves a picture, c normal with deviation 1 / `memory` (seconds).
-    """
-
-    seed: int
-    role: str
-    cycles: float
-    memory: float
-
-    def sample(self, shape: tuple[int, int], time: float) -> np.ndarray:
-        """Return the field at `time` (seconds) for a picture of `shape` (H, W), float32 [H, W]."""
-        rng = stream(self.seed, self.role)
-        across, down = rng.normal(0, self.cycles, (2, _WAVES))
-        phase = rng.uniform(0, 2 * np.pi, _WAVES) + time * rng.normal(0, 1 / self.memory, _WAVES)
-        y, x = np.mgrid[0:49, 0:65]
-        angle = 2 * np.pi * (across * (x / 64)[..., None] + down * (y / 48)[..., None]) + phase
-        coarse = np.sqrt(2 / _WAVES) * np.cos(angle).sum(axis=-1)
-        return cv2.resize(coarse.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
-
-
-def weakness(oracle: SimulatedOracle, index: int) -> np.ndarray:
-    """Return the lack of texture, float32 [H, W] in [0, 1]: 1 on a plain wall, 0 from a strength of 0.25."""
-    texture = oracle.texture(index).astype(np.float32)
-    around = cv2.GaussianBlur(texture, (0, 0), max(1.0, texture.shape[1] / 53))
-    return np.clip(1.0 - around / _FULL_TEXTURE, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -299,8 +292,9 @@ class SimulatedVggt:
         poses, found = self._poses(indices, lacking.mean(axis=(1, 2)), middle, rng)
         poses[:, :3, 3] /= unit
         sigma = self.depth_error * (1 + self.weak * lacking)
-        field = SmoothField(int(rng.integers(2**31)), "vggt", self.cycles, self.memory)
-        waves = np.stack([field.sample(depths[0].shape, self.oracle.timestamp(index)) for index in indices])
+        seed, times = int(rng.integers(2**31)), [self.oracle.timestamp(index) for index in indices]
+        field = lambda time: smooth_field(stream(seed, "vggt"), depths[0].shape, time, self.cycles, self.memory)
+        waves = np.stack([field(time) for time in times])
         certainty = np.where(np.isfinite(depths), self.depth_error / np.maximum(sigma, 1e-12), 0.0)
         return WindowGuess(
             poses=poses,
