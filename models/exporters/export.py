@@ -70,10 +70,10 @@ def export(
     recipe: Recipe,
     request: Request,
     output: Path,
-    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
     tolerance: float | None = None,
 ) -> Report:
-    """Write the network as `output` (.onnx); `say` receives progress messages.
+    """Write the network as `output` (.onnx); `progress` receives messages.
 
     tolerance: largest difference that is accepted; None for `TOLERANCE` or `HALF_TOLERANCE`.
 
@@ -97,10 +97,10 @@ def export(
         written = folder / output.name
         properties = _properties(recipe, request, weights)
         with _quiet():
-            inputs, outputs, parameters, rewrite = _write(recipe, request, written, properties, tolerance, say)
-        say("checking the file")
+            inputs, outputs, parameters, rewrite = _write(recipe, request, written, properties, tolerance, progress)
+        progress("checking the file")
         load("onnx").checker.check_model(str(written), full_check=True)
-        say("running it in onnxruntime")
+        progress("running it in onnxruntime")
         found, latency = _run(written, inputs, list(outputs))
         parity = _compare("onnxruntime", found, outputs, tolerance)
         record: dict[str, Any] = {f"input.{name}": array for name, array in inputs.items()}
@@ -122,19 +122,19 @@ def _write(
     path: Path,
     properties: Mapping[str, str],
     tolerance: float,
-    say: Callable[[str], None],
+    progress: Callable[[str], None],
 ) -> tuple[_Arrays, _Arrays, int, float]:
     """Build, compare with the published code, and write. On return the torch module's weights are gone from memory.
 
     Return inputs, PyTorch's outputs, number of weights, and difference of the changed module from the published one.
     """
-    say(f"building {recipe.network} ({request.variant}) from {request.source}")
+    progress(f"building {recipe.network} ({request.variant}) from {request.source}")
     graph = recipe.build(request)
     names = _output_names(recipe.network, graph)
-    say("comparing with the published code in PyTorch")
+    progress("comparing with the published code in PyTorch")
     values = evaluate(graph.module, graph.inputs, names)
     rewrite = _compare("the changed module", values, graph.published, tolerance)
-    say("exporting")
+    progress("exporting")
     parameters = _save(graph, names, path, properties)
     _free(graph.module)
     return graph.inputs, values, parameters, rewrite
