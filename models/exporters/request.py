@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +64,11 @@ class Checkout:
         return None
 
     @contextlib.contextmanager
-    def importable(self, source: Path) -> Iterator[None]:
-        """Import `packages` from the checkout and from nowhere else, in the block."""
+    def importable(self, source: Path) -> Iterator[Callable[[str], Any]]:
+        """Import `packages` from the checkout and from nowhere else, in the block; give a function that imports one.
+
+        It raises `ExportError` if something that the module imports is missing.
+        """
         root = self.root(source)
         search_path = list(sys.path)
         for name in [name for name in sys.modules if name.split(".")[0] in self.packages]:
@@ -74,17 +76,17 @@ class Checkout:
         # a namespace package (croco's `models`, say) loses against any regular one of its name later on the path
         sys.path[:] = [str(root), *(entry for entry in search_path if not _provides(entry, self.packages))]
         importlib.invalidate_caches()
+
+        def imported(module: str) -> Any:
+            try:
+                return importlib.import_module(module)
+            except ImportError as error:
+                raise ExportError(f"`--source` {source}: importing `{module}` failed: {error}; {self.hint}") from None
+
         try:
-            yield
+            yield imported
         finally:
             sys.path[:] = search_path
-
-    def import_from(self, source: Path, module: str) -> Any:
-        """Return the module, inside `importable`; raise `ExportError` if something that it imports is missing."""
-        try:
-            return importlib.import_module(module)
-        except ImportError as error:
-            raise ExportError(f"`--source` {source}: importing `{module}` failed: {error}; {self.hint}") from None
 
     def revision(self, source: Path) -> str:
         """Return `repository@commit` of the checkout, the commit `unknown` outside git."""
@@ -131,9 +133,9 @@ class Request:
     @contextlib.contextmanager
     def code(self) -> Iterator[Callable[[str], Any]]:
         """Give a function that imports modules of the checkout, in the block; torch's random numbers are fixed."""
-        with self.checkout.importable(self.source):
+        with self.checkout.importable(self.source) as imported:
             load("torch").manual_seed(self.seed)
-            yield partial(self.checkout.import_from, self.source)
+            yield imported
 
 
 @dataclass(frozen=True)
