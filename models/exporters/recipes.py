@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from vggtgeo.models.exporters import convolutional, dinov3, letr, mast3r, moge2, vggt
+from vggtgeo.models.exporters import dinov3, line_detectors, moge2, point_matchers, vggt
 from vggtgeo.models.exporters.request import Checkout, ExportError, Graph, Request
 
 
@@ -95,12 +95,12 @@ _ALL = (
     Recipe("vggt", _VGGT, vggt.build, ("1b", "test"), (392, 518), multiple=14, fixed=("--width",), views=4),
     Recipe("dinov3", _DINOV3, dinov3.build, ("vitl16", "vitb16", "vits16"), multiple=16),
     Recipe("moge2", _MOGE2, moge2.build, ("vitl", "vitb", "vits"), tokens=1800),
-    Recipe("letr", _LETR, letr.build, ("resnet50", "resnet101", "test"), half=False),
-    Recipe("mast3r_encoder", _MAST3R, mast3r.build_encoder, ("vitl", "test"), (384, 512), multiple=16),
-    Recipe("mast3r_decoder", _MAST3R, mast3r.build_decoder, ("vitl", "test"), (384, 512), multiple=16),
-    Recipe("alike", _ALIKE, convolutional.build_alike, ("normal", "tiny", "small", "large"), multiple=32, half=False),
-    Recipe("xfeat", _XFEAT, convolutional.build_xfeat, ("published",), multiple=32, half=False),
-    Recipe("mlsd", _MLSD, convolutional.build_mlsd, ("tiny",), (512, 512), fixed=("--height", "--width"), half=False),
+    Recipe("letr", _LETR, line_detectors.build_letr, ("resnet50", "resnet101", "test"), half=False),
+    Recipe("mast3r_encoder", _MAST3R, point_matchers.build_mast3r_encoder, ("vitl", "test"), (384, 512), multiple=16),
+    Recipe("mast3r_decoder", _MAST3R, point_matchers.build_mast3r_decoder, ("vitl", "test"), (384, 512), multiple=16),
+    Recipe("alike", _ALIKE, point_matchers.build_alike, ("normal", "tiny", "small", "large"), multiple=32, half=False),
+    Recipe("xfeat", _XFEAT, point_matchers.build_xfeat, ("published",), multiple=32, half=False),
+    Recipe("mlsd", _MLSD, line_detectors.build_mlsd, ("tiny",), (512, 512), fixed=("--height", "--width"), half=False),
 )
 RECIPES = {recipe.network: recipe for recipe in _ALL}
 """Every network that can be exported, by the name of its contract."""

@@ -10,8 +10,7 @@ import tiny_networks as tiny
 from vggtgeo.models.classical import OrbMatcher, SiftMatcher
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.cache import MemoryCache
-from vggtgeo.models.onnx.dense_points import DensePointMatcher
-from vggtgeo.models.onnx.mast3r import Mast3rMatcher
+from vggtgeo.models.onnx.point_matchers import DensePointMatcher, Mast3rMatcher
 from vggtgeo.models.onnx.session import Session, open_session
 from vggtgeo.models.roles import PointMatcher
 

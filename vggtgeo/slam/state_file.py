@@ -28,7 +28,7 @@ from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.onnx.fit import Fit
-from vggtgeo.models.onnx.mast3r import Mast3rView
+from vggtgeo.models.onnx.point_matchers import Mast3rView
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.perception.rgbd_view import Points, RgbdView

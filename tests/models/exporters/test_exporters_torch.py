@@ -15,7 +15,7 @@ import onnx
 import onnxruntime
 import pytest
 from reported import raises
-from vggtgeo.models.exporters import mast3r, vggt, weights
+from vggtgeo.models.exporters import point_matchers, vggt, weights
 from vggtgeo.models.exporters.export import Report, export
 from vggtgeo.models.exporters.recipes import recipe_of
 from vggtgeo.models.exporters.request import ExportError, Request
@@ -143,7 +143,7 @@ def test_a_checkpoint_is_loaded_in_full(checkouts: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("network", "module", "function"),
-    [("vggt", vggt, "fix_positions"), ("mast3r_decoder", mast3r, "fix_positions"), ("dinov3", None, "")],
+    [("vggt", vggt, "fix_positions"), ("mast3r_decoder", point_matchers, "fix_positions"), ("dinov3", None, "")],
 )
 def test_an_error_in_a_change_is_seen(
     network: str, module, function: str, checkouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

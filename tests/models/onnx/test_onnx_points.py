@@ -9,10 +9,9 @@ import pytest
 import tiny_networks as tiny
 from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs
-from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks
 from vggtgeo.models.onnx.dinov3 import DinoFeatures, saliency
 from vggtgeo.models.onnx.fit import vectors_at
-from vggtgeo.models.onnx.mast3r import nearest, reciprocal
+from vggtgeo.models.onnx.point_matchers import DensePointMatcher, nearest, peaks, reciprocal
 from vggtgeo.models.onnx.session import Session, open_session
 from vggtgeo.models.roles import DenseConfidence
 

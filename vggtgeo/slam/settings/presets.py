@@ -32,11 +32,10 @@ from vggtgeo.models.onnx.bounds import (
 )
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
 from vggtgeo.models.onnx.contracts import NetworkFileError
-from vggtgeo.models.onnx.dense_points import DensePointMatcher
 from vggtgeo.models.onnx.dinov3 import DenseLineMatcher, DinoFeatures
 from vggtgeo.models.onnx.line_detectors import LetrDetector, MlsdDetector
-from vggtgeo.models.onnx.mast3r import Mast3rMatcher
 from vggtgeo.models.onnx.moge2 import MogeDepth
+from vggtgeo.models.onnx.point_matchers import DensePointMatcher, Mast3rMatcher
 from vggtgeo.models.onnx.registry import NETWORKS, files_of, players
 from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow

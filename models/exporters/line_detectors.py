@@ -1,6 +1,6 @@
-"""LETR (Xu et al., CVPR 2021), both stages: line segments and their scores.
+"""Line detectors: LETR (Xu et al., CVPR 2021), both stages, and M-LSD tiny (Gu et al., AAAI 2022), as published.
 
-Changes, since the published code is of the time of torch 1.7:
+Changes to LETR, since the published code is of the time of torch 1.7:
 
 - It asks torchvision for a ResNet with options that newer versions lack and that download weights: they are left out.
   It reads the version as a number of three characters: another is given.
@@ -15,14 +15,17 @@ from __future__ import annotations
 from typing import Any
 from unittest import mock
 
+import numpy as np
 from vggtgeo.models.exporters.request import Graph, Request, as_module, load
 from vggtgeo.models.exporters.weights import fill
 
+_FOURTH_CHANNEL = 1 / 127.5 - 1
+"""An image of ones, scaled as the colours are (M-LSD)."""
 _SMALL = ("--enc_layers", "--dec_layers", "--second_enc_layers", "--second_dec_layers")
 
 
-def build(request: Request) -> Graph:
-    """Return the network for one image of the request's size."""
+def build_letr(request: Request) -> Graph:
+    """Return the network for one image of the request's size: line segments and their scores."""
     torch, torchvision = load("torch"), load("torchvision")
     backbone = "resnet50" if request.variant == "test" else request.variant
     resnet = getattr(torchvision.models, backbone)
@@ -67,3 +70,13 @@ def _replace_attention(network: Any) -> None:
                 own = attention(child.embed_dim, child.num_heads)
                 own.load_state_dict(child.state_dict(), strict=True)
                 setattr(module, name, own.eval().requires_grad_(False))
+
+
+def build_mlsd(request: Request) -> Graph:
+    """Return the network for its one size, 512 x 512: maps of segment centres and displacements."""
+    with request.code() as imported:
+        network = imported("models.mbv2_mlsd_tiny").MobileV2_MLSD_Tiny()
+    fill(network, request, "M-LSD tiny")
+    colours = request.random_images(-1.0, 1.0)
+    image = np.concatenate([colours, np.full_like(colours[:, :1], _FOURTH_CHANNEL)], axis=1)
+    return Graph.unchanged(network, lambda network, image: network(image), {"image": image}, ("maps",))
