@@ -1,14 +1,5 @@
 """Inputs and outputs of the ONNX file of each network, for exporters and adapters; checks of a file.
 
-| network | role | paper |
-|---|---|---|
-| `vggt` | geometry of a window | Wang et al., CVPR 2025 |
-| `dinov3` | descriptors and dense confidence | Siméoni et al., 2025 |
-| `moge2` | metric depth | Wang et al., 2025 |
-| `letr`, `mlsd` | line segments | Xu et al., CVPR 2021; Gu et al., AAAI 2022 |
-| `mast3r_encoder`, `mast3r_decoder` | point matches | Leroy et al., ECCV 2024 |
-| `alike`, `xfeat` | point matches | Zhao et al., IEEE TMM 2022; Potje et al., CVPR 2024 |
-
 Shapes are written as in a paper: a number is fixed, a letter is any size, equal at all its places, `Patches` is
 the number of tokens of an H x W image. A file may leave sizes open; those it fixes must agree.
 """
