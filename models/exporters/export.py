@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from vggtgeo.models.exporters.recipes import Recipe
-from vggtgeo.models.exporters.request import ExportError, Graph, Request, evaluate, load
+from vggtgeo.models.exporters.request import Graph, Request, evaluate, load
 from vggtgeo.models.exporters.weights import identity, read_checkpoint
 from vggtgeo.models.onnx.contracts import (
     CONTRACTS,
@@ -38,6 +38,7 @@ from vggtgeo.models.onnx.contracts import (
     relative_difference,
 )
 
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.peak_memory import peak_memory_gb
 
 OPSET = 20
@@ -77,12 +78,12 @@ def export(
 
     tolerance: largest difference that is accepted; None for `TOLERANCE` or `HALF_TOLERANCE`.
 
-    Raises `ExportError` if something given does not fit, or if the file does not give what PyTorch gives: then
+    Raises `InputError` if something given does not fit, or if the file does not give what PyTorch gives: then
     nothing is written.
     """
     started = time.perf_counter()
     if output.suffix != ".onnx" or output.is_dir():
-        raise ExportError(f"`--output` is {output}, expected the name of a file that ends in .onnx")
+        raise InputError(f"`--output` is {output}, expected the name of a file that ends in .onnx")
     recipe.checkout.root(request.source)
     for package in ("torch", "onnx", "onnxscript", "onnxruntime"):  # before any work begins
         load(package)
@@ -147,7 +148,7 @@ def _output_names(network: str, graph: Graph) -> tuple[str, ...]:
     known = {tensor.name for tensor in contract.outputs}
     names = tuple(graph.published)
     if not needed <= set(names) <= known:
-        raise ExportError(
+        raise InputError(
             f"{network} gives {', '.join(names)}, expected {', '.join(sorted(needed))}; is this checkpoint of the "
             "version with all of these heads?"
         )
@@ -208,12 +209,12 @@ def _run(path: Path, inputs: _Arrays, names: list[str]) -> tuple[_Arrays, float]
 
 
 def _compare(who: str, found: _Arrays, wanted: _Arrays, tolerance: float) -> float:
-    """Return the largest difference; raise `ExportError` above `tolerance`, for NaN, or for another shape."""
+    """Return the largest difference; raise `InputError` above `tolerance`, for NaN, or for another shape."""
     largest = 0.0
     for name, reference in wanted.items():
         gap = relative_difference(found[name], reference)
         if not gap <= tolerance:
-            raise ExportError(
+            raise InputError(
                 f"`{name}` of {who} differs from PyTorch by {gap:.2g}, expected at most {tolerance:g}; nothing was "
                 "written; raise `--tolerance` if that will do, and report it with the versions of torch and onnxruntime"
             )

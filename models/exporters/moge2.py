@@ -20,8 +20,10 @@ from typing import Any
 from unittest import mock
 
 from vggtgeo.models.exporters.attention import halve_blocks
-from vggtgeo.models.exporters.request import ExportError, Graph, Request, as_module, load
+from vggtgeo.models.exporters.request import Graph, Request, as_module, load
 from vggtgeo.models.exporters.weights import fill, read_checkpoint
+
+from vggtgeo.io.errors import InputError
 
 _BLOCKS = {"vits": 12, "vitb": 12, "vitl": 24}
 _CHANNELS = {"vits": 384, "vitb": 768, "vitl": 1024}
@@ -58,14 +60,14 @@ def _configuration(request: Request) -> dict[str, Any]:
     if request.checkpoint is not None:
         configuration = read_checkpoint(request.checkpoint).get("model_config")
         if not isinstance(configuration, dict):
-            raise ExportError(
+            raise InputError(
                 f"`--checkpoint` {request.checkpoint} holds no `model_config`, expected the published MoGe-2 file "
                 "(model.pt), which has its options and its weights"
             )
         return configuration
     path = request.checkout.root(request.source) / _CONFIGURATION
     if not path.is_file():
-        raise ExportError(
+        raise InputError(
             f"`--source` {request.source}: no `{_CONFIGURATION}` in it, from which random weights are "
             "made; update the checkout"
         )

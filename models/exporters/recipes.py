@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vggtgeo.models.exporters import dinov3, line_detectors, moge2, point_matchers, vggt
-from vggtgeo.models.exporters.request import Checkout, ExportError, Graph, Request
+from vggtgeo.models.exporters.request import Checkout, Graph, Request
+
+from vggtgeo.io.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -43,23 +45,23 @@ class Recipe:
         half: bool = False,
         allow_extra: bool = False,
     ) -> Request:
-        """Return the request with defaults filled in; `ExportError` for what this network cannot be."""
+        """Return the request with defaults filled in; `InputError` for what this network cannot be."""
         height, width = height or self.size[0], width or self.size[1]
         for option, size, default in zip(("--height", "--width"), (height, width), self.size, strict=True):
             if size < 1 or size % self.multiple or (option in self.fixed and size != default):
                 allowed = f"{default} alone" if option in self.fixed else f"multiples of {self.multiple}"
-                raise ExportError(f"`{option}` is {size}; {self.network} takes {allowed}")
+                raise InputError(f"`{option}` is {size}; {self.network} takes {allowed}")
         for option, value, default in (("--views", views, self.views), ("--tokens", tokens, self.tokens)):
             if value is not None and (value < 1 or not default):
-                raise ExportError(f"`{option}` is {value}; {self.network} takes {'at least 1' if default else 'none'}")
+                raise InputError(f"`{option}` is {value}; {self.network} takes {'at least 1' if default else 'none'}")
         if variant is not None and variant not in self.variants:
-            raise ExportError(
+            raise InputError(
                 f"`--variant` {variant} is not known for {self.network}; expected one of {', '.join(self.variants)}"
             )
         if checkpoint is not None and variant == "test":
-            raise ExportError("`--variant` test is for tests, with `--random-weights`; no checkpoint fits it")
+            raise InputError("`--variant` test is for tests, with `--random-weights`; no checkpoint fits it")
         if half and not self.half:
-            raise ExportError(f"`--half` does nothing for {self.network}, which is small; leave it out")
+            raise InputError(f"`--half` does nothing for {self.network}, which is small; leave it out")
         return Request(
             checkout=self.checkout,
             source=source,
@@ -107,7 +109,7 @@ RECIPES = {recipe.network: recipe for recipe in _ALL}
 
 
 def recipe_of(network: str) -> Recipe:
-    """Return the recipe of `network`; `ExportError` with the names there are."""
+    """Return the recipe of `network`; `InputError` with the names there are."""
     if network not in RECIPES:
-        raise ExportError(f"`NAME` is {network!r}, expected one of {', '.join(RECIPES)}")
+        raise InputError(f"`NAME` is {network!r}, expected one of {', '.join(RECIPES)}")
     return RECIPES[network]

@@ -13,19 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.io.errors import install_hint
-
-
-class ExportError(ValueError):
-    """A checkout, a checkpoint or a size does not fit the network; the message says what, and what to do."""
+from vggtgeo.io.errors import InputError, install_hint
 
 
 def load(name: str) -> Any:
-    """Return the package `name`; raise `ExportError` naming the extra if it, or a dependency, is missing."""
+    """Return the package `name`; raise `InputError` naming the extra if it, or a dependency, is missing."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise ExportError(
+        raise InputError(
             f"exporting needs the package `{error.name}`, which is not installed; {install_hint('export')}"
         ) from None
 
@@ -46,12 +42,12 @@ class Checkout:
     hint: str = ""
 
     def root(self, source: Path) -> Path:
-        """Return the folder to import from; raises `ExportError` if `source` is no such checkout."""
+        """Return the folder to import from; raises `InputError` if `source` is no such checkout."""
         for folder in self.roots:
             if (source / folder / self.marker).is_file():
                 return (source / folder).resolve()
         found = "no such folder" if not source.is_dir() else f"no `{self.marker}` in it"
-        raise ExportError(
+        raise InputError(
             f"`--source` {source}: {found}; expected a checkout of {self.repository}: "
             f"git clone https://github.com/{self.repository}"
         )
@@ -67,7 +63,7 @@ class Checkout:
     def importable(self, source: Path) -> Iterator[Callable[[str], Any]]:
         """Import `packages` from the checkout and from nowhere else, in the block; give a function that imports one.
 
-        It raises `ExportError` if something that the module imports is missing.
+        It raises `InputError` if something that the module imports is missing.
         """
         root = self.root(source)
         search_path = list(sys.path)
@@ -81,7 +77,7 @@ class Checkout:
             try:
                 return importlib.import_module(module)
             except ImportError as error:
-                raise ExportError(f"`--source` {source}: importing `{module}` failed: {error}; {self.hint}") from None
+                raise InputError(f"`--source` {source}: importing `{module}` failed: {error}; {self.hint}") from None
 
         try:
             yield imported

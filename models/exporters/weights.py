@@ -10,7 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.models.exporters.request import ExportError, Request, load
+from vggtgeo.models.exporters.request import Request, load
+
+from vggtgeo.io.errors import InputError
 
 _LONGEST = 2000
 """Characters of torch's error, which lists each wrong weight."""
@@ -21,7 +23,7 @@ _STATES = ("model", "state_dict", "teacher")
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Return the content of a PyTorch checkpoint, read without running code from it, mapped rather than copied.
 
-    Raises `ExportError` if it is missing, or not one.
+    Raises `InputError` if it is missing, or not one.
     """
     torch = load("torch")
     try:
@@ -34,7 +36,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         return dict(content)
     # torch's message is left out: its advice is to run what the file holds.
     except (RuntimeError, TypeError, ValueError, pickle.UnpicklingError, EOFError, OSError):
-        raise ExportError(
+        raise InputError(
             f"`--checkpoint` {path} cannot be read, expected the published weights: a dictionary in a .pt or .pth file"
         ) from None
 
@@ -42,7 +44,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 def fill(module: Any, request: Request, fits: str) -> None:
     """Load the request's checkpoint into `module`, or make its random weights tell errors apart.
 
-    fits: what the module is, for the message. Raises `ExportError` unless names and shapes of the weights agree
+    fits: what the module is, for the message. Raises `InputError` unless names and shapes of the weights agree
     exactly; with `request.allow_extra`, weights that the module has no place for are left out, as the published code of
     some networks does.
     """
@@ -57,7 +59,7 @@ def fill(module: Any, request: Request, fits: str) -> None:
         try:
             module.load_state_dict(weights, strict=True)
         except RuntimeError as error:  # names all that is missing, superfluous, or of another shape
-            raise ExportError(
+            raise InputError(
                 f"`--checkpoint` {request.checkpoint} does not hold the weights of {fits}: {str(error)[:_LONGEST]}; "
                 "give the checkpoint of this network and `--variant`, or allow superfluous ones by "
                 "`--allow-extra-weights`"

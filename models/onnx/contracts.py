@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from vggtgeo.io.errors import InputError
+
 METADATA_NETWORK = "vggtgeo.network"
 """Key of the file's metadata that names its network, one of `CONTRACTS`."""
 METADATA_WEIGHTS = "vggtgeo.weights"
@@ -220,7 +222,7 @@ CONTRACTS = {contract.network: contract for contract in _ALL}
 """Every contract by its network's name."""
 
 
-class NetworkFileError(ValueError):
+class NetworkFileError(InputError):
     """A network's file cannot be used; the message says what was expected, what was found, and what to do."""
 
 

@@ -34,7 +34,7 @@ from vggtgeo.models.onnx.contracts import (
 )
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 
-from vggtgeo.io.errors import install_hint, put_back_hint
+from vggtgeo.io.errors import InputError, install_hint, put_back_hint
 
 _log = logging.getLogger(__name__)
 GPU_PACKAGE = "onnxruntime-gpu"
@@ -55,7 +55,7 @@ _LARGE = 2**30
 Input: TypeAlias = np.ndarray | onnxruntime.OrtValue
 
 
-class NetworkRunError(RuntimeError):
+class NetworkRunError(InputError):
     """A network failed while it ran, or returned values that are not finite."""
 
 

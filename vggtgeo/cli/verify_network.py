@@ -13,7 +13,7 @@ import typer
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.network_files import as_input_errors, network_named
+from vggtgeo.io.network_files import network_named
 from vggtgeo.models.onnx.bounds import BoundedDepth, BoundedWindow
 from vggtgeo.models.onnx.contracts import (
     HALF_TOLERANCE,
@@ -69,26 +69,25 @@ def verify_file(
         raise InputError(f"`{file}` is a folder; give the file of a network, `NAME.onnx`")
     beside = file.with_name(file.name + PARITY_SUFFIX)
     record = against or (beside if beside.is_file() else None)
-    with as_input_errors():
-        contract = None if network is None else network_named(network).contract
-        session = open_session(file, contract, provider=provider)
-        # Before the image: an invalid record is found at once, but the default image takes seconds to render.
-        parity = _parity(session, record) if record else {}
-        shown = shown_image(image)
-        inputs = example_inputs(session, shown)
-        return Report(
-            file=str(file),
-            network=session.contract.network,
-            provider=session.provider,
-            random_weights=session.random_weights,
-            sha256=session.digest,
-            inputs={name: array.shape for name, array in inputs.items()},
-            outputs=_check_outputs(session, inputs),
-            latency=_latency(session, inputs, runs),
-            parity=parity,
-            limit=_tolerance(session),
-            depth_pixels=_depth_pixels(session, shown),
-        )
+    contract = None if network is None else network_named(network).contract
+    session = open_session(file, contract, provider=provider)
+    # Before the image: an invalid record is found at once, but the default image takes seconds to render.
+    parity = _parity(session, record) if record else {}
+    shown = shown_image(image)
+    inputs = example_inputs(session, shown)
+    return Report(
+        file=str(file),
+        network=session.contract.network,
+        provider=session.provider,
+        random_weights=session.random_weights,
+        sha256=session.digest,
+        inputs={name: array.shape for name, array in inputs.items()},
+        outputs=_check_outputs(session, inputs),
+        latency=_latency(session, inputs, runs),
+        parity=parity,
+        limit=_tolerance(session),
+        depth_pixels=_depth_pixels(session, shown),
+    )
 
 
 def faults(report: Report) -> list[str]:

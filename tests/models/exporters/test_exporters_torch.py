@@ -18,7 +18,7 @@ from reported import raises
 from vggtgeo.models.exporters import point_matchers, vggt, weights
 from vggtgeo.models.exporters.export import Report, export
 from vggtgeo.models.exporters.recipes import recipe_of
-from vggtgeo.models.exporters.request import ExportError, Request
+from vggtgeo.models.exporters.request import Request
 from vggtgeo.models.onnx.contracts import CONTRACTS, HALF_TOLERANCE, relative_difference
 
 pytestmark = [
@@ -159,6 +159,6 @@ def test_an_error_in_a_change_is_seen(
         right = dinov3._last_attention
         flat = lambda block, tokens, rope: right(block, tokens, (0 * rope[0], 0 * rope[1] + 1))
         monkeypatch.setattr(dinov3, "_last_attention", flat)
-    with raises("the changed module", error=ExportError):
+    with raises("the changed module"):
         export(recipe_of(network), request_of(network, checkouts), tmp_path / "file.onnx")
     assert list(tmp_path.iterdir()) == []

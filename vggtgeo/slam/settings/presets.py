@@ -19,7 +19,7 @@ from typing import Any, get_args
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_positive, path_of
-from vggtgeo.io.network_files import as_input_errors, networks_folder
+from vggtgeo.io.network_files import networks_folder
 from vggtgeo.models.classical import ConstantVelocity, OrbMatcher
 from vggtgeo.models.onnx.bounds import (
     BoundedConfidence,
@@ -189,19 +189,18 @@ def perception(
         return Perception(classical, {})
     needed, place = _files(parts), networks_folder(folder)
     _check_present(needed, place)
-    with as_input_errors():
-        networks = {
-            name: open_session(
-                place / NETWORKS[name].file,
-                NETWORKS[name].contract,
-                provider=provider,
-                memory_limit_gb=memory_limit_gb,
-            )
-            for name in needed
-        }
-        players, refusals = _players(parts, classical, networks, cache)
-        for session in networks.values():
-            session.warm_up()
+    networks = {
+        name: open_session(
+            place / NETWORKS[name].file,
+            NETWORKS[name].contract,
+            provider=provider,
+            memory_limit_gb=memory_limit_gb,
+        )
+        for name in needed
+    }
+    players, refusals = _players(parts, classical, networks, cache)
+    for session in networks.values():
+        session.warm_up()
     return Perception(replace(classical, **players), networks, refusals)
 
 
