@@ -30,8 +30,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vggtgeo.models.exporters.recipes import RECIPES
-from vggtgeo.models.onnx.file_checks import NetworkFileError
-from vggtgeo.models.onnx.providers import CUDA_OPTIONS, NAMES, check_started, choose_provider, load_cuda_libraries
+from vggtgeo.models.onnx.contracts import NetworkFileError
+from vggtgeo.models.onnx.session import CUDA_OPTIONS, NAMES, choose_provider, load_cuda_libraries, used_device
 
 from vggtgeo.slam.settings.presets import NEEDED
 
@@ -177,7 +177,7 @@ def measure(file: Path, threads: int, provider: str) -> dict:
         if provider == "cuda":
             load_cuda_libraries()
         session = onnxruntime.InferenceSession(str(file), options, providers=PROVIDERS[provider])
-        check_started(provider, provider, "cuda" if NAMES["cuda"] in session.get_providers() else "cpu")
+        used_device(session, provider, provider)
         with np.load(f"{file}.parity.npz") as parity:
             inputs = {value.name: parity[f"input.{value.name}"] for value in session.get_inputs()}
         session.run(None, inputs)

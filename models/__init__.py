@@ -1,1 +1,1 @@
-"""The perception roles: their protocols (`roles`), classical code (`classical`) and simulated models (`stubs`)."""
+"""The perception roles: their protocols (`roles`), classical code (`classical`) and networks (`onnx`, `exporters`)."""

@@ -148,12 +148,6 @@ class RelativeView:
     depths: np.ndarray | None = None
     error: float = 0.0
 
-    def __post_init__(self) -> None:
-        check_pose("pose", self.pose)
-        check_array("intrinsics", np.asarray(self.intrinsics), (4,))
-        if self.depths is not None:
-            check_array("depths", self.depths, (None, 2), finite=False)
-
 
 @dataclass(frozen=True)
 class LineMatches:
@@ -292,19 +286,6 @@ class PoseQuery:
     window_images: tuple[np.ndarray, ...] = ()
     window_poses: tuple[np.ndarray, ...] = ()
     window_depths: tuple[np.ndarray, ...] = ()
-
-    def __post_init__(self) -> None:
-        check_array("intrinsics", np.asarray(self.intrinsics), (4,))
-        check_array("points", self.points, (None, 3))
-        check_array("pixels", self.pixels, (len(self.points), 2))
-        check_confidence("confidence", self.confidence, (len(self.points),))
-        if self.predicted is not None:
-            check_pose("predicted", self.predicted)
-        if len(self.window_images) != len(self.window_poses):
-            raise ValueError(
-                f"`window_images` has {len(self.window_images)} entries and `window_poses` "
-                f"{len(self.window_poses)}; give one pose for each image"
-            )
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_array, check_fields, check_image
+from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.nearest import mutual_nearest, unit
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
 
@@ -47,11 +47,22 @@ class BandLineMatcher:
     ) -> LineMatches:
         """Return the matches from view i to view j; see `LineMatcher.match`."""
         similarity = features_i.descriptors @ features_j.descriptors.T
-        ends_i, ends_j = features_i.segments.endpoints, features_j.segments.endpoints
-        allowed = allowed_pairs(ends_i, ends_j, relative)
-        similarity[~allowed] = -np.inf
-        index_i, index_j, clarity = mutual_nearest(similarity, self.ratio, self.similarity)
-        return LineMatches(index_i, index_j, np.clip(1.0 - clarity**2, 0.05, 1.0))
+        return match_segments(similarity, features_i, features_j, relative, self.ratio, self.similarity)
+
+
+def match_segments(
+    similarity: np.ndarray,
+    features_i: LineFeatures,
+    features_j: LineFeatures,
+    relative: RelativeView | None,
+    ratio: float,
+    floor: float,
+) -> LineMatches:
+    """Return the mutual nearest neighbours by `similarity` [L_i, L_j], overwritten, that the geometry allows."""
+    allowed = allowed_pairs(features_i.segments.endpoints, features_j.segments.endpoints, relative)
+    similarity[~allowed] = -np.inf
+    index_i, index_j, clarity = mutual_nearest(similarity, ratio, floor)
+    return LineMatches(index_i, index_j, np.clip(1.0 - clarity**2, 0.05, 1.0))
 
 
 def _strips(gray: np.ndarray, endpoints: np.ndarray, width: int, samples: int = 24) -> np.ndarray:
@@ -223,7 +234,6 @@ def line_coefficients(endpoints: np.ndarray) -> np.ndarray:
     endpoints: float [L, 2, 2] = (segment, end, xy). a x + b y + c is then the signed distance of a pixel, positive
     to the right of the direction from end 0 to end 1 as the image shows it. Raises `ValueError` for ends that coincide.
     """
-    check_array("endpoints", endpoints, (None, 2, 2))
     start = endpoints[:, 0].astype(np.float64)
     along = endpoints[:, 1] - start
     length = np.linalg.norm(along, axis=1)
@@ -241,7 +251,6 @@ def sample_segments(endpoints: np.ndarray, spacing: float = 10.0) -> tuple[np.nd
     endpoints: float [L, 2, 2]. Returns index int [s], the segment of each sample; pixels float64 [s, 2]; and fraction
     float64 [s] in [0, 1], the position from end 0 to end 1. A segment of length l has floor(l / spacing) + 1.
     """
-    check_array("endpoints", endpoints, (None, 2, 2))
     along = (endpoints[:, 1] - endpoints[:, 0]).astype(np.float64)
     length = np.linalg.norm(along, axis=1)
     counts = np.floor(length / spacing + 1e-9).astype(np.int64) + 1

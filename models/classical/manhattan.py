@@ -14,7 +14,6 @@ from itertools import permutations, product
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_array
 from vggtgeo.models.classical.nearest import unit
 
 from vggtgeo.geometry import pinhole
@@ -59,7 +58,6 @@ class ManhattanEstimator:
         endpoints: float [L, 2, 2], pixels. intrinsics: float [4]. predicted: float [3, 3], frame -> camera; without it
         order and signs of the axes are arbitrary.
         """
-        check_array("endpoints", endpoints, (None, 2, 2))
         if len(endpoints) < 2 * self.least_segments:
             return None
         planes = _Planes.of(endpoints, np.asarray(intrinsics, float))

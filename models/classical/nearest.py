@@ -16,7 +16,7 @@ def mutual_nearest(
     """Return pairs that are each other's best and pass the ratio test.
 
     similarity: float [I, J], inner products of unit vectors; -inf where a pair is excluded. It is overwritten.
-    ratio: accept when distance(best) < ratio * distance(second), with distance^2 = 2 - 2 similarity (Lowe 2004).
+    ratio: accept when distance(best) < ratio * distance(second) (Lowe 2004).
     floor: minimum similarity of a pair.
 
     Returns index_i int [m], index_j int [m], and the distance ratio float [m] of each pair.
@@ -34,9 +34,14 @@ def mutual_nearest(
     index_j, best = best_j[index_i], best[index_i]
     similarity[index_i, index_j] = -np.inf
     second = similarity[index_i].max(axis=1, initial=-1.0)
-    clarity = np.sqrt(np.maximum(1.0 - best, 0.0) / np.maximum(1.0 - second, 1e-6))
+    clarity = distance_ratio(best, second)
     keep = clarity < ratio
     return index_i[keep], index_j[keep], clarity[keep]
+
+
+def distance_ratio(best: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the ratio of the best to the second-best distance of unit vectors; distance^2 = 2 - 2 similarity."""
+    return np.sqrt(np.maximum(1.0 - best, 0.0) / np.maximum(1.0 - second, 1e-6))
 
 
 def exclude_far(similarity: np.ndarray, predicted: np.ndarray, pixels: np.ndarray, radius: float) -> None:

@@ -12,8 +12,8 @@ from functools import cache, cached_property
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
-from vggtgeo.models.checks import check_array, check_fields, check_image
-from vggtgeo.models.classical.nearest import exclude_far, mutual_nearest
+from vggtgeo.models.checks import check_fields, check_image
+from vggtgeo.models.classical.nearest import distance_ratio, exclude_far, mutual_nearest
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
 from vggtgeo.models.roles import Features, PointMatches
@@ -51,23 +51,26 @@ class PixelMatcher:
         second: PixelDescriptors = features_j.descriptors
         similarity = first.vectors @ second.vectors.T
         if predicted is not None:
-            check_array("predicted", predicted, (len(features_i), 2), finite=False)
             exclude_far(similarity, predicted, features_j.pixels, self.radius)
         index_i, index_j, clarity = mutual_nearest(similarity, self.ratio)
         pixels_i, pixels_j = features_i.pixels[index_i], features_j.pixels[index_j]
-        keep = self.verifier.inliers(pixels_i, pixels_j)
-        matches = PointMatches(index_i, index_j, pixels_i, pixels_j, confidence_of(clarity)).select(keep)
-        return refined(self.refinement, first.gray, second.gray, matches)
+        matches = PointMatches(index_i, index_j, pixels_i, pixels_j, confidence_of(clarity))
+        return verified(matches, self.verifier, self.refinement, first.gray, second.gray)
 
 
-def refined(
-    refinement: PatchAlignment | None, gray_i: np.ndarray, gray_j: np.ndarray, found: PointMatches
+def verified(
+    matches: PointMatches,
+    verifier: EpipolarVerifier,
+    refinement: PatchAlignment | None,
+    gray_i: np.ndarray,
+    gray_j: np.ndarray,
 ) -> PointMatches:
-    """Return matches with targets refined to sub-pixels in two images, uint8 [H, W], if `refinement` is given."""
-    if refinement is None or not len(found):
-        return found
-    targets, _ = refinement.refine(gray_i, gray_j, found.pixels_i, found.pixels_j)
-    return replace(found, pixels_j=targets)
+    """Return the matches that the verifier accepts, with targets refined to sub-pixels in two images, uint8 [H, W]."""
+    matches = matches.select(verifier.inliers(matches.pixels_i, matches.pixels_j))
+    if refinement is None or not len(matches):
+        return matches
+    targets, _ = refinement.refine(gray_i, gray_j, matches.pixels_i, matches.pixels_j)
+    return replace(matches, pixels_j=targets)
 
 
 def confidence_of(clarity: np.ndarray) -> np.ndarray:
@@ -225,7 +228,7 @@ def search_near(
     order = np.argsort(-alike, axis=1)
     rows = np.arange(len(index))
     best, next_best = alike[rows, order[:, 0]], alike[rows, order[:, 1]]
-    clarity = np.sqrt(np.maximum(1.0 - best, 0.0) / np.maximum(1.0 - next_best, 1e-6))
+    clarity = distance_ratio(best, next_best)
     good = np.nonzero((best > similarity) & (clarity < ratio))[0]
     good = good[np.argsort(-best[good], kind="stable")]
     target = near[good, order[good, 0]]

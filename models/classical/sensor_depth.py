@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_array, check_fields, check_image
+from vggtgeo.models.checks import check_array, check_fields
 from vggtgeo.models.roles import DepthEstimate
 
 
@@ -48,7 +48,6 @@ class SensorDepth:
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
         """Return the sensor's depth with its noise; nothing anywhere when `sensor_depth` is None."""
-        check_image("image", image)
         if sensor_depth is None:
             return no_depth(image.shape[:2])
         check_array("sensor_depth", sensor_depth, image.shape[:2], finite=False)
@@ -87,7 +86,6 @@ class NoDepth:
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
         """Return NaN everywhere, whatever the sensor says."""
-        check_image("image", image)
         return no_depth(image.shape[:2])
 
 

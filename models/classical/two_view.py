@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.checks import check_array
 from vggtgeo.models.classical.verification import SampleOrder
 from vggtgeo.models.roles import GeometryResult, StartGuess
 
@@ -40,13 +39,14 @@ class TwoViewStart:
 
     def start(self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray) -> StartGuess:
         """Return motion and structure from matches float [n, 2] each; see `InitialGeometry.start`."""
-        check_array("pixels_i", pixels_i, (None, 2))
-        check_array("pixels_j", pixels_j, (len(pixels_i), 2))
         if len(pixels_i) < self.least:
             return _failed(len(pixels_i), GeometryResult.TOO_FEW_MATCHES)
         rays_i, rays_j = _rays(pixels_i, intrinsics), _rays(pixels_j, intrinsics)
-        essential, agrees = self._essential(pixels_i, pixels_j, intrinsics)
-        if essential is None:
+        settings = (cv2.USAC_MAGSAC, self.confidence, self.threshold, self.max_iterations)
+        matrix = pinhole.matrix(intrinsics)
+        essential, agrees = self.order.estimate(cv2.findEssentialMat, pixels_i, pixels_j, matrix, *settings)
+        # For degenerate points there may be several matrices, stacked.
+        if essential is None or essential.shape != (3, 3) or not np.isfinite(essential).all():
             return _failed(len(pixels_i), GeometryResult.DEGENERATE)
         pose = _motion(essential, rays_i[agrees], rays_j[agrees])
         points, inliers = _triangulate(pose, rays_i, rays_j, agrees)
@@ -75,18 +75,12 @@ class TwoViewStart:
         self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray
     ) -> list[np.ndarray]:
         """Return the motions, at most two, of the homography of most matches whose plane is in front of the camera."""
-        order = self.order.of(len(pixels_i))
-        first, second = (np.ascontiguousarray(pixels[order], np.float64) for pixels in (pixels_i, pixels_j))
-        try:
-            homography, mask = cv2.findHomography(
-                first, second, cv2.USAC_MAGSAC, self.threshold, None, self.max_iterations, self.confidence
-            )
-            if homography is None:
-                return []
-            _, *found = cv2.decomposeHomographyMat(homography, pinhole.matrix(intrinsics))
-        except cv2.error:
+        settings = (cv2.USAC_MAGSAC, self.threshold, None, self.max_iterations, self.confidence)
+        homography, agrees = self.order.estimate(cv2.findHomography, pixels_i, pixels_j, *settings)
+        if homography is None:
             return []
-        rays = pinhole.rays(first[mask.ravel() > 0], intrinsics)
+        _, *found = cv2.decomposeHomographyMat(homography, pinhole.matrix(intrinsics))
+        rays = pinhole.rays(np.asarray(pixels_i[agrees], np.float64), intrinsics)
         motions = []
         for rotation, translation, normal in zip(*found, strict=True):
             in_front = np.count_nonzero(rays @ normal.ravel() > 0) > 0.5 * len(rays)
@@ -94,26 +88,6 @@ class TwoViewStart:
                 motions.append(np.eye(4))
                 motions[-1][:3, :3], motions[-1][:3, 3] = rotation, translation.ravel()
         return motions
-
-    def _essential(
-        self, pixels_i: np.ndarray, pixels_j: np.ndarray, intrinsics: np.ndarray
-    ) -> tuple[np.ndarray | None, np.ndarray]:
-        order = self.order.of(len(pixels_i))
-        try:
-            essential, mask = cv2.findEssentialMat(
-                np.ascontiguousarray(pixels_i[order], dtype=np.float64),
-                np.ascontiguousarray(pixels_j[order], dtype=np.float64),
-                pinhole.matrix(intrinsics),
-                cv2.USAC_MAGSAC,
-                self.confidence,
-                self.threshold,
-                self.max_iterations,
-            )
-        except cv2.error:
-            return None, np.zeros(len(pixels_i), dtype=bool)
-        if essential is None or essential.shape != (3, 3) or not np.isfinite(essential).all():
-            return None, np.zeros(len(pixels_i), dtype=bool)
-        return essential, self.order.undone(mask.ravel().astype(bool))
 
     def _only_turned(self, rays_i: np.ndarray, rays_j: np.ndarray, intrinsics: np.ndarray) -> bool:
         """Return whether a rotation alone maps half of the rays of i onto those of j to within the threshold."""

@@ -44,6 +44,23 @@ class SampleOrder:
         own[self.of(len(values))] = values
         return own
 
+    def estimate(
+        self, estimator: Callable[..., Any], pixels_i: np.ndarray, pixels_j: np.ndarray, *settings: Any
+    ) -> tuple[Any, np.ndarray]:
+        """Return the model of an OpenCV estimator and its inliers among the matches [m, 2] -> [m, 2], bool [m].
+
+        None and no inliers for degenerate points (all equal, collinear).
+        """
+        rows = self.of(len(pixels_i))
+        first, second = (np.ascontiguousarray(pixels[rows], np.float64) for pixels in (pixels_i, pixels_j))
+        try:
+            model, mask = estimator(first, second, *settings)
+        except cv2.error:
+            model = mask = None
+        if mask is None or mask.size != len(first):
+            return None, np.zeros(len(first), dtype=bool)
+        return model, self.undone(mask.ravel().astype(bool))
+
 
 def in_order(role: Role, order: SampleOrder) -> Role:
     """Return a role, with all its parts, with another order of samples."""
@@ -80,32 +97,23 @@ class EpipolarVerifier:
 
     def inliers(self, pixels_i: np.ndarray, pixels_j: np.ndarray) -> np.ndarray:
         """Return which of the matches [m, 2] -> [m, 2] agree, bool [m]; all False if there are too few."""
+        none = np.zeros(len(pixels_i), dtype=bool)
         if len(pixels_i) < self.least:
-            return np.zeros(len(pixels_i), dtype=bool)
-        order = self.order.of(len(pixels_i))
-        first, second = (np.ascontiguousarray(pixels[order], np.float64) for pixels in (pixels_i, pixels_j))
-        return self.order.undone(self._inliers(first, second))
-
-    def _inliers(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        epipolar = self._epipolar(first, second)
-        # A well determined epipolar geometry needs no homography, which costs as much again.
-        if np.count_nonzero(epipolar) >= 0.7 * len(first):
-            return epipolar
-        homography = self._homography(first, second)
-        best = homography if _adds_nothing(epipolar, homography) else epipolar
-        return best if np.count_nonzero(best) >= self.least else np.zeros(len(first), dtype=bool)
-
-    def _epipolar(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+            return none
         if self.intrinsics is None:
-            settings = (cv2.USAC_MAGSAC, self.threshold, self.confidence, self.max_iterations)
-            return _agreeing(cv2.findFundamentalMat, first, second, *settings)
-        matrix = pinhole.matrix(self.intrinsics)
-        settings = (cv2.USAC_MAGSAC, self.confidence, self.threshold, self.max_iterations)
-        return _agreeing(cv2.findEssentialMat, first, second, matrix, *settings)
-
-    def _homography(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+            settings: tuple[Any, ...] = (cv2.USAC_MAGSAC, self.threshold, self.confidence, self.max_iterations)
+            _, epipolar = self.order.estimate(cv2.findFundamentalMat, pixels_i, pixels_j, *settings)
+        else:
+            matrix = pinhole.matrix(self.intrinsics)
+            settings = (matrix, cv2.USAC_MAGSAC, self.confidence, self.threshold, self.max_iterations)
+            _, epipolar = self.order.estimate(cv2.findEssentialMat, pixels_i, pixels_j, *settings)
+        # A well determined epipolar geometry needs no homography, which costs as much again.
+        if np.count_nonzero(epipolar) >= 0.7 * len(pixels_i):
+            return epipolar
         settings = (cv2.USAC_MAGSAC, self.threshold, None, self.max_iterations, self.confidence)
-        return _agreeing(cv2.findHomography, first, second, *settings)
+        _, homography = self.order.estimate(cv2.findHomography, pixels_i, pixels_j, *settings)
+        best = homography if _adds_nothing(epipolar, homography) else epipolar
+        return best if np.count_nonzero(best) >= self.least else none
 
 
 def _adds_nothing(epipolar: np.ndarray, homography: np.ndarray) -> bool:
@@ -115,16 +123,3 @@ def _adds_nothing(epipolar: np.ndarray, homography: np.ndarray) -> bool:
     """
     extra = np.count_nonzero(epipolar & ~homography)
     return bool(extra < 0.15 * np.count_nonzero(~homography))
-
-
-def _agreeing(
-    estimate: Callable[..., tuple[Any, np.ndarray | None]], first: np.ndarray, second: np.ndarray, *settings: Any
-) -> np.ndarray:
-    """Return the inliers of an OpenCV estimator, bool [m]; none for degenerate points (all equal, collinear)."""
-    try:
-        mask = estimate(first, second, *settings)[1]
-    except cv2.error:
-        mask = None
-    if mask is None or mask.size != len(first):
-        return np.zeros(len(first), dtype=bool)
-    return mask.ravel().astype(bool)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,34 +22,30 @@ from vggtgeo.models.exporters.request import load
 
 
 @contextmanager
-def attention_replaced(make: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Iterator[None]:
-    """Replace torch's own attention by `make` of it, in the block."""
+def attention_replaced(attention: Callable[..., Any]) -> Iterator[None]:
+    """Replace torch's own attention in the block; `attention` takes the original function and its arguments."""
     functional = load("torch").nn.functional
     original = functional.scaled_dot_product_attention
-    functional.scaled_dot_product_attention = make(original)
+    functional.scaled_dot_product_attention = partial(attention, original)
     try:
         yield
     finally:
         functional.scaled_dot_product_attention = original
 
 
-def in_parts(queries: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def in_parts(queries: int) -> Callable[..., Any]:
     """Compute the same sums, for so many queries at a time; for `attention_replaced`.
 
     onnxruntime holds the weights of all pairs of tokens at once: of VGGT's 10 views of 392 x 518 pixels 7 GB a layer.
     A query's answer depends on no other query.
     """
+    torch = load("torch")
 
-    def make(original: Callable[..., Any]) -> Callable[..., Any]:
-        torch = load("torch")
+    def attention(original: Callable[..., Any], query: Any, key: Any, value: Any, *others: Any, **named: Any) -> Any:
+        parts = [original(part, key, value, *others, **named) for part in query.split(queries, dim=-2)]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-2)
 
-        def attention(query: Any, key: Any, value: Any, *others: Any, **named: Any) -> Any:
-            parts = [original(part, key, value, *others, **named) for part in query.split(queries, dim=-2)]
-            return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-2)
-
-        return attention
-
-    return make
+    return attention
 
 
 def fix_positions(rope: Any, positions: np.ndarray, head_size: int, base: float) -> None:

@@ -32,14 +32,11 @@ def build(request: Request) -> Graph:
     image = request.random_images(-_DEVIATIONS, _DEVIATIONS)
     recorded: list[tuple[Any, Any]] = []
 
-    def recording(original: Callable[..., Any]) -> Callable[..., Any]:
-        def attention(query: Any, key: Any, *others: Any, **named: Any) -> Any:
-            recorded[:] = [(query, key)]
-            return original(query, key, *others, **named)
+    def recorded_attention(original: Callable[..., Any], query: Any, key: Any, *others: Any, **named: Any) -> Any:
+        recorded[:] = [(query, key)]
+        return original(query, key, *others, **named)
 
-        return attention
-
-    with torch.inference_mode(), attention_replaced(recording):
+    with torch.inference_mode(), attention_replaced(recorded_attention):
         descriptors = network.forward_features(torch.from_numpy(image))["x_norm_patchtokens"]
         attention = _attention(*recorded[-1])
     published = {"patch_descriptors": descriptors.numpy(), "attention": attention.numpy()}

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from vggtgeo.models.exporters.recipes import Recipe
-from vggtgeo.models.exporters.request import ExportError, Graph, Request, evaluate, load
+from vggtgeo.models.exporters.request import Graph, Request, evaluate, load
 from vggtgeo.models.exporters.weights import identity, read_checkpoint
 from vggtgeo.models.onnx.contracts import (
     CONTRACTS,
@@ -38,6 +38,7 @@ from vggtgeo.models.onnx.contracts import (
     relative_difference,
 )
 
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.peak_memory import peak_memory_gb
 
 OPSET = 20
@@ -70,19 +71,19 @@ def export(
     recipe: Recipe,
     request: Request,
     output: Path,
-    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
     tolerance: float | None = None,
 ) -> Report:
-    """Write the network as `output` (.onnx); `say` receives progress messages.
+    """Write the network as `output` (.onnx); `progress` receives messages.
 
     tolerance: largest difference that is accepted; None for `TOLERANCE` or `HALF_TOLERANCE`.
 
-    Raises `ExportError` if something given does not fit, or if the file does not give what PyTorch gives: then
+    Raises `InputError` if something given does not fit, or if the file does not give what PyTorch gives: then
     nothing is written.
     """
     started = time.perf_counter()
     if output.suffix != ".onnx" or output.is_dir():
-        raise ExportError(f"`--output` is {output}, expected the name of a file that ends in .onnx")
+        raise InputError(f"`--output` is {output}, expected the name of a file that ends in .onnx")
     recipe.checkout.root(request.source)
     for package in ("torch", "onnx", "onnxscript", "onnxruntime"):  # before any work begins
         load(package)
@@ -97,10 +98,10 @@ def export(
         written = folder / output.name
         properties = _properties(recipe, request, weights)
         with _quiet():
-            inputs, outputs, parameters, rewrite = _write(recipe, request, written, properties, tolerance, say)
-        say("checking the file")
+            inputs, outputs, parameters, rewrite = _write(recipe, request, written, properties, tolerance, progress)
+        progress("checking the file")
         load("onnx").checker.check_model(str(written), full_check=True)
-        say("running it in onnxruntime")
+        progress("running it in onnxruntime")
         found, latency = _run(written, inputs, list(outputs))
         parity = _compare("onnxruntime", found, outputs, tolerance)
         record: dict[str, Any] = {f"input.{name}": array for name, array in inputs.items()}
@@ -122,19 +123,19 @@ def _write(
     path: Path,
     properties: Mapping[str, str],
     tolerance: float,
-    say: Callable[[str], None],
+    progress: Callable[[str], None],
 ) -> tuple[_Arrays, _Arrays, int, float]:
     """Build, compare with the published code, and write. On return the torch module's weights are gone from memory.
 
     Return inputs, PyTorch's outputs, number of weights, and difference of the changed module from the published one.
     """
-    say(f"building {recipe.network} ({request.variant}) from {request.source}")
+    progress(f"building {recipe.network} ({request.variant}) from {request.source}")
     graph = recipe.build(request)
     names = _output_names(recipe.network, graph)
-    say("comparing with the published code in PyTorch")
+    progress("comparing with the published code in PyTorch")
     values = evaluate(graph.module, graph.inputs, names)
     rewrite = _compare("the changed module", values, graph.published, tolerance)
-    say("exporting")
+    progress("exporting")
     parameters = _save(graph, names, path, properties)
     _free(graph.module)
     return graph.inputs, values, parameters, rewrite
@@ -147,7 +148,7 @@ def _output_names(network: str, graph: Graph) -> tuple[str, ...]:
     known = {tensor.name for tensor in contract.outputs}
     names = tuple(graph.published)
     if not needed <= set(names) <= known:
-        raise ExportError(
+        raise InputError(
             f"{network} gives {', '.join(names)}, expected {', '.join(sorted(needed))}; is this checkpoint of the "
             "version with all of these heads?"
         )
@@ -208,12 +209,12 @@ def _run(path: Path, inputs: _Arrays, names: list[str]) -> tuple[_Arrays, float]
 
 
 def _compare(who: str, found: _Arrays, wanted: _Arrays, tolerance: float) -> float:
-    """Return the largest difference; raise `ExportError` above `tolerance`, for NaN, or for another shape."""
+    """Return the largest difference; raise `InputError` above `tolerance`, for NaN, or for another shape."""
     largest = 0.0
     for name, reference in wanted.items():
         gap = relative_difference(found[name], reference)
         if not gap <= tolerance:
-            raise ExportError(
+            raise InputError(
                 f"`{name}` of {who} differs from PyTorch by {gap:.2g}, expected at most {tolerance:g}; nothing was "
                 "written; raise `--tolerance` if that will do, and report it with the versions of torch and onnxruntime"
             )

@@ -14,12 +14,16 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+from types import ModuleType
 from typing import Any
 from unittest import mock
 
 from vggtgeo.models.exporters.attention import halve_blocks
-from vggtgeo.models.exporters.request import ExportError, Graph, Request, as_module, load, stand_in
+from vggtgeo.models.exporters.request import Graph, Request, as_module, load
 from vggtgeo.models.exporters.weights import fill, read_checkpoint
+
+from vggtgeo.io.errors import InputError
 
 _BLOCKS = {"vits": 12, "vitb": 12, "vitl": 24}
 _CHANNELS = {"vits": 384, "vitb": 768, "vitl": 1024}
@@ -32,7 +36,8 @@ def build(request: Request) -> Graph:
     torch = load("torch")
     configuration = _configuration(request)
     without_xformers = mock.patch.dict(os.environ, {"XFORMERS_DISABLED": "1"})
-    with request.code() as imported, stand_in("utils3d"), without_xformers:
+    sys.modules.setdefault("utils3d", ModuleType("utils3d"))
+    with request.code() as imported, without_xformers:
         network = imported("moge.model.v2").MoGeModel(**configuration)
     fill(network, request, f"MoGe-2 {configuration['encoder']['backbone']}")
     image = request.random_images(0.0, 1.0)
@@ -55,14 +60,14 @@ def _configuration(request: Request) -> dict[str, Any]:
     if request.checkpoint is not None:
         configuration = read_checkpoint(request.checkpoint).get("model_config")
         if not isinstance(configuration, dict):
-            raise ExportError(
+            raise InputError(
                 f"`--checkpoint` {request.checkpoint} holds no `model_config`, expected the published MoGe-2 file "
                 "(model.pt), which has its options and its weights"
             )
         return configuration
     path = request.checkout.root(request.source) / _CONFIGURATION
     if not path.is_file():
-        raise ExportError(
+        raise InputError(
             f"`--source` {request.source}: no `{_CONFIGURATION}` in it, from which random weights are "
             "made; update the checkout"
         )

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from vggtgeo.models.exporters import convolutional, dinov3, letr, mast3r, moge2, vggt
-from vggtgeo.models.exporters.request import Checkout, ExportError, Graph, Request
+from vggtgeo.models.exporters import dinov3, line_detectors, moge2, point_matchers, vggt
+from vggtgeo.models.exporters.request import Checkout, Graph, Request
+
+from vggtgeo.io.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -43,24 +45,23 @@ class Recipe:
         half: bool = False,
         allow_extra: bool = False,
     ) -> Request:
-        """Return the request with defaults filled in; `ExportError` for what this network cannot be."""
+        """Return the request with defaults filled in; `InputError` for what this network cannot be."""
         height, width = height or self.size[0], width or self.size[1]
         for option, size, default in zip(("--height", "--width"), (height, width), self.size, strict=True):
-            if option in self.fixed and size != default:
-                raise ExportError(f"`{option}` is {size}; {self.network} takes {default} alone, leave it out")
-            if size < 1 or size % self.multiple:
-                near = max(self.multiple, round(size / self.multiple) * self.multiple)
-                raise ExportError(
-                    f"`{option}` is {size}; {self.network} takes multiples of {self.multiple}: {near}, for instance"
-                )
+            if size < 1 or size % self.multiple or (option in self.fixed and size != default):
+                allowed = f"{default} alone" if option in self.fixed else f"multiples of {self.multiple}"
+                raise InputError(f"`{option}` is {size}; {self.network} takes {allowed}")
+        for option, value, default in (("--views", views, self.views), ("--tokens", tokens, self.tokens)):
+            if value is not None and (value < 1 or not default):
+                raise InputError(f"`{option}` is {value}; {self.network} takes {'at least 1' if default else 'none'}")
         if variant is not None and variant not in self.variants:
-            raise ExportError(
+            raise InputError(
                 f"`--variant` {variant} is not known for {self.network}; expected one of {', '.join(self.variants)}"
             )
         if checkpoint is not None and variant == "test":
-            raise ExportError("`--variant` test is for tests, with `--random-weights`; no checkpoint fits it")
+            raise InputError("`--variant` test is for tests, with `--random-weights`; no checkpoint fits it")
         if half and not self.half:
-            raise ExportError(f"`--half` does nothing for {self.network}, which is small; leave it out")
+            raise InputError(f"`--half` does nothing for {self.network}, which is small; leave it out")
         return Request(
             checkout=self.checkout,
             source=source,
@@ -68,18 +69,11 @@ class Recipe:
             height=height,
             width=width,
             variant=variant or self.variants[0],
-            views=self._only_where("--views", views, self.views) or 1,
-            tokens=self._only_where("--tokens", tokens, self.tokens),
+            views=views or self.views or 1,
+            tokens=tokens or self.tokens,
             half=half,
             allow_extra=allow_extra,
         )
-
-    def _only_where(self, option: str, value: int | None, default: int) -> int:
-        if value is not None and not default:
-            raise ExportError(f"`{option}` means nothing to {self.network}; leave it out")
-        if value is not None and value < 1:
-            raise ExportError(f"`{option}` is {value}, expected at least 1")
-        return default if value is None else value
 
 
 _NEEDS = "install einops and huggingface-hub"
@@ -103,19 +97,19 @@ _ALL = (
     Recipe("vggt", _VGGT, vggt.build, ("1b", "test"), (392, 518), multiple=14, fixed=("--width",), views=4),
     Recipe("dinov3", _DINOV3, dinov3.build, ("vitl16", "vitb16", "vits16"), multiple=16),
     Recipe("moge2", _MOGE2, moge2.build, ("vitl", "vitb", "vits"), tokens=1800),
-    Recipe("letr", _LETR, letr.build, ("resnet50", "resnet101", "test"), half=False),
-    Recipe("mast3r_encoder", _MAST3R, mast3r.build_encoder, ("vitl", "test"), (384, 512), multiple=16),
-    Recipe("mast3r_decoder", _MAST3R, mast3r.build_decoder, ("vitl", "test"), (384, 512), multiple=16),
-    Recipe("alike", _ALIKE, convolutional.build_alike, ("normal", "tiny", "small", "large"), multiple=32, half=False),
-    Recipe("xfeat", _XFEAT, convolutional.build_xfeat, ("published",), multiple=32, half=False),
-    Recipe("mlsd", _MLSD, convolutional.build_mlsd, ("tiny",), (512, 512), fixed=("--height", "--width"), half=False),
+    Recipe("letr", _LETR, line_detectors.build_letr, ("resnet50", "resnet101", "test"), half=False),
+    Recipe("mast3r_encoder", _MAST3R, point_matchers.build_mast3r_encoder, ("vitl", "test"), (384, 512), multiple=16),
+    Recipe("mast3r_decoder", _MAST3R, point_matchers.build_mast3r_decoder, ("vitl", "test"), (384, 512), multiple=16),
+    Recipe("alike", _ALIKE, point_matchers.build_alike, ("normal", "tiny", "small", "large"), multiple=32, half=False),
+    Recipe("xfeat", _XFEAT, point_matchers.build_xfeat, ("published",), multiple=32, half=False),
+    Recipe("mlsd", _MLSD, line_detectors.build_mlsd, ("tiny",), (512, 512), fixed=("--height", "--width"), half=False),
 )
 RECIPES = {recipe.network: recipe for recipe in _ALL}
 """Every network that can be exported, by the name of its contract."""
 
 
 def recipe_of(network: str) -> Recipe:
-    """Return the recipe of `network`; `ExportError` with the names there are."""
+    """Return the recipe of `network`; `InputError` with the names there are."""
     if network not in RECIPES:
-        raise ExportError(f"`NAME` is {network!r}, expected one of {', '.join(RECIPES)}")
+        raise InputError(f"`NAME` is {network!r}, expected one of {', '.join(RECIPES)}")
     return RECIPES[network]

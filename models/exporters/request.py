@@ -4,33 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import io
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from vggtgeo.io.errors import install_hint
-
-
-class ExportError(ValueError):
-    """A checkout, a checkpoint or a size does not fit the network; the message says what, and what to do."""
+from vggtgeo.io.errors import InputError, install_hint
 
 
 def load(name: str) -> Any:
-    """Return the package `name`; raise `ExportError` naming the extra if it, or a dependency, is missing."""
+    """Return the package `name`; raise `InputError` naming the extra if it, or a dependency, is missing."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise ExportError(
+        raise InputError(
             f"exporting needs the package `{error.name}`, which is not installed; {install_hint('export')}"
         ) from None
 
@@ -51,12 +42,12 @@ class Checkout:
     hint: str = ""
 
     def root(self, source: Path) -> Path:
-        """Return the folder to import from; raises `ExportError` if `source` is no such checkout."""
+        """Return the folder to import from; raises `InputError` if `source` is no such checkout."""
         for folder in self.roots:
             if (source / folder / self.marker).is_file():
                 return (source / folder).resolve()
         found = "no such folder" if not source.is_dir() else f"no `{self.marker}` in it"
-        raise ExportError(
+        raise InputError(
             f"`--source` {source}: {found}; expected a checkout of {self.repository}: "
             f"git clone https://github.com/{self.repository}"
         )
@@ -69,8 +60,11 @@ class Checkout:
         return None
 
     @contextlib.contextmanager
-    def importable(self, source: Path) -> Iterator[None]:
-        """Import `packages` from the checkout and from nowhere else, in the block."""
+    def importable(self, source: Path) -> Iterator[Callable[[str], Any]]:
+        """Import `packages` from the checkout and from nowhere else, in the block; give a function that imports one.
+
+        It raises `InputError` if something that the module imports is missing.
+        """
         root = self.root(source)
         search_path = list(sys.path)
         for name in [name for name in sys.modules if name.split(".")[0] in self.packages]:
@@ -78,19 +72,17 @@ class Checkout:
         # a namespace package (croco's `models`, say) loses against any regular one of its name later on the path
         sys.path[:] = [str(root), *(entry for entry in search_path if not _provides(entry, self.packages))]
         importlib.invalidate_caches()
+
+        def imported(module: str) -> Any:
+            try:
+                return importlib.import_module(module)
+            except ImportError as error:
+                raise InputError(f"`--source` {source}: importing `{module}` failed: {error}; {self.hint}") from None
+
         try:
-            with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-                warnings.simplefilter("ignore")
-                yield
+            yield imported
         finally:
             sys.path[:] = search_path
-
-    def import_from(self, source: Path, module: str) -> Any:
-        """Return the module, inside `importable`; raise `ExportError` if something that it imports is missing."""
-        try:
-            return importlib.import_module(module)
-        except ImportError as error:
-            raise ExportError(f"`--source` {source}: importing `{module}` failed: {error}; {self.hint}") from None
 
     def revision(self, source: Path) -> str:
         """Return `repository@commit` of the checkout, the commit `unknown` outside git."""
@@ -105,27 +97,6 @@ class Checkout:
 def _provides(entry: str, packages: Sequence[str]) -> bool:
     folder = Path(entry or ".")
     return any((folder / name).is_dir() or (folder / f"{name}.py").is_file() for name in packages)
-
-
-@contextlib.contextmanager
-def stand_in(name: str, **attributes: Any) -> Iterator[None]:
-    """Let `import name` give an empty module with `attributes` in the block.
-
-    For packages that the published code imports at the top and does not need for the forward pass.
-    """
-    parts = [".".join(name.split(".")[: depth + 1]) for depth in range(name.count(".") + 1)]
-    previous = {part: sys.modules.pop(part, None) for part in parts}
-    sys.modules.update({part: ModuleType(part) for part in parts})
-    for parent, child in pairwise(parts):
-        setattr(sys.modules[parent], child.rsplit(".", 1)[1], sys.modules[child])
-    vars(sys.modules[name]).update(attributes)
-    try:
-        yield
-    finally:
-        for part, module in previous.items():
-            sys.modules.pop(part, None)
-            if module is not None:
-                sys.modules[part] = module
 
 
 @dataclass(frozen=True)
@@ -158,9 +129,9 @@ class Request:
     @contextlib.contextmanager
     def code(self) -> Iterator[Callable[[str], Any]]:
         """Give a function that imports modules of the checkout, in the block; torch's random numbers are fixed."""
-        with self.checkout.importable(self.source):
+        with self.checkout.importable(self.source) as imported:
             load("torch").manual_seed(self.seed)
-            yield partial(self.checkout.import_from, self.source)
+            yield imported
 
 
 @dataclass(frozen=True)

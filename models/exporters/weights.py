@@ -10,7 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.models.exporters.request import ExportError, Request, load
+from vggtgeo.models.exporters.request import Request, load
+
+from vggtgeo.io.errors import InputError
 
 _LONGEST = 2000
 """Characters of torch's error, which lists each wrong weight."""
@@ -21,30 +23,28 @@ _STATES = ("model", "state_dict", "teacher")
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Return the content of a PyTorch checkpoint, read without running code from it, mapped rather than copied.
 
-    Raises `ExportError` if it is not one.
+    Raises `InputError` if it is missing, or not one.
     """
     torch = load("torch")
-    expected = "expected the published weights, a .pt or .pth file that torch.save wrote"
-    if not path.is_file():
-        raise ExportError(f"`--checkpoint` {path}: no such file; {expected}")
-    with path.open("rb") as handle:
-        is_zip = handle.read(2) == b"PK"  # files of old versions of torch are not, and cannot be mapped
     try:
+        with path.open("rb") as handle:
+            is_zip = handle.read(2) == b"PK"  # files of old versions of torch are not, and cannot be mapped
         # some checkpoints keep their training options beside the weights
         with torch.serialization.safe_globals([argparse.Namespace]), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_zip)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError):  # its advice is to run what the file holds
-        raise ExportError(f"`--checkpoint` {path} cannot be read as a PyTorch checkpoint; {expected}") from None
-    if not isinstance(content, Mapping):
-        raise ExportError(f"`--checkpoint` {path} holds a {type(content).__name__}, expected a dictionary of weights")
-    return dict(content)
+        return dict(content)
+    # torch's message is left out: its advice is to run what the file holds.
+    except (RuntimeError, TypeError, ValueError, pickle.UnpicklingError, EOFError, OSError):
+        raise InputError(
+            f"`--checkpoint` {path} cannot be read, expected the published weights: a dictionary in a .pt or .pth file"
+        ) from None
 
 
 def fill(module: Any, request: Request, fits: str) -> None:
     """Load the request's checkpoint into `module`, or make its random weights tell errors apart.
 
-    fits: what the module is, for the message. Raises `ExportError` unless names and shapes of the weights agree
+    fits: what the module is, for the message. Raises `InputError` unless names and shapes of the weights agree
     exactly; with `request.allow_extra`, weights that the module has no place for are left out, as the published code of
     some networks does.
     """
@@ -59,7 +59,7 @@ def fill(module: Any, request: Request, fits: str) -> None:
         try:
             module.load_state_dict(weights, strict=True)
         except RuntimeError as error:  # names all that is missing, superfluous, or of another shape
-            raise ExportError(
+            raise InputError(
                 f"`--checkpoint` {request.checkpoint} does not hold the weights of {fits}: {str(error)[:_LONGEST]}; "
                 "give the checkpoint of this network and `--variant`, or allow superfluous ones by "
                 "`--allow-extra-weights`"

@@ -7,7 +7,7 @@ no segment, no view), and counted for the verdict. A network that fails to run s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -32,8 +32,9 @@ from vggtgeo.models.roles import (
     WindowGuess,
 )
 
+from vggtgeo.geometry.camera import Camera
+
 _Role = TypeVar("_Role")
-_Answer = TypeVar("_Answer")
 NEAREST, FARTHEST = 0.05, 100.0
 """Minimum and maximum depth of an indoor world, a sports hall included, metres."""
 AVERAGE = 0.5
@@ -59,6 +60,10 @@ class Refusals:
         self.refused += refused
         self.without += not left
 
+    def note_failure(self, values: int = 1) -> None:
+        """Count an answer that is not valid at all, of so many values."""
+        self.note(values, values, left=False)
+
     @property
     def share(self) -> float:
         """Return the rejected share, of answers or of values, whichever is larger."""
@@ -72,14 +77,6 @@ class _Bounded(Generic[_Role]):
     source: _Role
     refusals: Refusals = field(default_factory=Refusals)
 
-    def _asked(self, ask: Callable[[], _Answer], values: int = 1) -> _Answer | None:
-        """Return an answer; None, with so many values counted as refused, if the network gives none."""
-        try:
-            return ask()
-        except NetworkValueError:
-            self.refusals.note(values, values, left=False)
-            return None
-
 
 @dataclass(frozen=True, eq=False)
 class BoundedDepth(_Bounded[MetricDepth]):
@@ -91,8 +88,10 @@ class BoundedDepth(_Bounded[MetricDepth]):
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        found = self._asked(lambda: self.source.estimate(image, sensor_depth, intrinsics), image[..., 0].size)
-        if found is None:
+        try:
+            found = self.source.estimate(image, sensor_depth, intrinsics)
+        except NetworkValueError:
+            self.refusals.note_failure(image[..., 0].size)
             return no_depth(image.shape[:2])
         with np.errstate(invalid="ignore"):
             given = np.isfinite(found.depth)
@@ -114,13 +113,15 @@ class BoundedConfidence(_Bounded[DenseConfidence]):
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         average = np.full(image.shape[:2], AVERAGE, np.float32)
-        found = self._asked(lambda: self.source.confidence(image), average.size)
-        if found is None:
+        try:
+            found = self.source.confidence(image)
+        except NetworkValueError:
+            self.refusals.note_failure(average.size)
             return average
         with np.errstate(invalid="ignore"):
             good = np.isfinite(found) & (found >= 0) & (found <= 1)
         self.refusals.note(found.size, int(found.size - good.sum()), left=bool(good.any()))
-        return found if good.all() else np.where(good, found, average).astype(np.float32)
+        return np.where(good, found, average).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,13 +129,15 @@ class BoundedLines(_Bounded[LineDetector]):
     """A `LineDetector` with segments inside the image."""
 
     def detect(self, image: np.ndarray) -> Segments:
-        found = self._asked(lambda: self.source.detect(image))
-        if found is None:
+        try:
+            found = self.source.detect(image)
+        except NetworkValueError:
+            self.refusals.note_failure()
             return _NO_SEGMENTS
         inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
         good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
         self.refusals.note(len(found), int(len(found) - good.sum()), left=True)  # an image may have no line
-        return found if good.all() else Segments(found.endpoints[good], found.scores[good])
+        return Segments(found.endpoints[good], found.scores[good])
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +145,10 @@ class BoundedLineMatcher(_Bounded[LineMatcher]):
     """A `LineMatcher` without segments for an image on which its network failed."""
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
-        found = self._asked(lambda: self.source.describe(image, segments))
-        if found is None:
+        try:
+            found = self.source.describe(image, segments)
+        except NetworkValueError:
+            self.refusals.note_failure()
             return LineFeatures(_NO_SEGMENTS)
         self.refusals.note(1, 0, left=True)
         return found
@@ -161,14 +166,19 @@ class BoundedPoints(_Bounded[PointMatcher]):
     """A `PointMatcher` without matches if its network fails; bounds are checked by `PointMatches`."""
 
     def describe(self, image: np.ndarray) -> Features:
-        found = self._asked(lambda: self.source.describe(image))
-        return Features(np.zeros((0, 2)), np.zeros(0)) if found is None else found
+        try:
+            return self.source.describe(image)
+        except NetworkValueError:
+            self.refusals.note_failure()
+            return Features(np.zeros((0, 2)), np.zeros(0))
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
         if not (len(features_i) and len(features_j)):
             return PointMatches.none()
-        found = self._asked(lambda: self.source.match(features_i, features_j, predicted))
-        if found is None:
+        try:
+            found = self.source.match(features_i, features_j, predicted)
+        except NetworkValueError:
+            self.refusals.note_failure()
             return PointMatches.none()
         self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
         return found
@@ -179,16 +189,17 @@ class BoundedWindow(_Bounded[WindowGeometry]):
     """A `WindowGeometry` that fails for values that are not finite; views with values out of bounds are not found."""
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
-        count, size = len(images), images[0].shape[:2]
-        found = self._asked(lambda: self.source.window(images, intrinsics), count)
-        if found is None:
-            focal, (height, width) = float(max(size)), size
-            camera = np.array([focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)])
+        count, (height, width) = len(images), images[0].shape[:2]
+        try:
+            found = self.source.window(images, intrinsics)
+        except NetworkValueError:
+            self.refusals.note_failure(count)
+            camera = Camera.guess(width, height).intrinsics if intrinsics is None else intrinsics
             return WindowGuess(
                 np.tile(np.eye(4), (count, 1, 1)),
-                camera if intrinsics is None else np.asarray(intrinsics, np.float64),
-                np.full((count, *size), np.nan, np.float32),
-                np.zeros((count, *size), np.float32),
+                np.array(camera, np.float64),
+                np.full((count, height, width), np.nan, np.float32),
+                np.zeros((count, height, width), np.float32),
                 np.zeros(count, bool),
                 result=GeometryResult.DEGENERATE,
             )

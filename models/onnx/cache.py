@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -10,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from vggtgeo.models.onnx.providers import warn_once
-from vggtgeo.models.onnx.session import Session
+from vggtgeo.models.onnx.session import Session, warn_once
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.persistence import Format
@@ -66,14 +66,15 @@ class FolderCache:
         """Return an output as `MemoryCache.get`; networks are identified by the SHA-256 of their files."""
         key = key_of([session.digest for session in sessions], settings, images)
         path = self.folder / key[:2] / f"{key}.npz"
-        found = _read(path)
-        if found is None:
-            found = compute()
-            try:
-                _FORMAT.write(path, found)
-            except OSError as error:
-                reason = error.strerror or error
-                warn_once(f"network outputs cannot be cached in `{self.folder}` ({reason}); the run continues")
+        with contextlib.suppress(InputError, OSError):
+            kept: Outputs = _FORMAT.read(path)[0]
+            return kept
+        found = compute()
+        try:
+            _FORMAT.write(path, found)
+        except OSError as error:
+            reason = error.strerror or error
+            warn_once(f"network outputs cannot be cached in `{self.folder}` ({reason}); the run continues")
         return found
 
 
@@ -87,12 +88,3 @@ def key_of(networks: Sequence[str], settings: tuple[object, ...], images: Sequen
         total.update(repr((image.shape, image.dtype.str)).encode())
         total.update(np.ascontiguousarray(image).data)
     return total.hexdigest()
-
-
-def _read(path: Path) -> Outputs | None:
-    try:
-        found, _ = _FORMAT.read(path)
-    except (InputError, OSError):
-        return None
-    valid = isinstance(found, dict) and all(isinstance(values, np.ndarray) for values in found.values())
-    return found if valid else None

@@ -1,13 +1,4 @@
-"""Inputs and outputs of the ONNX file of each network, for exporters and adapters.
-
-| network | role | paper |
-|---|---|---|
-| `vggt` | geometry of a window | Wang et al., CVPR 2025 |
-| `dinov3` | descriptors and dense confidence | Siméoni et al., 2025 |
-| `moge2` | metric depth | Wang et al., 2025 |
-| `letr`, `mlsd` | line segments | Xu et al., CVPR 2021; Gu et al., AAAI 2022 |
-| `mast3r_encoder`, `mast3r_decoder` | point matches | Leroy et al., ECCV 2024 |
-| `alike`, `xfeat` | point matches | Zhao et al., IEEE TMM 2022; Potje et al., CVPR 2024 |
+"""Inputs and outputs of the ONNX file of each network, for exporters and adapters; checks of a file.
 
 Shapes are written as in a paper: a number is fixed, a letter is any size, equal at all its places, `Patches` is
 the number of tokens of an H x W image. A file may leave sizes open; those it fixes must agree.
@@ -15,9 +6,14 @@ the number of tokens of an H x W image. A file may leave sizes open; those it fi
 
 from __future__ import annotations
 
+import mmap
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
+
+from vggtgeo.io.errors import InputError
 
 METADATA_NETWORK = "vggtgeo.network"
 """Key of the file's metadata that names its network, one of `CONTRACTS`."""
@@ -224,6 +220,107 @@ XFEAT = Contract(
 _ALL = (VGGT, DINOV3, MOGE2, LETR, MLSD, MAST3R_ENCODER, MAST3R_DECODER, ALIKE, XFEAT)
 CONTRACTS = {contract.network: contract for contract in _ALL}
 """Every contract by its network's name."""
+
+
+class NetworkFileError(InputError):
+    """A network's file cannot be used; the message says what was expected, what was found, and what to do."""
+
+
+@dataclass(frozen=True)
+class Signature:
+    """An input or output as a file declares it; None in the shape is a size left open."""
+
+    shape: tuple[int | None, ...]
+    dtype: str
+
+    def __str__(self) -> str:
+        return f"[{', '.join('any' if size is None else str(size) for size in self.shape)}] {self.dtype}"
+
+
+Signatures = Mapping[str, Signature]
+
+
+def check_signature(path: Path, contract: Contract, inputs: Signatures, outputs: Signatures) -> None:
+    """Raise `NetworkFileError` unless the file's inputs and outputs are those of the contract."""
+    wrong = _faults(contract, inputs, outputs)
+    if wrong:
+        like = recognise(inputs, outputs)
+        hint = f"it looks like a file of `{like.network}`" if like else "export it again for this contract"
+        raise NetworkFileError(f"`{path}` is not a file of `{contract.network}`: {'; '.join(wrong)}; {hint}")
+
+
+def recognise(inputs: Signatures, outputs: Signatures) -> Contract | None:
+    """Return the contract that a file with this signature fulfils, or None."""
+    return next((contract for contract in _ALL if not _faults(contract, inputs, outputs)), None)
+
+
+def _faults(contract: Contract, inputs: Signatures, outputs: Signatures) -> list[str]:
+    found = {**inputs, **outputs}
+    missing = [t for t in (*contract.inputs, *contract.outputs) if not t.optional and t.name not in found]
+    unknown = set(inputs) - {tensor.name for tensor in contract.inputs}
+    wrong = [f"expected `{tensor}`, which is missing" for tensor in missing]
+    wrong += [f"the input `{name}` {inputs[name]} is unknown" for name in sorted(unknown)]
+    return wrong or wrong_shapes(contract, found)
+
+
+def wrong_shapes(contract: Contract, found: Signatures) -> list[str]:
+    """Return where types and sizes of a file, or of one run, depart from the contract; an open size fits any.
+
+    A size of 0 is wrong, but an image may have no line.
+    """
+    wrong = []
+    sizes: dict[Dimension, int] = {}
+    for tensor in (*contract.inputs, *contract.outputs):
+        have = found.get(tensor.name)
+        if have is None:
+            continue
+        if have.dtype not in tensor.dtypes or len(have.shape) != len(tensor.shape):
+            wrong.append(f"expected `{tensor}`, found {have}")
+            continue
+        for dimension, size in zip(tensor.shape, have.shape, strict=True):
+            if size is None:
+                continue
+            expected = dimension if isinstance(dimension, int) else sizes.setdefault(dimension, size)
+            if size != expected or (size == 0 and dimension != "Q"):
+                wrong.append(f"expected `{tensor}` with {dimension} = {expected}, found {have}")
+    for letter in ("H", "W"):
+        if sizes.get(letter, 0) % contract.multiple:
+            wrong.append(f"{letter} is {sizes[letter]}, expected a multiple of {contract.multiple}")
+    if {"H", "W"} <= sizes.keys():
+        tokens = {kind: kind.count(sizes["H"], sizes["W"]) for kind in sizes if isinstance(kind, Patches)}
+        wrong += [f"{kind} is {sizes[kind]}, expected {n}" for kind, n in tokens.items() if sizes[kind] != n]
+    return wrong
+
+
+def file_parts(path: Path) -> list[Path]:
+    """Return the file and the existing files of external data that its graph names, sorted by name."""
+    beside = {file.name: file for file in path.parent.iterdir() if file.is_file()}
+    return [path, *(beside[name] for name in sorted(set(_metadata(path, "location"))) if name in beside)]
+
+
+def has_random_weights(path: Path) -> bool:
+    """Return whether the file says that its weights were drawn at random, as an export for tests does."""
+    return RANDOM_WEIGHTS in _metadata(path, METADATA_WEIGHTS)
+
+
+def _metadata(path: Path, key: str) -> list[str]:
+    """Return the values of all entries with this key, of metadata or external data, without loading the weights.
+
+    An entry is a protobuf message of a key (field 1) and a value (field 2), both text: a search for the key with its
+    tags and length suffices. A value is shorter than 128 bytes: its length is one byte.
+    """
+    mark = b"\x0a" + bytes([len(key)]) + key.encode() + b"\x12"
+    if not path.stat().st_size:  # an empty file cannot be mapped
+        return []
+    found = []
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        place = content.find(mark)
+        while place >= 0:
+            start = place + len(mark)
+            length = content[start] if start < len(content) else 0
+            found.append(content[start + 1 : start + 1 + length].decode(errors="replace"))
+            place = content.find(mark, start)
+    return found
 
 
 def relative_difference(found: np.ndarray, reference: np.ndarray) -> float:

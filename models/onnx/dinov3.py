@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields, check_image
-from vggtgeo.models.classical.lines import allowed_pairs
-from vggtgeo.models.classical.nearest import mutual_nearest, unit
+from vggtgeo.models.checks import check_fields
+from vggtgeo.models.classical.lines import match_segments
+from vggtgeo.models.classical.nearest import unit
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import DINOV3
-from vggtgeo.models.onnx.fit import Fit
+from vggtgeo.models.onnx.fit import Fit, vectors_at
 from vggtgeo.models.onnx.session import NetworkValueError, Session
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
 
@@ -19,33 +19,9 @@ PREFIX = 5
 """Tokens before the patches: the class token and four registers."""
 
 
-@dataclass(frozen=True)
-class DescriptorGrid:
-    """Unit descriptors of patches, float32 [h, w, C], and the fit of the image."""
-
-    grid: np.ndarray
-    fit: Fit
-    patch: int
-
-    def at(self, pixels: np.ndarray) -> np.ndarray:
-        """Return descriptors float32 [n, C], of unit length, at image pixels float [n, 2]: bilinear between patch
-        centres.
-        """
-        place = (self.fit.to_network(np.asarray(pixels, np.float64)) + 0.5) / self.patch - 0.5
-        height, width = self.grid.shape[:2]
-        place = np.clip(place, 0.0, [width - 1, height - 1])
-        low = np.minimum(place.astype(np.int64), np.maximum([width - 2, height - 2], 0))
-        high = np.minimum(low + 1, [width - 1, height - 1])
-        part = (place - low).astype(np.float32)
-        (x0, y0), (x1, y1), (fx, fy) = low.T, high.T, part.T[..., None]
-        top = (1 - fx) * self.grid[y0, x0] + fx * self.grid[y0, x1]
-        bottom = (1 - fx) * self.grid[y1, x0] + fx * self.grid[y1, x1]
-        return unit((1 - fy) * top + fy * bottom)
-
-
 @dataclass(frozen=True, eq=False)
 class DinoFeatures:
-    """The network on one image: saliency Omega (a `DenseConfidence`) and the grid of descriptors.
+    """The network on one image: saliency Omega (a `DenseConfidence`) and descriptors.
 
     Omega = s / (1 + s), with s the attention of the class token to a patch, mean over the heads of the last block, in
     units of the mean over patches: 1/2 where a patch gets as much as on average.
@@ -61,14 +37,16 @@ class DinoFeatures:
         fine = cv2.resize(omega, fit.network_size[::-1], interpolation=cv2.INTER_LINEAR)
         return fit.map_to_image(fine)
 
-    def describe(self, image: np.ndarray) -> DescriptorGrid:
-        """Return descriptors of the patches of `image`, less their mean, which all patches of an image share."""
+    def descriptors(self, image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """Return unit descriptors float32 [n, C] at `pixels` [n, 2] of `image`: those of the patches, less their mean,
+        which all patches of an image share.
+        """
         outputs, fit = self._outputs(image)
-        grid = outputs["patch_descriptors"].astype(np.float32)
-        return DescriptorGrid(unit(grid - grid.mean(axis=0)).reshape(*_grid(fit), -1), fit, DINOV3.multiple)
+        patches = outputs["patch_descriptors"].astype(np.float32)
+        grid = unit(patches - patches.mean(axis=0)).reshape(*_grid(fit), -1)
+        return vectors_at(grid, fit.to_network(pixels), fit.network_size)
 
     def _outputs(self, image: np.ndarray) -> tuple[Outputs, Fit]:
-        check_image("image", image)
         fit = self.session.fit(image)
         return self.cache.get((self.session,), ("features",), (image,), lambda: self._run(image, fit)), fit
 
@@ -122,18 +100,15 @@ class DenseLineMatcher:
         place = ((np.arange(self.samples) + 0.5) / self.samples)[:, None]
         ends = segments.endpoints
         pixels = ends[:, None, 0] + place * (ends[:, None, 1] - ends[:, None, 0])
-        vectors = self.features.describe(image).at(pixels.reshape(-1, 2))
+        vectors = self.features.descriptors(image, pixels.reshape(-1, 2))
         return LineFeatures(segments, vectors.reshape(len(segments), self.samples, -1).astype(np.float16))
 
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
         """Return the matches from view i to view j; see `LineMatcher.match`."""
-        ends_i, ends_j = features_i.segments.endpoints, features_j.segments.endpoints
-        allowed = allowed_pairs(ends_i, ends_j, relative)
-        similarity = np.where(allowed, segment_similarity(features_i.descriptors, features_j.descriptors), -np.inf)
-        index_i, index_j, clarity = mutual_nearest(similarity, self.ratio, self.similarity)
-        return LineMatches(index_i, index_j, np.clip(1.0 - clarity**2, 0.05, 1.0))
+        similarity = segment_similarity(features_i.descriptors, features_j.descriptors)
+        return match_segments(similarity, features_i, features_j, relative, self.ratio, self.similarity)
 
 
 def segment_similarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:

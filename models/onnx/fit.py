@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from vggtgeo.models.classical.nearest import unit
 
 _MAX_STRETCH = 1.05
 _BORDER = (127, 127, 127)
@@ -78,6 +79,20 @@ class Fit:
         """Return (fx, fy, cx, cy) of the image, float64 [4], from those of the network's input."""
         focal = np.asarray(intrinsics[:2], np.float64) / self.scale
         return np.concatenate([focal, self.to_image(np.asarray(intrinsics[2:], np.float64))])
+
+
+def vectors_at(grid: np.ndarray, pixels: np.ndarray, network_size: tuple[int, int]) -> np.ndarray:
+    """Return unit vectors float32 [n, C] of a map [h, w, C] at `pixels` [n, 2] of the network's input, interpolated
+    bilinearly between the centres of the map's cells.
+    """
+    size = np.array(grid.shape[1::-1])
+    place = np.clip(size / np.array(network_size[::-1]) * (pixels + 0.5) - 0.5, 0.0, size - 1)
+    low = np.minimum(place.astype(np.int64), np.maximum(size - 2, 0))
+    high = np.minimum(low + 1, size - 1)
+    (x0, y0), (x1, y1), (u, v) = low.T, high.T, (place - low).astype(np.float32).T[..., None]
+    above = (1 - u) * grid[y0, x0] + u * grid[y0, x1]
+    below = (1 - u) * grid[y1, x0] + u * grid[y1, x1]
+    return unit((1 - v) * above + v * below)
 
 
 def at_multiples(size: tuple[int, int], multiple: int, width: int | None = None) -> tuple[int, int]:

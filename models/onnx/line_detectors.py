@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_image
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache
 from vggtgeo.models.onnx.contracts import MLSD
 from vggtgeo.models.onnx.session import Session
@@ -88,7 +87,6 @@ class LetrDetector:
 
     def detect(self, image: np.ndarray) -> Segments:
         """Return segments of `image` (uint8 [H, W, 3]), most probable first."""
-        check_image("image", image)
         factor = SHORT_SIDE / min(image.shape[:2])
         height, width = (round(factor * side) for side in image.shape[:2])
         fit = self.session.fit(image, (height, width))
@@ -134,7 +132,6 @@ class MlsdDetector:
 
     def detect(self, image: np.ndarray) -> Segments:
         """Return segments of `image` (uint8 [H, W, 3]), best first."""
-        check_image("image", image)
         run = lambda: {"maps": self.session.run({"image": prepare(image)[None]})["maps"][0, :5]}
         outputs = self.cache.get((self.session,), ("lines",), (image,), run)
         ends, scores = decode_maps(outputs["maps"], self.score, self.least_length, self.count)

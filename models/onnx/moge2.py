@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import least_squares
-from vggtgeo.models.checks import check_fields, check_image
+from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.sensor_depth import no_depth
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.fit import Fit
@@ -41,7 +41,6 @@ class MogeDepth:
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
         """Return metric depth; with `intrinsics` only the shift is recovered, without them the focal length too."""
-        check_image("image", image)
         fit = self.session.fit(image)
         outputs = self.cache.get((self.session,), ("depth", self.tokens), (image,), lambda: self._run(image, fit))
         mask = fit.map_to_image(outputs["mask"][0])
@@ -76,7 +75,9 @@ def recover_focal_shift(
 
     points: float [H, W, 3]. keep: bool [H, W]. Gives s = 0 where fewer than two points are kept.
     """
-    rows, columns = _thin(points.shape[0]), _thin(points.shape[1])
+    counts = [min(side, _GRID) for side in keep.shape]
+    spread = lambda side, count: ((np.arange(count) + 0.5) * side / count).astype(np.int64)
+    rows, columns = map(spread, keep.shape, counts)
     which = keep[np.ix_(rows, columns)] & np.isfinite(points[np.ix_(rows, columns)]).all(axis=2)
     x, y, z = points[np.ix_(rows, columns)][which].astype(np.float64).T
     v, u = (axis[which].astype(np.float64) for axis in np.meshgrid(rows, columns, indexing="ij"))
@@ -86,7 +87,8 @@ def recover_focal_shift(
         return float(fx), 0.0
 
     def scale_and_error(shift: float) -> tuple[float, np.ndarray]:
-        image = np.concatenate([x, y]) / np.tile(_away_from_zero(z + shift), 2)
+        ahead = z + shift
+        image = np.concatenate([x, y]) / np.tile(np.where(np.abs(ahead) < 1e-6, 1e-6, ahead), 2)
         factor = 1.0 if intrinsics is not None else float(image @ rays / max(image @ image, 1e-12))
         return factor, factor * image - rays
 
@@ -104,13 +106,3 @@ def _closed_form_shift(x: np.ndarray, y: np.ndarray, z: np.ndarray, rays: np.nda
         return float(rays @ (image - ahead * rays) / max(rays @ rays, 1e-12))
     solved = np.linalg.lstsq(np.stack([image, -rays], axis=1), ahead * rays, rcond=None)[0]
     return float(solved[1])
-
-
-def _away_from_zero(values: np.ndarray) -> np.ndarray:
-    return np.where(np.abs(values) < 1e-6, 1e-6, values)
-
-
-def _thin(length: int) -> np.ndarray:
-    """Return at most 64 indices spread evenly over `length`."""
-    count = min(length, _GRID)
-    return ((np.arange(count) + 0.5) * length / count).astype(np.int64)

@@ -2,40 +2,51 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import logging
 import time
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import onnxruntime
-from vggtgeo.models.onnx.contracts import METADATA_WEIGHTS, RANDOM_WEIGHTS, Contract
-from vggtgeo.models.onnx.file_checks import (
+from vggtgeo.models.checks import check_image
+from vggtgeo.models.onnx.contracts import (
+    CONTRACTS,
+    METADATA_NETWORK,
+    METADATA_WEIGHTS,
+    RANDOM_WEIGHTS,
+    Contract,
     NetworkFileError,
     Signature,
     Signatures,
-    check_looks_like_onnx,
     check_signature,
     file_parts,
+    recognise,
     wrong_shapes,
 )
 from vggtgeo.models.onnx.fit import Fit, at_multiples
-from vggtgeo.models.onnx.providers import (
-    CUDA_OPTIONS,
-    FATAL,
-    NAMES,
-    WARNING,
-    Provider,
-    check_started,
-    choose_provider,
-    load_cuda_libraries,
-)
+
+from vggtgeo.io.errors import InputError, install_hint, put_back_hint
 
 _log = logging.getLogger(__name__)
+GPU_PACKAGE = "onnxruntime-gpu"
+Provider = Literal["auto", "cuda", "cpu"]
+NAMES = {"cuda": "CUDAExecutionProvider", "cpu": "CPUExecutionProvider"}
+"""Names in onnxruntime."""
+CUDA_OPTIONS = {"arena_extend_strategy": "kSameAsRequested", "use_tf32": "0"}
+"""The arena grows as needed, since several networks share one device. Products of float32 use float32, as on the CPU:
+in TF32, the default of onnxruntime, maps of M-LSD differ by 3 % of their range, others by 1e-3.
+"""
+_FATAL, _WARNING = 4, 2
+"""Levels of onnxruntime's log; the second is its default."""
 _DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(int64)": "int64"}
 """Element types of the contracts by their names in onnxruntime."""
 _LARGE = 2**30
@@ -44,7 +55,7 @@ _LARGE = 2**30
 Input: TypeAlias = np.ndarray | onnxruntime.OrtValue
 
 
-class NetworkRunError(RuntimeError):
+class NetworkRunError(InputError):
     """A network failed while it ran, or returned values that are not finite."""
 
 
@@ -80,8 +91,12 @@ class Session:
 
     @cached_property
     def digest(self) -> str:
-        """Return the SHA-256 of the file and its external data, hexadecimal."""
-        return digest_of(self.path)
+        """Return the SHA-256 of the file and the external data that its graph names, hexadecimal."""
+        total = hashlib.sha256()
+        for part in file_parts(self.path):
+            with part.open("rb") as file:
+                total.update(hashlib.file_digest(file, "sha256").digest())
+        return total.hexdigest()
 
     def fit(self, image: np.ndarray, wanted: tuple[int, int] | None = None) -> Fit:
         """Return the fit of `image` (uint8 [H, W, 3]) to the input; `wanted`: (height, width) where the file leaves it
@@ -93,6 +108,7 @@ class Session:
 
     def prepare(self, image: np.ndarray, fit: Fit) -> np.ndarray:
         """Return `image` (uint8 [H, W, 3]) as input, resized and normalised, float32 [1, 3, *fit.network_size]."""
+        check_image("image", image)
         return self.contract.normalisation.apply(fit.resize(image))[None]
 
     def run(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, np.ndarray]:
@@ -127,7 +143,7 @@ class Session:
         for name in names:
             binding.bind_output(name, self.provider, 0)
         options = onnxruntime.RunOptions()
-        options.log_severity_level = FATAL  # the exception reports what is wrong, once
+        options.log_severity_level = _FATAL  # the exception reports what is wrong, once
         try:
             self.session.run_with_iobinding(binding, options)
         except Exception as error:  # onnxruntime's errors have no base class of their own
@@ -136,25 +152,22 @@ class Session:
         self.tally.seconds += time.perf_counter() - began
         found = dict(zip(names, binding.get_outputs(), strict=True))
         types = {**self.inputs, **self.outputs}
-        shapes = {
-            name: Signature(tuple(value.shape()), types[name].dtype) for name, value in {**given, **found}.items()
-        }
+        shapes = {name: Signature(tuple(v.shape()), types[name].dtype) for name, v in {**given, **found}.items()}
         wrong = wrong_shapes(self.contract, shapes)
         if wrong:
             raise NetworkRunError(
-                f"`{self.path}` has output sizes that `{self.contract.network}` does not allow: {'; '.join(wrong)}; "
-                "export it again"
+                f"`{self.path}` gave other sizes than its contract: {'; '.join(wrong)}; export it again"
             )
         return found
 
-    def warm_up(self, seed: int = 0) -> None:
+    def warm_up(self) -> None:
         """Run once on noise, if all input sizes are fixed: the first run allocates memory, and on CUDA tunes kernels.
 
         Raises `NetworkRunError` as `run` does, so that a network that cannot run is detected early.
         """
         shapes = {name: [size or 0 for size in signature.shape] for name, signature in self.inputs.items()}
         if all(shape and all(shape) for shape in shapes.values()):
-            noise = np.random.default_rng(seed)
+            noise = np.random.default_rng(0)
             self.run({name: noise.uniform(size=shape) for name, shape in shapes.items()})
             self.tally.calls, self.tally.seconds = 0, 0.0
 
@@ -167,7 +180,7 @@ class Session:
 
 def open_session(
     path: str | Path,
-    contract: Contract,
+    contract: Contract | None = None,
     *,
     provider: Provider = "auto",
     memory_limit_gb: float | None = None,
@@ -175,40 +188,39 @@ def open_session(
 ) -> Session:
     """Open `path` and check it against `contract`; raise `NetworkFileError` if it is not that network.
 
-    provider: "auto" uses CUDA if onnxruntime offers it. memory_limit_gb: maximum memory on CUDA, weights included.
-    threads: per operator on the CPU; None for the default of onnxruntime.
+    contract: None for the one that its metadata name, or that its inputs and outputs fulfil. provider: "auto" uses CUDA
+    if onnxruntime offers it. memory_limit_gb: maximum memory on CUDA, weights included. threads: per operator on the
+    CPU; None for the default of onnxruntime.
     """
     path = Path(path)
-    check_looks_like_onnx(path)
+    if not path.is_file():
+        raise NetworkFileError(f"`{path}` is not there, expected an ONNX file; see `vggtgeo models list`")
     device = choose_provider(provider)
     opened = _open(path, device, memory_limit_gb, threads)
-    used = "cuda" if NAMES["cuda"] in opened.get_providers() else "cpu"
-    check_started(provider, device, used)
-    _announce(used)
-    inputs, outputs, metadata = _described(opened)
+    used = used_device(opened, provider, device)
+    _log_device(used)
+    inputs, outputs = (
+        {
+            node.name: Signature(
+                tuple(size if isinstance(size, int) else None for size in node.shape), _DTYPES.get(node.type, node.type)
+            )
+            for node in nodes
+        }
+        for nodes in (opened.get_inputs(), opened.get_outputs())
+    )
+    properties = opened.get_modelmeta().custom_metadata_map
+    if contract is None:
+        contract = CONTRACTS.get(properties.get(METADATA_NETWORK, "")) or recognise(inputs, outputs)
+    if contract is None:
+        listing = ", ".join(f"`{name}` {signature}" for name, signature in {**inputs, **outputs}.items())
+        raise NetworkFileError(f"`{path}` matches no known network ({', '.join(CONTRACTS)}); it has {listing}")
     check_signature(path, contract, inputs, outputs)
-    return Session(path, contract, used, inputs, outputs, metadata, opened)
-
-
-def read_signature(path: str | Path) -> tuple[Signatures, Signatures, Mapping[str, str]]:
-    """Return inputs, outputs and metadata of any ONNX file; raise `NetworkFileError` for other files."""
-    path = Path(path)
-    check_looks_like_onnx(path)
-    return _described(_open(path, "cpu", None, None))
-
-
-def digest_of(path: Path) -> str:
-    """Return the SHA-256 of an ONNX file and the external data that its graph names, hexadecimal."""
-    total = hashlib.sha256()
-    for part in file_parts(path):
-        with part.open("rb") as file:
-            total.update(hashlib.file_digest(file, "sha256").digest())
-    return total.hexdigest()
+    return Session(path, contract, used, inputs, outputs, properties, opened)
 
 
 def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int | None) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = FATAL  # The exception reports what is wrong, once.
+    options.log_severity_level = _FATAL  # The exception reports what is wrong, once.
     # An arena would keep the working memory of every network: 1.5 times the memory, for 10 % of the time.
     options.enable_cpu_mem_arena = False
     if sum(part.stat().st_size for part in file_parts(path)) > _LARGE:
@@ -220,34 +232,74 @@ def _open(path: Path, device: str, memory_limit_gb: float | None, threads: int |
         load_cuda_libraries()
         limit = {} if memory_limit_gb is None else {"gpu_mem_limit": int(memory_limit_gb * 2**30)}
         providers.insert(0, (NAMES["cuda"], {**CUDA_OPTIONS, **limit}))
-    onnxruntime.set_default_logger_severity(FATAL)  # for networks that do not start on the GPU
+    onnxruntime.set_default_logger_severity(_FATAL)  # for networks that do not start on the GPU
     try:
         # Without CUDA there is no fallback, and onnxruntime would print that it tries.
         return onnxruntime.InferenceSession(str(path), options, providers, enable_fallback=int(device == "cuda"))
     except Exception as error:  # onnxruntime's errors have no base class of their own
         reason = " ".join(str(error).split())
         raise NetworkFileError(
-            f"`{path}` cannot be opened by onnxruntime {onnxruntime.__version__}: {reason}; fetch it again with all "
-            "its files, or export it for this version"
+            f"`{path}` cannot be opened by onnxruntime {onnxruntime.__version__}: {reason}; it may be "
+            "incomplete, a checkpoint, a web page or a Git LFS pointer: fetch it again with all its files, or export it"
         ) from error
     finally:
-        onnxruntime.set_default_logger_severity(WARNING)
+        onnxruntime.set_default_logger_severity(_WARNING)
 
 
-def _described(opened: onnxruntime.InferenceSession) -> tuple[Signatures, Signatures, Mapping[str, str]]:
-    """Return inputs, outputs and metadata of an open file."""
-    inputs, outputs = (
-        {
-            node.name: Signature(
-                tuple(size if isinstance(size, int) else None for size in node.shape), _DTYPES.get(node.type, node.type)
-            )
-            for node in nodes
-        }
-        for nodes in (opened.get_inputs(), opened.get_outputs())
-    )
-    return inputs, outputs, opened.get_modelmeta().custom_metadata_map
+def choose_provider(provider: Provider) -> str:
+    """Return the device, "cuda" or "cpu"; raise `NetworkFileError` if CUDA is requested and not available.
+
+    Warns if the package for CUDA is installed but not in use.
+    """
+    if provider == "cpu" or NAMES["cuda"] in onnxruntime.get_available_providers():
+        return "cpu" if provider == "cpu" else "cuda"
+    overwritten = ""
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        # Both packages have the same module, and an installer may write either last.
+        version = metadata.version(GPU_PACKAGE)
+        overwritten = (
+            f"{GPU_PACKAGE} {version} is installed, but its files are overwritten by those of the package onnxruntime; "
+            f"{put_back_hint(GPU_PACKAGE, version)}"
+        )
+    if provider == "cuda":
+        why = overwritten or f"this onnxruntime runs on the CPU only; {install_hint('gpu')}"
+        raise NetworkFileError(f"`provider` is cuda, but {why}")
+    if overwritten:
+        warn_once(overwritten)
+    return "cpu"
 
 
 @cache
-def _announce(provider: str) -> None:
+def load_cuda_libraries() -> str:
+    """Load CUDA's libraries from pip's folders, which the system's loader does not search; return what is missing."""
+    printed = io.StringIO()
+    if hasattr(onnxruntime, "preload_dlls"):  # from 1.21 on
+        with contextlib.redirect_stdout(printed):
+            onnxruntime.preload_dlls()
+    return " ".join(printed.getvalue().split())
+
+
+def used_device(opened: onnxruntime.InferenceSession, provider: Provider, device: str) -> str:
+    """Return the device of an open session, "cuda" or "cpu": onnxruntime falls back to the CPU silently.
+
+    Raises `NetworkFileError` if CUDA was requested but did not start, and warns if it was only chosen.
+    """
+    used = "cuda" if NAMES["cuda"] in opened.get_providers() else "cpu"
+    if used != device:
+        missing = load_cuda_libraries()
+        why = f"onnxruntime could not start CUDA: {missing or 'is there a GPU and its driver?'}"
+        if provider == "cuda":
+            raise NetworkFileError(f"`provider` is cuda, but {why}")
+        warn_once(f"networks run on the CPU: {why}")
+    return used
+
+
+@cache
+def warn_once(text: str) -> None:
+    """Issue a UserWarning, only the first time."""
+    warnings.warn(text, stacklevel=3)
+
+
+@cache
+def _log_device(provider: str) -> None:
     _log.info("networks run on %s", provider)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.checks import check_image
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.session import Session
@@ -35,7 +34,11 @@ class VggtWindow:
         Given intrinsics are handed back. A view whose quaternion has no length, or whose translation is not finite or
         beyond all scenes, is not found.
         """
-        self._check(images)
+        if self.views is not None and len(images) > self.views:
+            raise ValueError(
+                f"`images` has {len(images)} views, but `{self.session.path}` takes at most {self.views}; "
+                "give fewer, or export it for more views"
+            )
         fit = self.session.fit(images[0])
         outputs = self.cache.get((self.session,), ("window",), images, lambda: self._run(images, fit))
         count = len(images)
@@ -53,17 +56,6 @@ class VggtWindow:
             found=found,
             result=GeometryResult.SUCCESS if found.all() else GeometryResult.DEGENERATE,
         )
-
-    def _check(self, images: Sequence[np.ndarray]) -> None:
-        for image in images:
-            check_image("images", image)
-        if self.views is not None and len(images) > self.views:
-            raise ValueError(
-                f"`images` has {len(images)} views, but `{self.session.path}` takes at most {self.views}; "
-                "give fewer, or export it for more views"
-            )
-        if any(image.shape != images[0].shape for image in images):
-            raise ValueError("`images` have different sizes, expected one size; resize them")
 
     def _run(self, images: Sequence[np.ndarray], fit: Fit) -> Outputs:
         prepared = [self.session.prepare(image, fit) for image in images]

@@ -15,11 +15,12 @@ import tiny_networks as tiny
 from hub_server import Hub, serve
 from huggingface_hub.utils import disable_progress_bars
 from typer.testing import CliRunner
-from vggtgeo.models.onnx import contracts, verification
+from vggtgeo.models.onnx import contracts
 from vggtgeo.models.onnx.registry import NETWORKS, HubFile, Network
 from vggtgeo.models.onnx.session import open_session
 
 from vggtgeo.cli.main import make_app
+from vggtgeo.cli.verify_network import example_inputs
 from vggtgeo.io.network_files import fetch_network, networks_folder
 from vggtgeo.slam.settings.presets import perception
 
@@ -141,7 +142,7 @@ def test_parity_is_shown_again_from_the_record(check: Callable, tmp_path: Path) 
     # same file, and the same with one value moved by 1 % of the largest.
     path = tiny.dinov3(tmp_path / "dinov3.onnx")
     session = open_session(path, contracts.DINOV3)
-    inputs = verification.example_inputs(session, views.texture(0, (64, 48)))
+    inputs = example_inputs(session, views.texture(0, (64, 48)))
     outputs = session.run(inputs)
     record = {f"input.{name}": value for name, value in inputs.items()}
     record |= {f"output.{name}": value for name, value in outputs.items()}

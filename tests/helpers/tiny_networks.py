@@ -88,12 +88,17 @@ def moge2(
     return constant(path, "moge2", inputs, outputs)
 
 
-def letr(path: Path, size: tuple[int, int] = (48, 64), lines: Sequence[Sequence[float]] | None = None) -> Path:
+def letr(
+    path: Path,
+    size: tuple[int, int] = (48, 64),
+    lines: Sequence[Sequence[float]] | None = None,
+    dtype: type = np.float32,
+) -> Path:
     """The given lines (x0 y0 x1 y1 in [0, 1]) with scores above 0.7, and one below."""
     lines = [(0.1, 0.2, 0.8, 0.3), (0.3, 0.1, 0.35, 0.9)] if lines is None else lines
     logits = [(3.0, 0.0)] * len(lines) + [(0.0, 0.0)]
     outputs = {"pred_logits": np.array([logits]), "pred_lines": np.array([[*lines, (0.5, 0.5, 0.9, 0.9)]])}
-    return constant(path, "letr", {"image": (1, 3, *size)}, outputs)
+    return constant(path, "letr", {"image": (1, 3, *size)}, outputs, dtype=dtype)
 
 
 def mlsd(path: Path, segments: Sequence[Sequence[float]] = ((100, 80, 60, 70, 140, 90),)) -> Path:

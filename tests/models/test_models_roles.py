@@ -1,7 +1,5 @@
 """The typed outputs of the roles refuse what no implementation may return."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from reported import raises
@@ -10,19 +8,7 @@ from vggtgeo.models import roles
 INDEX = np.arange(3)
 PIXELS = np.zeros((3, 2))
 ONES = np.ones(3)
-IMAGE = np.zeros((4, 5, 3), np.uint8)
 MAP = np.ones((4, 5), np.float32)
-
-
-def _pose_query(**changes: Any) -> roles.PoseQuery:
-    fields: dict[str, Any] = {
-        "image": IMAGE,
-        "intrinsics": np.ones(4),
-        "points": np.ones((3, 3)),
-        "pixels": PIXELS,
-        "confidence": ONES,
-    }
-    return roles.PoseQuery(**(fields | changes))
 
 
 WRONG = {
@@ -33,12 +19,8 @@ WRONG = {
     "index_j": lambda: roles.PointMatches(INDEX, INDEX - 2, PIXELS, PIXELS, ONES),
     "confidence": lambda: roles.PointMatches(INDEX, INDEX, PIXELS, PIXELS, 2 * ONES),
     "endpoints": lambda: roles.Segments(np.zeros((3, 4)), ONES),
-    "pose": lambda: roles.RelativeView(2 * np.eye(4), np.ones(4)),
-    "depths": lambda: roles.RelativeView(np.eye(4), np.ones(4), np.ones(3)),
     "sigma_rel": lambda: roles.DepthEstimate(MAP, MAP, MAP[:2]),
-    "points": lambda: _pose_query(points=np.ones((3, 2))),
-    "predicted": lambda: _pose_query(predicted=np.zeros((4, 4))),
-    "window_images": lambda: _pose_query(window_images=(IMAGE,)),
+    "pose": lambda: roles.PoseGuess(2 * np.eye(4), np.ones(3, bool), 0.1, roles.GeometryResult.SUCCESS),
     "inliers": lambda: roles.StartGuess(
         np.eye(4), np.ones((3, 3)), np.ones(2, bool), 0.1, roles.GeometryResult.SUCCESS
     ),

@@ -27,11 +27,11 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry
 from vggtgeo.models.roles import InitialGeometry
-from vggtgeo.models.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.report.map_scene import spread
 from vggtgeo.simulation import SimulatedOracle, simulate
 from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
+from vggtgeo.simulation.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
 from vggtgeo.slam.run import default_roles
 from vggtgeo.slam.settings.presets import Perception, perception
 from vggtgeo.slam.settings.slam_settings import Roles

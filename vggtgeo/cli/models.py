@@ -115,7 +115,7 @@ def verify(
 
 
 def _row(network: Network, place: Path) -> dict[str, str | int | bool]:
-    from vggtgeo.models.onnx.file_checks import has_random_weights
+    from vggtgeo.models.onnx.contracts import has_random_weights
 
     made = f"{network.export_command}  # {network.publication.code}; weights: {network.weights}"
     return {
@@ -163,7 +163,6 @@ def export(
 ) -> None:
     """Write the network NAME as an ONNX file and compare it with PyTorch."""
     from vggtgeo.models.exporters.recipes import recipe_of
-    from vggtgeo.models.exporters.request import ExportError
 
     def show(stage: str) -> None:
         if not quiet:
@@ -172,17 +171,14 @@ def export(
     if (checkpoint is None) != random_weights:
         found = "neither was given" if checkpoint is None else "both were given"
         raise InputError(f"one of `--checkpoint` FILE and `--random-weights` is needed; {found}")
-    try:
-        recipe = recipe_of(name)
-        request = recipe.request(
-            *(source, checkpoint, height, width, views, tokens),
-            *(variant, half, allow_extra_weights),
-        )
-        from vggtgeo.models.exporters.export import export as write
+    recipe = recipe_of(name)
+    request = recipe.request(
+        *(source, checkpoint, height, width, views, tokens),
+        *(variant, half, allow_extra_weights),
+    )
+    from vggtgeo.models.exporters.export import export as write
 
-        report = write(recipe, request, output, show, tolerance)
-    except ExportError as error:
-        raise InputError(str(error)) from error
+    report = write(recipe, request, output, show, tolerance)
     if as_json:
         typer.echo(json.dumps(asdict(report) | {"path": str(report.path)}, allow_nan=False))
     if as_json or quiet:

@@ -83,11 +83,9 @@ def run(
     if len(sequence):  # zero for a live camera
         check_selection(sequence.name, len(sequence), given.start, given.end, given.stride)
     if perception.provider == "cuda":
-        from vggtgeo.io.network_files import as_input_errors
-        from vggtgeo.models.onnx.providers import choose_provider
+        from vggtgeo.models.onnx.session import choose_provider
 
-        with as_input_errors():
-            choose_provider("cuda")  # is there a GPU?
+        choose_provider("cuda")  # is there a GPU?
     if options.save_depth and options.dense == "none":
         text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
         warnings.warn(text, InputWarning, stacklevel=2)

@@ -20,7 +20,6 @@ from vggtgeo.datasets.views import reduced
 from vggtgeo.io.errors import InputError, one_line
 from vggtgeo.io.files import whole_path
 from vggtgeo.io.interruption import interruption
-from vggtgeo.io.network_files import as_input_errors
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
@@ -75,7 +74,7 @@ def run_and_write(
         if wanted.resume and not folder.checkpoint.is_file():
             typer.echo(f"nothing to resume in `{output}`: the run begins at its first frame", err=True)
         viewed, url = _rerun_callbacks(wanted.rerun, folder, title, settings.window.size)
-        with as_input_errors(), ProgressBar(console) as bar:
+        with ProgressBar(console) as bar:
             result = reconstruct(
                 sequence,
                 roles,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,17 +11,32 @@ import numpy as np
 import typer
 
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.network_files import as_input_errors
-from vggtgeo.models.onnx import verification
+from vggtgeo.io.network_files import network_named
 from vggtgeo.models.onnx.bounds import BoundedDepth, BoundedWindow
-from vggtgeo.models.onnx.contracts import CONTRACTS, METADATA_NETWORK, PARITY_SUFFIX
-from vggtgeo.models.onnx.file_checks import NetworkFileError, recognise
+from vggtgeo.models.onnx.contracts import (
+    HALF_TOLERANCE,
+    PARITY_SUFFIX,
+    TOLERANCE,
+    Patches,
+    Tensor,
+    relative_difference,
+)
+from vggtgeo.models.onnx.line_detectors import prepare
 from vggtgeo.models.onnx.moge2 import MogeDepth
-from vggtgeo.models.onnx.providers import Provider
-from vggtgeo.models.onnx.registry import NETWORKS
-from vggtgeo.models.onnx.session import Session, open_session, read_signature
+from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
+
+
+@dataclass(frozen=True)
+class Output:
+    """Summary of an output: shape, number of values that are not finite, and range of the others."""
+
+    shape: tuple[int, ...]
+    not_finite: int
+    lowest: float
+    highest: float
 
 
 @dataclass(frozen=True)
@@ -37,7 +54,7 @@ class Report:
     random_weights: bool
     sha256: str
     inputs: dict[str, tuple[int, ...]]
-    outputs: dict[str, verification.Output]
+    outputs: dict[str, Output]
     latency: float
     parity: dict[str, float]
     limit: float
@@ -52,25 +69,25 @@ def verify_file(
         raise InputError(f"`{file}` is a folder; give the file of a network, `NAME.onnx`")
     beside = file.with_name(file.name + PARITY_SUFFIX)
     record = against or (beside if beside.is_file() else None)
-    with as_input_errors():
-        session = open_session(file, CONTRACTS[_contract_name(file, network)], provider=provider)
-        # Before the image: an invalid record is found at once, but the default image takes seconds to render.
-        parity = verification.parity(session, record) if record else {}
-        shown = shown_image(image)
-        inputs = verification.example_inputs(session, shown)
-        return Report(
-            file=str(file),
-            network=session.contract.network,
-            provider=session.provider,
-            random_weights=session.random_weights,
-            sha256=session.digest,
-            inputs={name: array.shape for name, array in inputs.items()},
-            outputs=verification.check_outputs(session, inputs),
-            latency=verification.latency(session, inputs, runs),
-            parity=parity,
-            limit=verification.tolerance(session),
-            depth_pixels=_depth_pixels(session, shown),
-        )
+    contract = None if network is None else network_named(network).contract
+    session = open_session(file, contract, provider=provider)
+    # Before the image: an invalid record is found at once, but the default image takes seconds to render.
+    parity = _parity(session, record) if record else {}
+    shown = shown_image(image)
+    inputs = example_inputs(session, shown)
+    return Report(
+        file=str(file),
+        network=session.contract.network,
+        provider=session.provider,
+        random_weights=session.random_weights,
+        sha256=session.digest,
+        inputs={name: array.shape for name, array in inputs.items()},
+        outputs=_check_outputs(session, inputs),
+        latency=_latency(session, inputs, runs),
+        parity=parity,
+        limit=_tolerance(session),
+        depth_pixels=_depth_pixels(session, shown),
+    )
 
 
 def faults(report: Report) -> list[str]:
@@ -132,18 +149,67 @@ def _depth_pixels(session: Session, image: np.ndarray) -> int | None:
     return int(np.isfinite(depth).sum())
 
 
-def _contract_name(file: Path, asked: str | None) -> str:
-    """Return the contract of the requested network, else by the file's metadata, else by its signature."""
-    if asked is not None:
-        if asked not in NETWORKS:
-            raise InputError(f"`--network` must be one of {', '.join(NETWORKS)}, got {asked!r}")
-        return NETWORKS[asked].contract_name
-    inputs, outputs, metadata = read_signature(file)
-    named = metadata.get(METADATA_NETWORK)
-    if named in CONTRACTS:
-        return named
-    like = recognise(inputs, outputs)
-    if not like:
-        listing = ", ".join(f"`{name}` {signature}" for name, signature in {**inputs, **outputs}.items())
-        raise NetworkFileError(f"`{file}` matches no known network ({', '.join(CONTRACTS)}); it has {listing}")
-    return like[0]
+def example_inputs(session: Session, image: np.ndarray, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return `image` (uint8 [H, W, 3]) as inputs of the network; encoder features are standard normal."""
+    rng = np.random.default_rng(seed)
+    return {
+        tensor.name: _example(session, tensor, image, rng)
+        for tensor in session.contract.inputs
+        if tensor.name in session.inputs
+    }
+
+
+def _check_outputs(session: Session, inputs: Mapping[str, np.ndarray]) -> dict[str, Output]:
+    """Return a summary of each output of the contract."""
+    wanted = [tensor.name for tensor in session.contract.outputs if tensor.name in session.outputs]
+    summaries = {}
+    for name, value in session.run_on_device(inputs, wanted).items():
+        array = value.numpy()
+        finite = array[np.isfinite(array)].astype(np.float64)
+        bounds = (float(finite.min()), float(finite.max())) if finite.size else (float("nan"), float("nan"))
+        summaries[name] = Output(array.shape, int(array.size - finite.size), *bounds)
+    return summaries
+
+
+def _latency(session: Session, inputs: Mapping[str, np.ndarray], runs: int) -> float:
+    """Return the median time of `runs` runs, s, with copies to and from the device, after one warm-up run."""
+    session.run_on_device(inputs)
+    seconds = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        for array in session.run_on_device(inputs).values():
+            array.numpy()
+        seconds.append(time.perf_counter() - began)
+    return float(np.median(seconds))
+
+
+def _parity(session: Session, recorded: Path) -> dict[str, float]:
+    """Return max |difference| / max |PyTorch| of each recorded output; InputError for an invalid record.
+
+    recorded: an `.npz` of `input.NAME` and `output.NAME` arrays, as an export writes it beside its file.
+    """
+    try:
+        with np.load(recorded) as file:
+            inputs = {name: file[f"input.{name}"] for name in session.inputs}
+            expected = {name: file[f"output.{name}"] for name in session.outputs if f"output.{name}" in file}
+    except UNREADABLE as error:
+        raise InputError(f"`{recorded}` is not the parity record (.npz) of `{session.path}`: {error}") from None
+    found = session.run(inputs, expected)
+    return {name: relative_difference(found[name], expected[name]) for name in expected}
+
+
+def _tolerance(session: Session) -> float:
+    """Return the largest difference from PyTorch that rounding explains, by the precision of the file."""
+    types = [session.metadata.get("vggtgeo.precision", ""), *(tensor.dtype for tensor in session.inputs.values())]
+    return HALF_TOLERANCE if any("float16" in name for name in types) else TOLERANCE
+
+
+def _example(session: Session, tensor: Tensor, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    signature = session.inputs[tensor.name]
+    if tensor.name == "num_tokens":
+        return np.asarray(1800)
+    if any(isinstance(size, Patches) for size in tensor.shape):
+        return rng.standard_normal([size or 1 for size in signature.shape], np.float32)
+    if session.contract.network == "mlsd":
+        return prepare(image)[None]
+    return np.repeat(session.prepare(image, session.fit(image)), signature.shape[0] or 1, axis=0)

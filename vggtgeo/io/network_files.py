@@ -5,17 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
 from vggtgeo.io.errors import InputError, install_hint
-from vggtgeo.models.onnx.file_checks import NetworkFileError
 from vggtgeo.models.onnx.registry import NETWORKS, HubFile, Network
-from vggtgeo.models.onnx.session import NetworkRunError
 
 FOLDER_VARIABLE = "VGGTGEO_MODELS"
 
@@ -114,12 +110,3 @@ def _hub_client() -> tuple[Any, Any, type[Exception]]:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@contextmanager
-def as_input_errors() -> Iterator[None]:
-    """Raise `InputError` for a network that cannot be opened or fails while it runs."""
-    try:
-        yield
-    except (NetworkFileError, NetworkRunError) as error:
-        raise InputError(str(error)) from error

@@ -20,7 +20,7 @@ from vggtgeo.bundle.observations import Observations
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.datasets.frame import Sequence as Recording
 from vggtgeo.evaluation.association import nearest_in_time
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.camera import Undistorter
 from vggtgeo.io.errors import InputError
 from vggtgeo.models.classical import StructureTensor
@@ -189,13 +189,8 @@ def _determined(window: TrackedWindow) -> bool:
 
 def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Return values at the nearest pixels, NaN outside."""
-    height, width = image.shape
-    with np.errstate(invalid="ignore"):
-        inside = np.all((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5), axis=1)
-    columns, rows = np.rint(pixels[inside]).astype(int).T
-    values = np.full(len(pixels), np.nan)
-    values[inside] = image[rows, columns]
-    return values
+    inside = np.all((pixels > -0.5) & (pixels < np.array(image.shape[::-1]) - 0.5), axis=1)
+    return np.where(inside, _read(image, pixels), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,11 +356,8 @@ def _patches(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def _read(image: np.ndarray, pixels: np.ndarray) -> Float[np.ndarray, " m"]:
-    height, width = image.shape
-    columns, rows = np.rint(np.nan_to_num(pixels)).astype(int).T
-    return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
+    return pinhole.at_pixels(image, np.nan_to_num(pixels)).astype(np.float64)
 
 
 def _inside(pixels: np.ndarray, image: np.ndarray, margin: float = 6.0) -> np.ndarray:
-    height, width = image.shape
-    return np.all((pixels >= margin) & (pixels <= np.array([width, height]) - 1 - margin), axis=1)
+    return np.all((pixels >= margin) & (pixels <= np.array(image.shape[::-1]) - 1 - margin), axis=1)

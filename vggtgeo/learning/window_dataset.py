@@ -8,6 +8,7 @@ own, forked ones too (collate function: `vggtgeo.learning.stack_windows`); `batc
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -26,7 +27,7 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.datasets.image_files import is_there
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
-from vggtgeo.io.given import check_kind, check_whole, path_of
+from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import Format
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.callback import Callback
@@ -76,9 +77,8 @@ class WindowWriter:
 
     def add(self, window: PackedWindow, **labels: Any) -> None:
         """Write a packed window and its labels (arrays of one shape for all windows)."""
-        check_kind("window", window, tuple, "all that `vggtgeo.pack` gives")
         problem, initial, index = window
-        arrays = {name: _label(name, value) for name, value in labels.items()}
+        arrays = {name: np.asarray(value) for name, value in labels.items()}
         if not self.count and is_there(self.folder / _name(0)):
             raise InputError(f"`{self.folder}` holds windows already; give a new folder")
         leaves, structure = jax.tree.flatten((problem, initial))
@@ -165,7 +165,7 @@ class WindowDataset:
             version, count = index["version"], index["windows"]
         except (ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"`{place}` is no complete folder of windows; write one first") from None
-        if type(version) is not int or version != VERSION:
+        if version != VERSION:
             raise InputError(f"`{place / _INDEX}` is of version {version!r:.20}; this program reads {VERSION}")
         return cls(place, count, tuple(terms))
 
@@ -182,8 +182,6 @@ class WindowDataset:
 
     def order(self, seed: int, epoch: int = 0) -> np.ndarray:
         """Return every row once, int [n], shuffled; it follows from `seed` and `epoch` alone."""
-        check_whole("seed", seed)
-        check_whole("epoch", epoch)
         return np.random.default_rng([seed, epoch, 13]).permutation(self.count)
 
     def batches(
@@ -201,10 +199,6 @@ class WindowDataset:
             InputError: a batch larger than the share, or an impossible share.
 
         """
-        check_whole("size", size, 1)
-        for name, value in (("seed", seed), ("epochs", epochs)):
-            if value is not None:
-                check_whole(name, value)
         part, parts = share
         if not 0 <= part < parts:
             raise InputError(f"`share` is {share}; it must be (k, n) with 0 <= k < n")
@@ -213,12 +207,10 @@ class WindowDataset:
         return self._read(self._rows(size, seed, epochs, part, parts))
 
     def _rows(self, size: int, seed: int | None, epochs: int | None, part: int, parts: int) -> Iterator[np.ndarray]:
-        epoch = 0
-        while epochs is None or epoch < epochs:
+        for epoch in itertools.count() if epochs is None else range(epochs):
             order = np.arange(self.count) if seed is None else self.order(seed, epoch)
             own = order[: self.count // parts * parts][part::parts]
             yield from own[: len(own) // size * size].reshape(-1, size)
-            epoch += 1
 
     def _read(self, rows: Iterable[np.ndarray]) -> Iterator[LabelledWindow]:
         with ThreadPoolExecutor(1) as pool:
@@ -243,16 +235,6 @@ def stack_windows(windows: Sequence[LabelledWindow]) -> LabelledWindow:
     """
     stack: LabelledWindow = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
     return stack
-
-
-def _label(name: str, given: Any) -> np.ndarray:
-    try:
-        found = np.asarray(given)
-    except ValueError as error:
-        raise InputError(f"the label `{name}` cannot be read as an array: {error}") from None
-    if found.dtype.hasobject:
-        raise InputError(f"the label `{name}` is {given!r:.60}; expected an array of numbers or texts")
-    return found
 
 
 def _name(row: int) -> str:

@@ -25,7 +25,7 @@ from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.onnx.fit import Fit
-from vggtgeo.models.onnx.mast3r import Mast3rView
+from vggtgeo.models.onnx.point_matchers import Mast3rView
 from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatches, Segments
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.perception.rgbd_view import Points, RgbdView

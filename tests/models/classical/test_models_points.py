@@ -16,24 +16,6 @@ def _errors(matches: roles.PointMatches, homography: np.ndarray) -> np.ndarray:
     return np.linalg.norm(views.move(homography, matches.pixels_i) - matches.pixels_j, axis=1)
 
 
-@pytest.mark.parametrize(("name", "median"), [("sift", 0.15), ("orb", 0.8)])
-def test_matches_follow_the_known_motion(name: str, median: float) -> None:
-    # Proves that matches of a moved plane lie where its homography says, all over the image. Oracle: the homography.
-    first, second, homography = views.plane_pair(MOTION)
-    matcher: roles.PointMatcher = MATCHERS[name]
-    matches = matcher.match(matcher.describe(first), matcher.describe(second))
-    errors = _errors(matches, homography)
-    measured = (
-        f"{name}: {len(matches)} matches, median error {np.median(errors):.3f} px, {np.mean(errors > 3):.1%} wrong"
-    )
-    assert len(matches) > 100, measured
-    assert np.median(errors) < median, measured
-    assert np.mean(errors > 3) < 0.03, measured
-    assert len(np.unique(matches.index_i)) == len(matches), measured
-    quarters = (matches.pixels_i > np.array(views.SIZE) / 2) @ [1, 2]
-    assert np.bincount(quarters, minlength=4).min() > 10, measured
-
-
 @pytest.mark.parametrize("name", MATCHERS)
 def test_confident_matches_are_better(name: str) -> None:
     # Proves that confidence orders matches by error. Oracle: errors against the known homography, with image noise.
@@ -48,18 +30,6 @@ def test_confident_matches_are_better(name: str) -> None:
         f"{name}: mean error {errors[half].mean():.3f} px where confident, {errors[~half].mean():.3f} px elsewhere"
     )
     assert errors[half].mean() < errors[~half].mean(), measured
-
-
-@pytest.mark.parametrize("name", MATCHERS)
-def test_blank_images_have_no_matches(name: str) -> None:
-    # Proves that images without texture give empty answers, never an exception. Oracle: there is nothing to find.
-    matcher = MATCHERS[name]
-    blank = [matcher.describe(np.full((240, 320, 3), grey, np.uint8)) for grey in (0, 128)]
-    full = matcher.describe(views.plane_pair(MOTION)[0])
-    assert len(blank[0]) == len(blank[1]) == 0
-    for pair in ((blank[0], blank[1]), (blank[0], full), (full, blank[0])):
-        assert len(matcher.match(*pair)) == 0
-    assert len(matcher.match(blank[0], full, np.zeros((0, 2)))) == 0
 
 
 def test_shrinking_for_detection_moves_no_key_point() -> None:
@@ -163,12 +133,10 @@ def test_a_homography_steps_in_for_a_plane() -> None:
     assert inliers[~right].mean() < 0.02, measured
 
 
-@pytest.mark.parametrize(
-    "pixels", [np.zeros((0, 2)), np.ones((5, 2)), np.ones((50, 2))], ids=["none", "few", "one place"]
-)
-def test_verification_survives_degenerate_matches(pixels: np.ndarray) -> None:
-    # Proves that too few or coincident matches give a mask, never an exception. Oracle: the shape of the mask.
-    assert EpipolarVerifier().inliers(pixels, pixels).shape == (len(pixels),)
+@pytest.mark.parametrize("count", [0, 50])
+def test_verification_survives_degenerate_matches(count: int) -> None:
+    # Proves that missing or coincident matches give a mask, never an exception. Oracle: the shape of the mask.
+    assert EpipolarVerifier().inliers(np.ones((count, 2)), np.ones((count, 2))).shape == (count,)
 
 
 def test_alignment_reduces_the_error_of_targets() -> None:

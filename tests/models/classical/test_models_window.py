@@ -40,10 +40,15 @@ class _Model:
         return self.guess
 
 
-@pytest.mark.parametrize("depths", [(), DEPTHS[:3]], ids=["by distance", "by depth"])
+KNOWN = DEPTHS[:3]
+UNKNOWN = tuple(np.full_like(depth, np.nan) for depth in KNOWN)
+
+
+@pytest.mark.parametrize("depths", [(), UNKNOWN, KNOWN], ids=["none", "unknown", "known"])
 def test_a_window_comes_home(depths: tuple[np.ndarray, ...]) -> None:
-    # Proves scale, rotation and translation from three known views. Oracle: the world the window was taken from.
-    aligned = align_window(_guess(bad_depth=0.6 if depths else 0.0), POSES[:3], depths)
+    # Proves scale, rotation and translation from three known views, by their depth or else by the distances of the
+    # cameras. Oracle: the world the window was taken from.
+    aligned = align_window(_guess(bad_depth=0.6 if depths is KNOWN else 0.0), POSES[:3], depths)
     assert aligned is not None
     np.testing.assert_allclose(aligned.poses, POSES, atol=1e-6)
     np.testing.assert_allclose(aligned.depth[:, -1], np.stack(DEPTHS)[:, -1], rtol=1e-6)
@@ -55,14 +60,6 @@ def test_what_is_undetermined_is_none() -> None:
     assert align_window(_guess(), POSES[:1]) is None
     assert align_window(_guess(found=(False,) * 4), POSES[:3], DEPTHS[:3]) is None
     assert align_window(_guess(), np.stack([POSES[0]] * 3)) is None
-
-
-def test_a_window_without_any_known_depth_takes_its_scale_from_the_cameras() -> None:
-    # Proves that depth which failed on every view does not cost the window. Oracle: the world it was taken from.
-    nothing = [np.full_like(depth, np.nan) for depth in DEPTHS[:3]]
-    aligned = align_window(_guess(), POSES[:3], nothing)
-    assert aligned is not None
-    np.testing.assert_allclose(aligned.poses, POSES, atol=1e-6)
 
 
 def _query(points: np.ndarray, window: int = 3) -> roles.PoseQuery:

@@ -77,15 +77,6 @@ def _cameras(count: int = 4) -> tuple[np.ndarray, np.ndarray]:
     return poses, np.array([400.0, 410.0]) + rng.normal(0, 2, (count, 2))
 
 
-def test_cameras_come_back_from_their_encoding() -> None:
-    # Proves the decoding of poses and fields of view, whatever the quaternion's sign and length. Oracle: round trip.
-    poses, focal = _cameras()
-    found, cameras, usable = decode_cameras(_encode(poses, focal, (392, 518)), (392, 518))
-    assert usable.all()
-    np.testing.assert_allclose(found, poses, atol=1e-12)
-    np.testing.assert_allclose(cameras, np.column_stack([focal, np.tile([258.5, 195.5], (4, 1))]), rtol=1e-12)
-
-
 def test_a_view_without_a_rotation_is_not_found() -> None:
     # Proves that nonsense of one view costs that view only. Oracle: the views that were spoilt.
     poses, focal = _cameras(5)

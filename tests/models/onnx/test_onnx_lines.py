@@ -8,7 +8,7 @@ import pytest
 import tiny_networks as tiny
 from vggtgeo.models.classical import LsdDetector
 from vggtgeo.models.onnx import contracts
-from vggtgeo.models.onnx.dinov3 import DenseLineMatcher, DinoFeatures, segment_similarity
+from vggtgeo.models.onnx.dinov3 import DenseLineMatcher, DinoFeatures
 from vggtgeo.models.onnx.line_detectors import (
     LetrDetector,
     MlsdDetector,
@@ -131,20 +131,6 @@ def test_a_segment_is_cut_off_along_itself() -> None:
 # --- matching ----------------------------------------------------------------------------------------------------
 
 
-def test_similarity_is_the_mean_of_the_best_both_ways() -> None:
-    # Proves the matrix product behind it. Oracle: loops over its definition.
-    rng = np.random.default_rng(0)
-    first, second = (rng.normal(size=(count, 4, 6)) for count in (3, 5))
-    first /= np.linalg.norm(first, axis=2, keepdims=True)
-    second /= np.linalg.norm(second, axis=2, keepdims=True)
-    found = segment_similarity(first, second)
-    for i, a in enumerate(first):
-        for j, b in enumerate(second):
-            there = np.mean([max(x @ y for y in b) for x in a])
-            back = np.mean([max(x @ y for x in a) for y in b])
-            assert abs(found[i, j] - 0.5 * (there + back)) < 1e-6
-
-
 @pytest.fixture
 def matcher(tmp_path: Path) -> DenseLineMatcher:
     path = tiny.dinov3(tmp_path / "dinov3.onnx", IMAGE, channels=32)
@@ -173,11 +159,3 @@ def test_segments_of_one_image_match_themselves(matcher: DenseLineMatcher) -> No
     matches = matcher.match(first, second)
     assert len(matches) >= 10, f"{len(matches)} of 12"
     np.testing.assert_array_equal(order[matches.index_j], matches.index_i)
-
-
-def test_no_segments_no_matches(matcher: DenseLineMatcher) -> None:
-    # Proves that empty sides give empty answers. Oracle: there is nothing to match.
-    none = matcher.describe(_textured(), Segments(np.zeros((0, 2, 2)), np.zeros(0)))
-    some = matcher.describe(_textured(), Segments(_fan(), np.ones(12)))
-    for pair in ((none, some), (some, none), (none, none)):
-        assert len(matcher.match(*pair)) == 0

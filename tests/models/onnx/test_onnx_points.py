@@ -7,133 +7,44 @@ import numpy as np
 import plane_views as views
 import pytest
 import tiny_networks as tiny
-from reported import raises
 from vggtgeo.models.onnx import contracts
-from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs, key_of
-from vggtgeo.models.onnx.dense_points import DensePointMatcher, peaks, vectors_at
-from vggtgeo.models.onnx.dinov3 import DescriptorGrid, DinoFeatures, saliency
-from vggtgeo.models.onnx.file_checks import NetworkFileError
-from vggtgeo.models.onnx.fit import Fit
-from vggtgeo.models.onnx.mast3r import Mast3rMatcher, corners, nearest, reciprocal
+from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache, Outputs
+from vggtgeo.models.onnx.dinov3 import DinoFeatures, saliency
+from vggtgeo.models.onnx.fit import vectors_at
+from vggtgeo.models.onnx.point_matchers import DensePointMatcher, nearest, peaks, reciprocal
 from vggtgeo.models.onnx.session import Session, open_session
-from vggtgeo.models.roles import DenseConfidence, PointMatcher
-
-MOTION = views.pose((1.0, -2.0, 3.0), (0.1, -0.05, 0.05))
-SIZE = (240, 320)
+from vggtgeo.models.roles import DenseConfidence
 
 
-def _matcher(folder: Path, **settings: object) -> Mast3rMatcher:
-    encoder = tiny.mast3r_encoder(folder / "encoder.onnx", SIZE)
-    decoder = tiny.mast3r_decoder(folder / "decoder.onnx", SIZE)
-    return Mast3rMatcher(
-        open_session(encoder, contracts.MAST3R_ENCODER), open_session(decoder, contracts.MAST3R_DECODER), **settings
-    )
-
-
-def test_matches_follow_the_known_motion(tmp_path: Path) -> None:
-    # Proves encoder, decoder, reciprocal search and refinement together: the tiny decoder's descriptors are filters
-    # of the image, so that matches can be judged. Oracle: the homography between two views of a plane.
-    first, second, homography = views.plane_pair(MOTION)
-    matcher = _matcher(tmp_path)
-    assert isinstance(matcher, PointMatcher)
-    matches = matcher.match(matcher.describe(first), matcher.describe(second))
-    errors = np.linalg.norm(views.move(homography, matches.pixels_i) - matches.pixels_j, axis=1)
-    measured = f"{len(matches)} matches, median error {np.median(errors):.3f} px, {np.mean(errors > 3):.1%} wrong"
-    assert len(matches) > 200, measured
-    assert np.median(errors) < 0.15, measured
-    assert np.mean(errors > 3) < 0.03, measured
-    assert (matches.index_j == -1).all()
-    assert len(np.unique(matches.index_i)) == len(matches)
-
-
-def test_blank_images_have_no_key_points(tmp_path: Path) -> None:
-    # Proves that a blank image costs nothing and matches nothing. Oracle: there is nothing to find.
-    matcher = _matcher(tmp_path)
-    blank = matcher.describe(np.full((*SIZE, 3), 90, np.uint8))
-    full = matcher.describe(views.plane_pair(MOTION)[0])
-    assert len(blank) == 0
-    assert len(matcher.match(blank, full)) == 0
-    assert len(matcher.match(full, blank)) == 0
-
-
-@pytest.mark.parametrize("size", [SIZE, ("H", "W")], ids=["fixed", "open"])
-def test_key_points_of_maps_follow_the_known_motion(tmp_path: Path, size: tuple) -> None:
-    # Proves key points, their vectors and their matches, of a file with the size of the images (no multiple of 32, so
-    # that they are resized) fixed or open: the tiny network's maps are filters of the image. Oracle: the homography
-    # between two views of a plane; a blank image.
-    fixed = (256, 320) if size == SIZE else size
-    session = open_session(tiny.alike(tmp_path / "alike.onnx", fixed), contracts.ALIKE)
-    matcher = DensePointMatcher(session=session)
-    assert isinstance(matcher, PointMatcher)
-    first, second, homography = views.plane_pair(MOTION)
-    described = matcher.describe(first), matcher.describe(second)
-    assert np.allclose(np.linalg.norm(described[0].descriptors.vectors, axis=1), 1.0, atol=1e-5)
-    matches = matcher.match(*described)
-    errors = np.linalg.norm(views.move(homography, matches.pixels_i) - matches.pixels_j, axis=1)
-    measured = f"{len(matches)} matches, median error {np.median(errors):.3f} px, {np.mean(errors > 3):.1%} wrong"
-    assert len(matches) > 150, measured
-    assert np.median(errors) < 0.2, measured
-    assert np.mean(errors > 3) < 0.03, measured
-    assert (described[1].pixels[matches.index_j] - matches.pixels_j).max() < 3
-    blank = matcher.describe(np.full((*SIZE, 3), 90, np.uint8))
-    assert len(blank) == 0
-    assert len(matcher.match(blank, described[0])) == len(matcher.match(described[0], blank)) == 0
-
-
-def test_peaks_and_vectors_lie_between_pixels() -> None:
-    # Proves the place of a maximum between pixels, the least score, and vectors of a map as large as the image and of
-    # one 8 times coarser. Oracle: a bell at a known place, a map that is linear in the place.
+def test_peaks_lie_between_pixels() -> None:
+    # Proves the place of a maximum between pixels, and the least score. Oracle: a bell at a known place.
     y, x = np.mgrid[:64, :96].astype(np.float64)
     bell = np.exp(-0.5 * ((x - 40.3) ** 2 + (y - 20.8) ** 2) / 4) + 0.3 * (np.hypot(x - 70, y - 30) < 0.5)
     places, values = peaks(bell, 0.2)
     np.testing.assert_allclose(places[values.argmax()], [40.3, 20.8], atol=0.05)
     assert len(places) == 2
     assert len(peaks(bell, 0.5)[0]) == 1
-    for step in (1, 8):
-        rows, columns = (np.arange(0, side, step) + 0.5 * (step - 1) for side in (64, 96))
-        grid = np.stack(np.broadcast_arrays(columns[None, :], rows[:, None], 50.0))
-        found = vectors_at(grid, np.array([[40.3, 20.8], [12.0, 9.5]]), (64, 96))
-        for vector, place in zip(found, ((40.3, 20.8, 50.0), (12.0, 9.5, 50.0)), strict=True):
-            np.testing.assert_allclose(vector, np.array(place) / np.linalg.norm(place), atol=1e-5)
+
+
+@pytest.mark.parametrize("step", [1, 8, 64])
+def test_vectors_are_interpolated_between_the_centres_of_cells(step: int) -> None:
+    # Proves vectors of a map as large as the network's input, of one 8 times coarser and of a single cell, and beyond
+    # the outermost centres. Oracle: a map that is linear in the place.
+    rows, columns = (np.arange(0, side, step) + 0.5 * (step - 1) for side in (64, 128))
+    grid = np.stack(np.broadcast_arrays(columns[None, :], rows[:, None], 50.0), axis=-1).astype(np.float32)
+    pixels = np.array([[40.3, 20.8], [12.0, 9.5], [-0.4, 63.4], [127.0, 0.0]])
+    x, y = (np.clip(place, edge[0], edge[-1]) for place, edge in zip(pixels.T, (columns, rows), strict=True))
+    expected = np.column_stack([x, y, np.full(4, 50.0)])
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(vectors_at(grid, pixels, (64, 128)), expected, atol=1e-5)
 
 
 def test_xfeat_s_blocks_have_vectors(tmp_path: Path) -> None:
-    # Proves the adapter on the other contract, and that the two are told apart by their signatures. Oracle: shapes.
+    # Proves the adapter on the other contract. Oracle: shapes.
     file = tiny.xfeat(tmp_path / "xfeat.onnx")
     features = DensePointMatcher(session=open_session(file, contracts.XFEAT)).describe(views.texture(0, (128, 96)))
     assert features.descriptors.vectors.shape == (len(features), 64)
     assert len(features) > 20
-    with raises("xfeat", error=NetworkFileError):
-        open_session(file, contracts.ALIKE)
-
-
-def test_an_image_is_encoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Proves that the encoder runs once an image, not once a pair, until `kept` others came. Oracle: a count.
-    matcher = _matcher(tmp_path, cache=MemoryCache(0), kept=3)
-    real, runs = Session.run_on_device, []
-
-    def run(self: Session, inputs: dict, wanted: object = None) -> object:
-        runs.extend([self] if self is matcher.encoder else [])
-        return real(self, inputs, wanted)
-
-    monkeypatch.setattr(Session, "run_on_device", run)
-    pictures = [views.texture(seed, (320, 240)) for seed in range(4)]
-    described = [matcher.describe(picture) for picture in pictures]
-    assert runs == []
-    for first, second, expected in ((0, 1, 2), (1, 2, 3), (0, 2, 3), (0, 3, 4), (1, 0, 5)):
-        matcher.match(described[first], described[second])
-        assert len(runs) == expected, (first, second)
-
-
-def test_the_strongest_corner_of_each_cell_is_taken() -> None:
-    # Proves that corners cover the image and blank cells have none. Oracle: an image with one known corner in a cell.
-    image = np.zeros((64, 96, 3), np.uint8)
-    image[20:40, 30:] = 200
-    pixels, strength = corners(image, 16, 1e-5)
-    assert len(np.unique(pixels // 16, axis=0)) == len(pixels)
-    best = pixels[strength.argmax()]
-    assert np.abs(best - [30, 20]).max() <= 2 or np.abs(best - [30, 39]).max() <= 2
-    assert (pixels[:, 0] > 20).all()
 
 
 def _smooth_grid(seed: int, shape: tuple[int, int] = (24, 30)) -> np.ndarray:
@@ -196,28 +107,6 @@ def test_confidence_is_high_where_the_network_looks(tmp_path: Path) -> None:
     assert means[1] > 1.5 * max(means[0], means[2], means[3]), means
 
 
-def test_descriptors_are_interpolated_between_patch_centres() -> None:
-    # Proves where patches lie and how descriptors between them come about. Oracle: a grid that is linear in x and y.
-    fit = Fit.of((96, 128), (48, 64))
-    y, x = np.mgrid[:3, :4]
-    grid = np.stack([x, y, np.full(x.shape, 5.0)], axis=-1).astype(np.float32)
-    pixels = np.random.default_rng(0).uniform((16, 16), (111, 79), (50, 2))
-    place = ((pixels + 0.5) / 2) / 16 - 0.5
-    expected = np.column_stack([place, np.full(50, 5.0)])
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    np.testing.assert_allclose(DescriptorGrid(grid, fit, 16).at(pixels), expected, atol=1e-5)
-
-
-def test_pixels_beyond_the_outermost_centres_take_those(tmp_path: Path) -> None:
-    # Proves that no pixel of the image is out of reach, even on one patch. Oracle: the corner patches.
-    fit = Fit.of((32, 48), (32, 48))
-    grid = np.eye(6, dtype=np.float32).reshape(2, 3, 6)
-    corner = DescriptorGrid(grid, fit, 16).at(np.array([[0.0, 0], [47, 0], [0, 31], [47, 31]]))
-    np.testing.assert_allclose(corner, np.eye(6)[[0, 2, 3, 5]])
-    lonely = DescriptorGrid(grid[:1, :1], Fit.of((16, 16), (16, 16)), 16).at(np.array([[3.0, 9.0]]))
-    np.testing.assert_allclose(lonely, np.eye(6)[:1])
-
-
 # --- the cache ---------------------------------------------------------------------------------------------------
 
 
@@ -244,7 +133,8 @@ def test_what_was_asked_before_is_not_computed_again(tmp_path: Path, session: Se
     other = image.copy()
     other[0, 0, 0] ^= 1
     compute, calls = _counted({"a": np.arange(6.0).reshape(2, 3), "b": np.array(3, np.float16)})
-    questions = [(("x", 1), (image,)), (("x", 2), (image,)), (("x", 1), (other,)), (("x", 1), (image, other))]
+    images = [(image,), (other,), (image, other), (image.reshape(64, 48, 3),)]  # the last has the bytes of the first
+    questions = [(("x", 2), (image,)), *((("x", 1), given) for given in images)]
     for count, (settings, images) in enumerate(questions, start=1):
         for _ in range(2):
             found = cache.get((session,), settings, images, compute)
@@ -262,13 +152,6 @@ def test_another_file_is_another_network(tmp_path: Path, session: Session) -> No
     for network, count in ((session, 1), (other, 2), (again, 2)):
         cache.get((network,), (), (), compute)
         assert len(calls) == count
-
-
-def test_the_key_separates_shape_from_content() -> None:
-    # Proves that two images with the same bytes differ by their shape. Oracle: a reshaped array.
-    image = np.zeros((4, 6, 3), np.uint8)
-    assert key_of(("n",), (), (image,)) != key_of(("n",), (), (image.reshape(6, 4, 3),))
-    assert key_of(("n",), (), (image,)) == key_of(("n",), (), (np.asfortranarray(image),))
 
 
 def test_the_memory_forgets_the_oldest(session: Session) -> None:

@@ -12,7 +12,7 @@ import tiny_networks as tiny
 from reported import raises, warns
 from tiny_sequences import seven_scenes
 from typer.testing import CliRunner
-from vggtgeo.models.onnx.mast3r import Mast3rMatcher
+from vggtgeo.models.onnx.point_matchers import Mast3rMatcher
 from vggtgeo.models.onnx.registry import files_of, players
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.window_locator import WindowLocator

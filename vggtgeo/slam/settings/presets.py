@@ -19,7 +19,7 @@ from typing import Any, get_args
 
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_positive, path_of
-from vggtgeo.io.network_files import as_input_errors, networks_folder
+from vggtgeo.io.network_files import networks_folder
 from vggtgeo.models.classical import ConstantVelocity, OrbMatcher
 from vggtgeo.models.onnx.bounds import (
     BoundedConfidence,
@@ -31,15 +31,13 @@ from vggtgeo.models.onnx.bounds import (
     Refusals,
 )
 from vggtgeo.models.onnx.cache import FolderCache, MemoryCache, OutputCache
-from vggtgeo.models.onnx.dense_points import DensePointMatcher
+from vggtgeo.models.onnx.contracts import NetworkFileError
 from vggtgeo.models.onnx.dinov3 import DenseLineMatcher, DinoFeatures
-from vggtgeo.models.onnx.file_checks import NetworkFileError, check_looks_like_onnx
 from vggtgeo.models.onnx.line_detectors import LetrDetector, MlsdDetector
-from vggtgeo.models.onnx.mast3r import Mast3rMatcher
 from vggtgeo.models.onnx.moge2 import MogeDepth
-from vggtgeo.models.onnx.providers import Provider
+from vggtgeo.models.onnx.point_matchers import DensePointMatcher, Mast3rMatcher
 from vggtgeo.models.onnx.registry import NETWORKS, files_of, players
-from vggtgeo.models.onnx.session import Session, open_session
+from vggtgeo.models.onnx.session import Provider, Session, open_session
 from vggtgeo.models.onnx.vggt import VggtWindow
 from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.slam.settings.slam_settings import Roles
@@ -192,13 +190,10 @@ def perception(
             "get each"
         )
     limits: dict[str, Any] = {"provider": provider, "memory_limit_gb": memory_limit_gb}
-    with as_input_errors():
-        for file in files.values():
-            check_looks_like_onnx(file)  # before gigabytes of others are read
-        networks = {name: open_session(file, NETWORKS[name].contract, **limits) for name, file in files.items()}
-        players, refusals = _players(parts, classical, networks, cache)
-        for session in networks.values():
-            session.warm_up()
+    networks = {name: open_session(file, NETWORKS[name].contract, **limits) for name, file in files.items()}
+    players, refusals = _players(parts, classical, networks, cache)
+    for session in networks.values():
+        session.warm_up()
     return Perception(replace(classical, **players), networks, refusals)
 
 

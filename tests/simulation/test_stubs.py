@@ -5,18 +5,19 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from vggtgeo.models.roles import DenseConfidence, LineDetector, MetricDepth, PointMatcher, WindowGeometry
-from vggtgeo.models.stubs import (
+
+from vggtgeo.geometry.pinhole import at_pixels
+from vggtgeo.simulation import IDEAL, SimulatedOracle, simulate
+from vggtgeo.simulation.stubs import (
     SimulatedDino,
     SimulatedLetr,
     SimulatedMast3r,
     SimulatedMoge,
     SimulatedVggt,
-    SmoothField,
+    smooth_field,
+    stream,
     weakness,
 )
-
-from vggtgeo.geometry.pinhole import at_pixels
-from vggtgeo.simulation import IDEAL, SimulatedOracle, simulate
 
 SIZE = (160, 120)
 EVERY = 4  # frames between images
@@ -48,8 +49,8 @@ def test_smooth_fields_have_unit_variance_and_memory() -> None:
     count, memory = 500, 1.5
     first, later = np.empty(count), np.empty(count)
     for seed in range(count):
-        field = SmoothField(seed, "test", cycles=1.0, memory=memory)
-        first[seed], later[seed] = field.sample((48, 64), 2.0)[20, 30], field.sample((48, 64), 3.0)[20, 30]
+        field = lambda time, seed=seed: smooth_field(stream(seed, "test"), (48, 64), time, cycles=1.0, memory=memory)
+        first[seed], later[seed] = field(2.0)[20, 30], field(3.0)[20, 30]
     expected = np.exp(-0.5 / memory**2)
     assert abs(first.mean()) < 4 / np.sqrt(count), f"{first.mean()=}"
     assert abs(first.var() - 1) < 4 * np.sqrt(2 / count), f"{first.var()=}"

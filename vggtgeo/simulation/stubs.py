@@ -17,14 +17,47 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PointMatches, Segments, WindowGuess
 
 from vggtgeo.geometry import pinhole
+from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PointMatches, Segments, WindowGuess
+from vggtgeo.simulation.oracle import SimulatedOracle
+
+_WAVES = 24
+_FULL_TEXTURE = 0.25
+"""Strength from which a region counts as well textured."""
+
+
+def stream(seed: int, role: str, *indices: int) -> np.random.Generator:
+    """Return the random stream of one answer."""
+    return np.random.default_rng([seed, zlib.crc32(role.encode()), *indices])
+
+
+def smooth_field(
+    rng: np.random.Generator, shape: tuple[int, int], time: float, cycles: float, memory: float
+) -> np.ndarray:
+    """Return a Gaussian-like field over a picture that drifts with time, float32 [H, W]: mean 0, variance 1 everywhere.
+
+    f(x, y, t) = sqrt(2 / K) sum_k cos(2 pi (a_k x + b_k y) + c_k t + phase_k), x and y in [0, 1]; a, b normal with
+    deviation `cycles` waves a picture, c normal with deviation 1 / `memory` (seconds). Equal streams give one field.
+    """
+    across, down = rng.normal(0, cycles, (2, _WAVES))
+    phase = rng.uniform(0, 2 * np.pi, _WAVES) + time * rng.normal(0, 1 / memory, _WAVES)
+    y, x = np.mgrid[0:49, 0:65]
+    angle = 2 * np.pi * (across * (x / 64)[..., None] + down * (y / 48)[..., None]) + phase
+    coarse = np.sqrt(2 / _WAVES) * np.cos(angle).sum(axis=-1)
+    return cv2.resize(coarse.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+
+
+def weakness(oracle: SimulatedOracle, index: int) -> np.ndarray:
+    """Return the lack of texture, float32 [H, W] in [0, 1]: 1 on a plain wall, 0 from a strength of 0.25."""
+    texture = oracle.texture(index).astype(np.float32)
+    around = cv2.GaussianBlur(texture, (0, 0), max(1.0, texture.shape[1] / 53))
+    return np.clip(1.0 - around / _FULL_TEXTURE, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -37,7 +70,7 @@ class SimulatedMoge:
     deviation of a frame's scale. The estimate states sqrt(sigma^2 + wobble^2) and a confidence error / sigma(u).
     """
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     error: float = 0.05
     weak: float = 0.6
@@ -54,9 +87,10 @@ class SimulatedMoge:
         depth = self.oracle.depth(index)
         sigma = self.error * (1 + self.weak * weakness(self.oracle, index))
         sigma = sigma * np.where(self.oracle.glass(index), self.glass, 1.0)
-        field = SmoothField(self.seed, "moge", self.cycles, self.memory)
+        time = self.oracle.timestamp(index)
+        field = smooth_field(stream(self.seed, "moge"), depth.shape, time, self.cycles, self.memory)
         scale = self.wobble * stream(self.seed, "moge", index).standard_normal()
-        log_error = sigma * field.sample(depth.shape, self.oracle.timestamp(index)) + scale
+        log_error = sigma * field + scale
         confidence = np.where(np.isfinite(depth), self.error / np.maximum(sigma, 1e-12), 0.0)
         stated = np.where(np.isfinite(depth), np.maximum(np.hypot(sigma, self.wobble), 1e-6), np.nan)
         return DepthEstimate(
@@ -73,7 +107,7 @@ class SimulatedDino:
     floor: least saliency. share: weight of texture against structure. reach: pixels. patch: side of a patch, pixels.
     """
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     noise: float = 0.08
     floor: float = 0.10
@@ -104,46 +138,6 @@ class SimulatedDino:
         return np.exp(-distance / self.reach)
 
 
-_WAVES = 24
-_FULL_TEXTURE = 0.25  # strength from which a region counts as well textured
-
-
-def stream(seed: int, role: str, *indices: int) -> np.random.Generator:
-    """Return the random stream of one answer."""
-    return np.random.default_rng([seed, zlib.crc32(role.encode()), *indices])
-
-
-@dataclass(frozen=True)
-class SmoothField:
-    """A Gaussian-like field over the picture that drifts with time: mean 0, variance 1 at every place and time.
-
-    f(x, y, t) = sqrt(2 / K) sum_k cos(2 pi (a_k x + b_k y) + c_k t + phase_k), x and y in [0, 1]; a, b normal with
-    deviation `cycles` waves a picture, c normal with deviation 1 / `memory` (seconds).
-    """
-
-    seed: int
-    role: str
-    cycles: float
-    memory: float
-
-    def sample(self, shape: tuple[int, int], time: float) -> np.ndarray:
-        """Return the field at `time` (seconds) for a picture of `shape` (H, W), float32 [H, W]."""
-        rng = stream(self.seed, self.role)
-        across, down = rng.normal(0, self.cycles, (2, _WAVES))
-        phase = rng.uniform(0, 2 * np.pi, _WAVES) + time * rng.normal(0, 1 / self.memory, _WAVES)
-        y, x = np.mgrid[0:49, 0:65]
-        angle = 2 * np.pi * (across * (x / 64)[..., None] + down * (y / 48)[..., None]) + phase
-        coarse = np.sqrt(2 / _WAVES) * np.cos(angle).sum(axis=-1)
-        return cv2.resize(coarse.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
-
-
-def weakness(oracle: Oracle, index: int) -> np.ndarray:
-    """Return the lack of texture, float32 [H, W] in [0, 1]: 1 on a plain wall, 0 from a strength of 0.25."""
-    texture = oracle.texture(index).astype(np.float32)
-    around = cv2.GaussianBlur(texture, (0, 0), max(1.0, texture.shape[1] / 53))
-    return np.clip(1.0 - around / _FULL_TEXTURE, 0.0, 1.0)
-
-
 @dataclass(frozen=True)
 class SimulatedMast3r:
     """Error model, with w in [0, 1] the lack of texture at the key point and g = 1 behind glass, else 0.
@@ -159,7 +153,7 @@ class SimulatedMast3r:
     simulated: ClassVar[bool] = True
     """Its descriptors are numbers of frames, which mean nothing in another run."""
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     count: int = 1500
     spread: float = 0.10
@@ -213,7 +207,7 @@ class SimulatedLetr:
     [0.7, 0.85] for false ones (LETR's own threshold is 0.7), so that a score tells a little and no more.
     """
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     across: float = 0.7
     along: float = 3.0
@@ -274,7 +268,7 @@ class SimulatedVggt:
     focal length is guessed with the relative error `focal`.
     """
 
-    oracle: Oracle
+    oracle: SimulatedOracle
     seed: int = 0
     rotation: float = 0.002
     translation: float = 0.02
@@ -298,8 +292,9 @@ class SimulatedVggt:
         poses, found = self._poses(indices, lacking.mean(axis=(1, 2)), middle, rng)
         poses[:, :3, 3] /= unit
         sigma = self.depth_error * (1 + self.weak * lacking)
-        field = SmoothField(int(rng.integers(2**31)), "vggt", self.cycles, self.memory)
-        waves = np.stack([field.sample(depths[0].shape, self.oracle.timestamp(index)) for index in indices])
+        seed, times = int(rng.integers(2**31)), [self.oracle.timestamp(index) for index in indices]
+        field = lambda time: smooth_field(stream(seed, "vggt"), depths[0].shape, time, self.cycles, self.memory)
+        waves = np.stack([field(time) for time in times])
         certainty = np.where(np.isfinite(depths), self.depth_error / np.maximum(sigma, 1e-12), 0.0)
         return WindowGuess(
             poses=poses,
@@ -362,57 +357,3 @@ def _tree(overlap: np.ndarray, least: float) -> list[tuple[int, int, float]]:
         placed.append(-view)
         waiting.remove(-view)
     return branches
-
-
-class VisibleSegments(Protocol):
-    """Visible straight edges. pixels: float [L, 2, 2] (segment, end, xy). contrast: float [L], grey levels a pixel."""
-
-    @property
-    def pixels(self) -> np.ndarray: ...
-
-    @property
-    def contrast(self) -> np.ndarray: ...
-
-
-@runtime_checkable
-class Oracle(Protocol):
-    """Knows each image that its scene has given. `index` is the frame's number."""
-
-    @property
-    def intrinsics(self) -> np.ndarray:
-        """fx, fy, cx, cy, float [4], pixels."""
-        ...
-
-    def index_of(self, image: np.ndarray) -> int:
-        """Return the frame whose image this is; raises ValueError for any other image."""
-        ...
-
-    def timestamp(self, index: int) -> float:
-        """Return the time, seconds."""
-        ...
-
-    def pose(self, index: int) -> np.ndarray:
-        """Return world -> camera, float [4, 4]."""
-        ...
-
-    def depth(self, index: int) -> np.ndarray:
-        """Return float [H, W], metres, NaN = none."""
-        ...
-
-    def glass(self, index: int) -> np.ndarray:
-        """Return bool [H, W], pixels seen through glass."""
-        ...
-
-    def texture(self, index: int) -> np.ndarray:
-        """Return float [H, W] in [0, 1), strength of texture."""
-        ...
-
-    def edges(self, index: int) -> Any:
-        """Return the `VisibleSegments` of the frame."""
-        ...
-
-    def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where pixels [n, 2] of frame i are in frame j, float [n, 2], and whether they are seen there, bool
-        [n].
-        """
-        ...

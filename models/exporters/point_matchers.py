@@ -1,6 +1,8 @@
-"""MASt3R (Leroy et al., ECCV 2024) in two files: encoder features once an image, then the decoder for each pair.
+"""Point matchers: MASt3R (Leroy et al., ECCV 2024) in two files, encoder features once an image, then the decoder for
+each pair; and ALIKE (Zhao et al., IEEE Transactions on Multimedia 2022) and XFeat (Potje et al., CVPR 2024), as
+published. Key points are taken of their maps by the adapter, so that their number is no part of the file.
 
-Changes to the loaded module:
+Changes to MASt3R:
 
 - Rotary embedding looks `positions.max()` up in the data: angles become constants of the grid (`attention`).
 - Image shapes travel through the published code as tensors: encoder, decoder and heads are called one by one, with
@@ -43,9 +45,18 @@ _METRIC: dict[str, Any] = {
 """`MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric`, for images that are not turned to landscape."""
 _SMALL = {"enc_embed_dim": 192, "enc_depth": 2, "enc_num_heads": 3, "dec_embed_dim": 192, "dec_num_heads": 3}
 _HEAD_OUTPUTS = {"points": "pts3d", "confidence": "conf", "descriptors": "desc", "descriptor_confidence": "desc_conf"}
+_ALIKE_SIZES = {
+    "tiny": (8, 16, 32, 64, 64),
+    "small": (8, 16, 48, 96, 96),
+    "normal": (16, 32, 64, 128, 128),
+    "large": (32, 64, 128, 128, 128),
+}
+"""Channels of the four blocks, and of the descriptors."""
+_BLOCK = 8
+"""Side of the blocks of pixels of XFeat."""
 
 
-def build_encoder(request: Request) -> Graph:
+def build_mast3r_encoder(request: Request) -> Graph:
     """Return image to features."""
     torch = load("torch")
     network = _network(request)
@@ -58,7 +69,7 @@ def build_encoder(request: Request) -> Graph:
     return Graph(as_module(network, _encode), {"image": image}, {"features": features.numpy()})
 
 
-def build_decoder(request: Request) -> Graph:
+def build_mast3r_decoder(request: Request) -> Graph:
     """Build the decoder: features of two images to points, descriptors and confidences of both.
 
     The example's features are of random images.
@@ -121,3 +132,38 @@ def _decode(request: Request) -> Callable[..., tuple[Any, ...]]:
         return tuple(view[key] for view in views for key in _HEAD_OUTPUTS.values())
 
     return forward
+
+
+def build_alike(request: Request) -> Graph:
+    """Return the network for one image of the request's size: a map of scores and one of unit descriptors."""
+    torch = load("torch")
+    with request.code() as imported:
+        network = imported("alnet").ALNet(*_ALIKE_SIZES[request.variant], single_head=request.variant != "large")
+    fill(network, request, f"ALIKE {request.variant}")
+
+    def forward(network: Any, image: Any) -> tuple[Any, Any]:
+        scores, descriptors = network(image)
+        return scores, torch.nn.functional.normalize(descriptors, dim=1)
+
+    return Graph.unchanged(network, forward, {"image": request.random_images(0.0, 1.0)}, ("scores", "descriptors"))
+
+
+def build_xfeat(request: Request) -> Graph:
+    """Return the network for one image of the request's size: a map of scores, and unit descriptors of 8 x 8 blocks.
+
+    The score of a pixel is the probability of a key point there, among the pixels of its block and none, times the
+    reliability of the block, as in the published detector.
+    """
+    functional = load("torch").nn.functional
+    with request.code() as imported:
+        network = imported("modules.model").XFeatModel()
+    fill(network, request, "XFeat")
+
+    def forward(network: Any, image: Any) -> tuple[Any, Any]:
+        features, logits, reliability = network(image)
+        places = functional.pixel_shuffle(logits.softmax(dim=1)[:, : _BLOCK**2], _BLOCK)
+        trust = functional.interpolate(reliability, scale_factor=_BLOCK, mode="bilinear")
+        return places * trust, functional.normalize(features, dim=1)
+
+    image = {"image": request.random_images(0.0, 1.0)}
+    return Graph.unchanged(network, forward, image, ("scores", "block_descriptors"))

@@ -1,4 +1,7 @@
-"""MASt3R (Leroy et al., ECCV 2024) as a point matcher: an encoder once an image, a decoder once a pair."""
+"""Point matchers: MASt3R (Leroy et al., ECCV 2024), an encoder once an image and a decoder once a pair; and ALIKE (Zhao
+et al., IEEE Transactions on Multimedia 2022) and XFeat (Potje et al., CVPR 2024), which return maps of an image: a
+score per pixel, and descriptors per pixel or per 8 x 8 block.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields, check_image
-from vggtgeo.models.classical.pixel_matcher import refined
+from vggtgeo.models.checks import check_fields
+from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher, spread, verified
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
-from vggtgeo.models.onnx.file_checks import NetworkFileError
-from vggtgeo.models.onnx.fit import Fit
+from vggtgeo.models.onnx.contracts import NetworkFileError
+from vggtgeo.models.onnx.fit import Fit, vectors_at
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Features, PointMatches
 
@@ -69,7 +72,6 @@ class Mast3rMatcher:
 
     def describe(self, image: np.ndarray) -> Features:
         """Return key points of `image` (uint8 [H, W, 3]); the network runs when they are matched."""
-        check_image("image", image)
         fit = Fit.of(image.shape[:2], self.size)
         starts, strength = corners(fit.resize(image), self.spacing, self.corner)
         pixels = fit.to_image(starts.astype(np.float64))
@@ -92,9 +94,8 @@ class Mast3rMatcher:
             pixels_j[index],
             confidence_of(found["certainty"][index]),
         )
-        matches = matches.select(self.verifier.inliers(matches.pixels_i, matches.pixels_j))
         gray_i, gray_j = (cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY) for view in (first, second))
-        return refined(self.refinement, gray_i, gray_j, matches)
+        return verified(matches, self.verifier, self.refinement, gray_i, gray_j)
 
     def _run(self, first: Mast3rView, second: Mast3rView) -> Outputs:
         if not len(first.starts):
@@ -183,3 +184,59 @@ def _around(queries: np.ndarray, grid: np.ndarray, found: np.ndarray, reach: int
     places = np.clip(found[:, None] + steps, 0, [grid.shape[1] - 1, grid.shape[0] - 1])
     products = np.einsum("md,mkd->mk", queries, grid[places[..., 1], places[..., 0]])
     return places[np.arange(len(places)), products.argmax(axis=1)]
+
+
+_RADIUS = 2
+"""Radius of non-maximum suppression, pixels, as published for both networks."""
+
+
+@dataclass(frozen=True, eq=False)
+class DensePointMatcher(PixelMatcher):
+    """A `PointMatcher`. Key points: the local maxima of the score map, to a fraction of a pixel, spread over the image.
+
+    score: minimum score, in [0, 1]; the authors use 0.2 (ALIKE) and 0.05 (XFeat), and less keeps faint points of white
+    walls. Other fields: `PixelMatcher`.
+    """
+
+    session: Session = field(kw_only=True)
+    cache: OutputCache = field(default_factory=MemoryCache)
+    score: float = 0.02
+
+    def describe(self, image: np.ndarray) -> Features:
+        """Return key points and unit vectors of `image` (uint8 [H, W, 3]); none where no score is high enough."""
+        settings = ("key points", self.count, self.score)
+        found = self.cache.get((self.session,), settings, (image,), lambda: self._run(image))
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        return Features(found["pixels"], found["scores"], PixelDescriptors(found["vectors"], gray))
+
+    def _run(self, image: np.ndarray) -> Outputs:
+        fit = self.session.fit(image)
+        scores, descriptors = (tensor.name for tensor in self.session.contract.outputs)
+        maps = self.session.run({"image": self.session.prepare(image, fit)})
+        places, strength = peaks(maps[scores][0, 0], self.score)
+        pixels = fit.to_image(places)
+        inside = np.flatnonzero(fit.inside(pixels))
+        keep = inside[spread(pixels[inside], strength[inside], self.count, image.shape[1::-1])]
+        vectors = vectors_at(maps[descriptors][0].transpose(1, 2, 0), places[keep], fit.network_size)
+        return {"pixels": pixels[keep], "scores": strength[keep], "vectors": vectors}
+
+
+def peaks(scores: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return local maxima of a map float [H, W] above `least`: float64 [M, 2] (x, y), and their values float64 [M].
+
+    The place between pixels is the top of the parabolas through a maximum and its neighbours in each direction; where
+    there is none, on a plateau or along a ridge, is no key point.
+    """
+    values = np.asarray(scores, np.float32)
+    side = 2 * _RADIUS + 1
+    highest = (values == cv2.dilate(values, np.ones((side, side), np.uint8))) & (values > least)
+    inner = np.zeros_like(highest)
+    inner[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS] = True
+    y, x = np.nonzero(highest & inner)
+    top = values[y, x].astype(np.float64)
+    before = np.stack([values[y, x - 1], values[y - 1, x]], axis=1)
+    after = np.stack([values[y, x + 1], values[y + 1, x]], axis=1)
+    bend = 2.0 * top[:, None] - before - after
+    good = (bend > 0).all(axis=1)
+    step = 0.5 * (after - before)[good] / bend[good]  # within half a pixel, as the middle one is highest
+    return np.stack([x, y], axis=1)[good] + step, top[good]
