@@ -10,7 +10,8 @@ import pytest
 import tiny_sequences
 from reported import raises
 
-from vggtgeo.datasets.bag_messages import Chosen, camera_of, chosen_topics, image_of, metres_of
+from vggtgeo.datasets.bag_cameras import camera_of
+from vggtgeo.datasets.bag_images import Chosen, chosen_topics, image_of, metres_of
 
 PLACE = Path("a.bag, /c, 0")
 
@@ -146,6 +147,6 @@ def test_the_camera_of_a_part_of_the_sensor_with_pixels_put_together() -> None:
     region = SimpleNamespace(x_offset=120, y_offset=200, width=400, height=200)
     info = SimpleNamespace(width=640, height=480, binning_x=2, binning_y=2, roi=region, distortion_model="plumb_bob")
     info.k, info.d = np.array([500.0, 0, 320, 0, 510, 300, 0, 0, 1]), np.zeros(5)
-    found = camera_of(Path("a.bag"), {"/c/info": [info]}, "/c/image", (200, 100))
+    found = camera_of(Path("a.bag"), {"/c/info": info}, "/c/image", (200, 100))
     assert found is not None
     np.testing.assert_allclose(found.intrinsics, (250.0, 255.0, 100.0, 50.0))

@@ -2,12 +2,12 @@
 
 Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage`; colour before grey and infrared),
 depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
-any other; depth with a camera of its own is registered by what the bag states of it, `bag_messages.py`), the camera's
+any other; depth with a camera of its own is registered by what the bag states of it, `bag_cameras.py`), the camera's
 `CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
 name contains `truth`, `gt`, `vicon` or `mocap`. A choice among several is reported.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -16,20 +16,23 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from vggtgeo.datasets.bag_messages import (
+from vggtgeo.datasets.bag_cameras import (
     CAMERA_INFO,
-    IMAGES,
     TRANSFORMS,
-    Chosen,
     DepthCamera,
-    Unread,
     camera_of,
-    chosen_topics,
     depth_camera_of,
-    described_choice,
     frame_name,
+    motion_between,
+)
+from vggtgeo.datasets.bag_images import (
+    IMAGES,
+    Chosen,
+    Unread,
+    chosen_topics,
     image_of,
     metres_of,
+    note_choice,
     truth_topic,
 )
 from vggtgeo.datasets.folder import ImageChecks
@@ -95,22 +98,20 @@ class RosBag:
 
         Raises:
             InputError: there are no colour images, the depth is of another camera and the bag has no extrinsics, or
-            rosbags
-                is not installed.
+                rosbags is not installed.
 
         """
         with _reader(path) as reader:
             topics = {name: str(info.msgtype) for name, info in reader.topics.items()}
-            first = {name: _first(reader, name) for name in topics if topics[name] in IMAGES}
-            chosen = chosen_topics(path, first)
-            poses = truth_topic(topics)
-            if text := described_choice(chosen, poses):
-                warn(f"`{path}`: {text}", NoteWarning)
+            first = {name: _first(reader, name) for name, kind in topics.items() if kind in IMAGES}
+            chosen, poses = chosen_topics(path, first), truth_topic(topics)
+            note_choice(path, chosen, poses)
             times, image, wrong = _times_and_first(reader, path, chosen.colour, image_of)
             if image is None:
                 raise InputError(f"none of the {len(times)} images of `{path}` can be read; the first: {wrong}")
             height, width = image.image.shape[:2]
-            infos = _infos(reader, topics)
+            infos = {name: _first(reader, name) for name, kind in topics.items() if kind == CAMERA_INFO}
+            infos = {name: info for name, info in infos.items() if not (info is None or isinstance(info, Unread))}
             frame = frame_name(first[chosen.colour].header.frame_id)
             known = camera_of(path, infos, chosen.colour, (width, height), frame)
             camera = known or guess_with_warning(str(path), width, height)
@@ -224,31 +225,22 @@ def _depth_is_usable(reader: Any, path: Path, topic: str, images: list[float], s
     return alone < len(images)
 
 
-def _infos(reader: Any, topics: Mapping[str, str]) -> dict[str, list[Any]]:
-    """Return the undamaged messages of the `CameraInfo` topics."""
-    kinds = [name for name, kind in topics.items() if kind == CAMERA_INFO]
-    messages = {name: [message for _, message in _messages(reader, name)] for name in kinds}
-    return {name: [one for one in found if not isinstance(one, Unread)] for name, found in messages.items()}
-
-
 def _depth_camera(
-    reader: Any,
-    path: Path,
-    chosen: Chosen,
-    first: Mapping[str, Any],
-    infos: Mapping[str, Sequence[Any]],
-    camera: Camera | None,
+    reader: Any, path: Path, chosen: Chosen, first: Mapping[str, Any], infos: Mapping[str, Any], camera: Camera | None
 ) -> DepthCamera | None:
     """Return `depth_camera_of`; None if no depth image can be read."""
-    for number, (_, message) in enumerate(_messages(reader, chosen.depth)):
-        try:
-            height, width = metres_of(message, _place(path, chosen.depth, number)).shape
-        except InputError:
-            continue
-        transforms = lambda: _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
-        cameras = camera, (width, height)
-        return depth_camera_of(path, chosen, first, infos, cameras, transforms, _extrinsics(reader))
-    return None
+    source, target = (frame_name(first[topic].header.frame_id) for topic in (chosen.depth, chosen.colour))
+
+    def stated_motion() -> np.ndarray | None:
+        transforms = _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
+        motion = motion_between(transforms, source, target) if source and target else None
+        return _extrinsics(reader) if motion is None else motion
+
+    _, depth, _ = _times_and_first(reader, path, chosen.depth, metres_of)
+    if depth is None:
+        return None
+    cameras = camera, depth.shape[::-1]
+    return depth_camera_of(path, chosen, (source, target), infos, cameras, stated_motion)
 
 
 def _extrinsics(reader: Any) -> np.ndarray | None:

@@ -12,6 +12,7 @@ from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES, is_ther
 from vggtgeo.datasets.images import ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
+from vggtgeo.datasets.live_camera import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.phones import ArkitScenes, Polycam, Scanner3d, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
@@ -20,7 +21,7 @@ from vggtgeo.datasets.scannet import ScanNet
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
-from vggtgeo.datasets.video import LiveCamera, VideoFile, is_live
+from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.views import with_rate
 from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.given import path_of
