@@ -78,6 +78,8 @@ class FolderSequence:
         further fields of the class.
         """
         files = tuple(FrameFile(index, *frame) for index, frame in enumerate(frames))
+        if not files:
+            raise InputError(f"`{folder}` has no images of a {cls.__name__}; `vggtgeo data list` shows its layout")
         for file in files:
             if not abs(file.timestamp) <= LATEST:
                 text = f"`{file.image.name}` has the time {file.timestamp:g}; it must be in seconds"

@@ -57,8 +57,6 @@ class Nerfstudio(FolderSequence):
         with parsing(file, _EXPECTED):
             content = read_json(file)
             images = _images(folder, content)
-            if not images:
-                raise ValueError("it lists no frames")
             order = sorted(images, key=lambda path: natural_key(str(path.relative_to(folder))))
             rows = [
                 (index / FRAMES_PER_SECOND, image, _depth(folder, images[image])) for index, image in enumerate(order)
@@ -135,8 +133,7 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
         centre = number("cx", 0.5 * across) - 0.5, number("cy", 0.5 * down) - 0.5
         fisheye = _is_fisheye(content)
         if unread := [key for key in ("k4", "k5", "k6") if number(key) and not (fisheye and key == "k4")]:
-            text = f"`{file}` has {', '.join(unread)} of its lens, which is not read, left out: undistort the images"
-            warn(text)
+            warn(f"`{file}` has {', '.join(unread)} of its lens, left out: undistort the images")
         lens = tuple(map(number, _OF_FISHEYE if fisheye else _DISTORTION))
         distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
         intrinsics = intrinsics_of(file, (fx, number("fl_y", fx), *centre))

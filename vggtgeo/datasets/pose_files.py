@@ -102,13 +102,13 @@ def trajectory_of_rows(
     """Return `trajectory_of` images whose poses are these lines of a file; warn of lines beyond its end."""
     there = [place for place, row in enumerate(rows) if row < len(poses)]
     beyond = len(rows) - len(there)
-    if beyond and len(poses):
+    if beyond:
         warn(
             f"`{where}`: {beyond} of {len(rows)} images, by their numbers up to {max(rows)} counted from 0, are beyond "
             f"its end (poses: {len(poses)}) and have no truth"
         )
-        if not there:
-            return None
+    if not there:
+        return None
     return trajectory_of([times[place] for place in there], poses[[rows[place] for place in there]], where)
 
 
@@ -134,23 +134,23 @@ def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray
     return poses
 
 
-def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
+def yaml_numbers(
+    file: Path, key: str, count: int | None = None, unstated: Sequence[float] | None = None
+) -> Sequence[float]:
     """Return the list of numbers after `key:` in a YAML file as the benchmarks write them: `key: [1, 2, 3]`.
 
-    Raises InputError if it is missing, or does not have `count` values (None: any number).
+    unstated: the default if it is missing. Raises InputError if it is missing without a default, or does not have
+    `count` values (None: any number).
     """
     found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", whole_text(file), re.MULTILINE)
+    if found is None and unstated is not None:
+        return unstated
     if found is None:
         raise InputError(f"`{file}` has no list `{key}: [...]`")
     words = found.group(1).replace(",", " ").split()
     if count is not None and len(words) != count:
         raise InputError(f"`{file}`: `{key}` has {len(words)} numbers; expected {count}")
     return numbers_of(words, f"`{file}`: `{key}`")
-
-
-def states_list(file: Path, key: str) -> bool:
-    """Return whether a YAML file has a list `key: [...]`."""
-    return re.search(rf"^\s*{re.escape(key)}\s*:\s*\[", whole_text(file), re.MULTILINE) is not None
 
 
 def numbers_of(words: Sequence[str], what: str) -> list[float]:
@@ -185,10 +185,7 @@ def same_size(stated: Sequence[object], size: tuple[int, int]) -> bool:
 def check_size(file: Path, stated: Sequence[object], size: tuple[int, int]) -> None:
     """Raise InputError if a camera's file is of images of another size."""
     if not same_size(stated, size):
-        raise InputError(
-            f"`{file}` is of images of {stated[0]} x {stated[1]} pixels; those here are {size[0]} x {size[1]}: write "
-            "the camera of these into it"
-        )
+        raise InputError(f"`{file}` is for {stated[0]} x {stated[1]} pixels; the images are {size[0]} x {size[1]}")
 
 
 def have_rotations(poses: np.ndarray) -> np.ndarray:
@@ -241,8 +238,8 @@ def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:
     rows = read_matrices(file, _KITTI)
     if clock is not None and len(clock) != len(rows):
         raise InputError(
-            f"`{file}` has poses without times (12 columns, KITTI), and {len(rows)} of them beside {len(clock)} of the "
-            "truth; give one for each of those, or a file with times, `timestamp tx ty tz qx qy qz qw`"
+            f"`{file}` has {len(rows)} poses without times (12 columns), the truth {len(clock)}; give as many, or "
+            "a file with times, `timestamp tx ty tz qx qy qz qw`"
         )
     poses = poses_of_rows(rows)
     times = np.arange(float(len(rows))) if clock is None else clock.timestamps

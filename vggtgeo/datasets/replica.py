@@ -13,7 +13,7 @@ from typing import Self
 
 from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.image_files import DepthFormat
-from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key, rows_of
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
 from vggtgeo.datasets.pose_files import check_size, parsing, read_json, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
@@ -41,16 +41,14 @@ class Replica(FolderSequence):
     @classmethod
     def open(cls, folder: Path) -> Self:
         """List the frames."""
-        images = sorted((folder / "results").glob("frame*"), key=lambda path: natural_key(path.name))
-        if not images:
-            raise InputError(f"`{folder}` has no `results/frameXXXXXX.jpg`; expected a room of Replica")
+        images = files_like(folder / "results", "frame*")
         rows = rows_of(images, _poses_in(folder / "traj.txt"))
         depths = (image.with_name(image.stem.replace("frame", "depth") + ".png") for image in images)
         frames = [
             ((row - rows[0]) / FRAMES_PER_SECOND, image, existing(depth))
             for row, image, depth in zip(rows, images, depths, strict=True)
         ]
-        places = (folder / _CAMERA, folder.resolve().parent / _CAMERA)
+        places = folder / _CAMERA, folder.resolve().parent / _CAMERA
         file = next((file for file in places if file.is_file()), None)
         scale, camera = (_UNITS, partial(_unstated_camera, folder)) if file is None else _stated(file)
         return cls.listed(folder, frames, camera, DepthFormat(scale), rows=rows)
@@ -92,8 +90,5 @@ def _unstated_camera(folder: Path, width: int, height: int) -> Camera:
         return Camera(_PUBLISHED, width, height)
     own = camera_from_folder(folder, width, height)
     if own is None:
-        raise InputError(
-            f"`{folder}` has no `{_CAMERA}`, which belongs beside it; its images have another size than "
-            f"those of the published camera, {_PUBLISHED_SIZE[0]} x {_PUBLISHED_SIZE[1]} pixels"
-        )
+        raise InputError(f"`{folder}` has no `{_CAMERA}`, in it or beside it, and its images are not 1200 x 680 pixels")
     return own
