@@ -232,20 +232,6 @@ def with_images(recording: Recording, change: Callable[[np.ndarray, int], np.nda
     return replace(recording, frames=frames)
 
 
-def in_bands_of_light(image: np.ndarray, row: int, share: float, period: float, speed: float) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], with flicker of a rolling shutter: bands of `period` rows with `share` more
-    and less light, which move by `speed` rows per image. row: of this image.
-    """
-    phase = 2 * np.pi * (np.arange(len(image))[:, None, None] + speed * row) / period
-    return np.clip(image * (1 + share * np.sin(phase)), 0, 255).astype(np.uint8)
-
-
-def compressed(image: np.ndarray, quality: int) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], RGB, after JPEG compression of this quality."""
-    _, code = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.ascontiguousarray(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])
-
-
 def with_depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
     """Return the recording with each depth, float32 [H, W], changed, by a function of depth and row."""
     frames = [

@@ -37,7 +37,7 @@ def repeated_corridor(
         size: (width, height) of the images, pixels.
 
     Example:
-        >>> from vggtgeo.simulation.repeated_corridor import repeated_corridor
+        >>> from repeated_corridor import repeated_corridor
         >>> sequence = repeated_corridor(sections=2, size=(32, 24))
         >>> next(sequence.frames()).image.shape
         (24, 32, 3)
