@@ -17,9 +17,8 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_picture, write_text
 from vggtgeo.io.given import check_kind, check_real, check_whole, real_array
 from vggtgeo.simulation.corridor import CORRIDOR_WALK, build_corridor
-from vggtgeo.simulation.hall import HALL_WALK, build_hall
 from vggtgeo.simulation.render import Picture, render
-from vggtgeo.simulation.rooms import OFFICE_WALK, ROOM_WALK, build_office, build_room
+from vggtgeo.simulation.rooms import HALL_WALK, OFFICE_WALK, ROOM_WALK, build_hall, build_office, build_room
 from vggtgeo.simulation.scene import Scene
 from vggtgeo.simulation.sensor import Sensor
 from vggtgeo.simulation.staircase import BUILDING_WALK, STAIRCASE_WALK, build_building, build_staircase
