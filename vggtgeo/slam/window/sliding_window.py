@@ -18,8 +18,8 @@ from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import rigid
-from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.models.classical import can_search
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -42,7 +42,7 @@ def _solve(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) ->
     return solve(problem, initial, solver=solver, diagnosis=False)
 
 
-solve_jit = KeptProgram(_solve, functools.partial(solution_like, diagnosis=False))
+solve_jit = CachedProgram(_solve, functools.partial(solution_like, diagnosis=False))
 
 
 def window_size(settings: SlamSettings) -> PaddedSize:

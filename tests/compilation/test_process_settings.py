@@ -13,8 +13,8 @@ from jax.experimental.compilation_cache import compilation_cache
 from reported import raises
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from vggtgeo.io import process_settings
-from vggtgeo.io.process_settings import ENABLED, FOLDER, SHORTEST, program_settings
+from vggtgeo.compilation import process_settings
+from vggtgeo.compilation.process_settings import ENABLED, FOLDER, SHORTEST, program_settings
 
 
 @pytest.fixture
@@ -89,10 +89,10 @@ def test_matrix_products_take_one_thread(
 def test_a_process_that_was_forked_from_one_that_computed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that a run in such a process is an error with what to do, where it waited for ever for threads that a fork
     # leaves behind. Oracle: a set that holds the number of another process, as a forked one finds it.
-    monkeypatch.setattr(process_settings, "_been_here", {os.getpid() + 1})
+    monkeypatch.setattr(process_settings, "_processes", {os.getpid() + 1})
     with raises("forked", "spawn"), program_settings():
         pass
-    monkeypatch.setattr(process_settings, "_been_here", set())
+    monkeypatch.setattr(process_settings, "_processes", set())
     for _ in range(2):
         with program_settings():
             pass

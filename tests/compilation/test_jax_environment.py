@@ -4,7 +4,7 @@ from importlib import metadata
 
 import pytest
 
-from vggtgeo.io.jax_environment import jax_environment
+from vggtgeo.compilation.jax_environment import jax_environment
 
 
 @pytest.mark.parametrize(
