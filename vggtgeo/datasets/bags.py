@@ -127,7 +127,6 @@ class RosBag:
         return len(self.times)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`."""
         check_selection(self.name, len(self), start, end, stride)
         return self._read(range(len(self))[start:end:stride])
 

@@ -35,7 +35,6 @@ class Euroc(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder`, or `mav0` in it, has `cam0/data.csv`."""
         return _base(folder) is not None
 
     @classmethod

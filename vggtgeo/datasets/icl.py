@@ -64,7 +64,6 @@ class IclNuim(FolderSequence):
         return cls.listed(folder, frames, lambda *size: _camera(folder, *size), FIVE_THOUSANDTHS)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses of the mirrored world."""
         return _truth(self.folder)
 
 
@@ -99,12 +98,10 @@ class IclNuimRaw(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has a `scene_00_0000.png` and its depth or camera beside."""
         return any(path.with_suffix(end).is_file() for path in _images(folder) for end in (".depth", ".txt"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images."""
         images = _images(folder)
         # The number of the scene comes first in the names: `scene_00_0012`.
         numbers = rows_of([path.with_name(path.stem.rpartition("_")[2]) for path in images], None)
@@ -124,7 +121,6 @@ class IclNuimRaw(FolderSequence):
         return metres_of_floats(distances / np.sqrt(1.0 + across**2 + down[:, None] ** 2))
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses of the mirrored world."""
         there = [file for file in self.files if file.image.with_suffix(".txt").is_file()]
         if not there:
             return _truth(self.folder)

@@ -53,12 +53,10 @@ class ImageFolder(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has an image."""
         return bool(image_files(folder))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images; raise InputError if there is none."""
         images = image_files(folder)
         if not images:
             raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")

@@ -36,12 +36,10 @@ class Kitti(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has one of the folders of images."""
         return any((folder / name).is_dir() for name in _FOLDERS)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images."""
         images = {folder / name: image_files(folder / name) for name in _FOLDERS}
         place = max(images, key=lambda each: len(images[each]))  # colour, where both have as many
         times = _times(folder, place)

@@ -69,7 +69,6 @@ class LiveCamera:
         return self._read(start, end, stride)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return None: there is no ground truth."""
         return None
 
     def _read(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:

@@ -47,7 +47,6 @@ class Nerfstudio(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `transforms.json`."""
         return (folder / FILE).is_file()
 
     @classmethod
@@ -68,7 +67,6 @@ class Nerfstudio(FolderSequence):
         return cls.listed(folder, rows, camera, coding)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the poses of the file, camera -> world."""
         file = self.folder / FILE
         frames = _images(self.folder, read_json(file))
         poses = np.array([_pose(frames[one.image]) for one in self.files])

@@ -71,7 +71,6 @@ class StrayScanner:
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `rgb.mp4` and one of the two lists (a recording without the other is damaged)."""
         return (folder / "rgb.mp4").is_file() and any((folder / name).is_file() for name in _LISTS)
 
     @classmethod
@@ -99,7 +98,6 @@ class StrayScanner:
         return min(len(self.video), len(self.times))
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`."""
         check_selection(self.name, len(self), start, end, stride)
         end = len(self) if end is None else min(end, len(self))
         return map(self._frame, self.video.frames(start, end, stride))
@@ -147,7 +145,6 @@ class ArkitScenes(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `lowres_wide`."""
         return (folder / "lowres_wide").is_dir()
 
     @classmethod
@@ -261,7 +258,6 @@ class PhoneExport(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has an image with the file of its camera."""
         return any(one.camera.is_file() for one in cls.files_of(folder))
 
     @classmethod

@@ -91,7 +91,6 @@ class Record3d(FolderSequence):
 
     @property
     def file(self) -> Path:
-        """Return the file of the metadata."""
         return self.folder / (EXPORTED if (self.folder / EXPORTED).is_file() else METADATA)
 
     def metadata(self) -> Mapping[str, Any]:
@@ -100,11 +99,9 @@ class Record3d(FolderSequence):
             return dict(json_in(self._content(self.file, MAX_TEXT), self.file))
 
     def holds(self, path: Path) -> bool:
-        """Return whether the archive or folder has this file."""
         return self._inside(path).is_file()
 
     def stored_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """Return the image in a file of the archive."""
         return image_in(self._content(path), path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:

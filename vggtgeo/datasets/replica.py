@@ -35,12 +35,10 @@ class Replica(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `traj.txt` and `results/frame...`."""
         return (folder / "traj.txt").is_file() and any((folder / "results").glob("frame*"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the frames."""
         images = files_like(folder / "results", "frame*")
         rows = rows_of(images, _poses_in(folder / "traj.txt"))
         depths = (image.with_name(image.stem.replace("frame", "depth") + ".png") for image in images)
@@ -54,7 +52,6 @@ class Replica(FolderSequence):
         return cls.listed(folder, frames, camera, DepthFormat(scale), rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses."""
         file = self.folder / "traj.txt"
         poses = read_matrices(file, 16)
         return trajectory_of_rows([one.timestamp for one in self.files], self.rows, poses, file)

@@ -50,14 +50,12 @@ class ScanNet(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `color`, `depth`, `pose` and `intrinsic`, or images beside `_info.txt`."""
         if all((folder / name).is_dir() for name in ("color", "depth", "pose", "intrinsic")):
             return True
         return _info(folder) is not None and bool(files_like(folder, "frame-*.color.*"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the frames that have an image."""
         place = folder / "color"
         images = image_files(place, _COLOUR) if place.is_dir() else files_like(folder, "frame-*.color.*")
         frames = [
@@ -104,7 +102,6 @@ class ScanNet(FolderSequence):
         return None if one_place else DepthRegistration.of(self.camera, self.camera, self.motion)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses."""
         there = [(one.timestamp, _beside(self.folder, one.image, "pose", ".txt")) for one in self.files]
         there = [(time, file) for time, file in there if file.is_file()]
         if not there:

@@ -53,7 +53,6 @@ class SevenScenes(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has colour frames of this layout, or sequences `seq-XX` that have."""
         return bool(_colour_files(folder)) or bool(_sequences(folder))
 
     @classmethod

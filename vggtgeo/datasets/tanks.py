@@ -33,7 +33,6 @@ class TanksAndTemples(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has a `*_COLMAP_SfM.log`."""
         return bool(files_like(folder, f"*{_LOG}"))
 
     @classmethod

@@ -34,7 +34,6 @@ class TumRgbd(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has an `rgb.txt`, or a list of pairs."""
         return _list_of(folder) is not None
 
     @classmethod

@@ -75,7 +75,6 @@ class Track:
 
     @property
     def is_depth(self) -> bool:
-        """Return whether its title says so."""
         return bool(_DEPTH.search(self.title))
 
 
@@ -172,7 +171,6 @@ class VideoFile:
         return self._decode(range(start, sys.maxsize if end is None else end, stride))
 
     def ground_truth(self) -> Trajectory | None:
-        """Return None."""
         return None
 
     def _decode(self, chosen: range) -> Iterator[Frame]:
@@ -208,7 +206,6 @@ class VideoFile:
 
     @contextmanager
     def _streams(self) -> Iterator[tuple[_Stream, NearestInTime | None]]:
-        """Return the images, and the depth where it is read."""
         with _open_stream(self.path, self.tracks.images) as images:
             if self.tracks.depth is None or not self.has_depth:
                 yield images, None

@@ -122,7 +122,6 @@ class ReducedSequence(SequenceView):
     """`source` with smaller images and depth; `camera` is that of the reduced images."""
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`."""
         return _reduced_frames(self.source.frames(start, end, stride), self.source.camera, self.camera)
 
 

@@ -40,7 +40,6 @@ class ArrayHeader:
 
     @property
     def bytes(self) -> int:
-        """Return the size of the data."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 

@@ -127,7 +127,6 @@ class Format:
         return f"{'an' if self.kind[0] in 'aeiou' else 'a'} {self.kind}"
 
     def _header(self, archive: Archive) -> dict[str, Any]:
-        """Return the header, checked."""
         if set(archive.members) != {HEADER, DATA}:
             raise InputError(f"`{archive.path}` is not {self._article} of vggtgeo: it must have `header` and `data`")
         text = archive.read([HEADER], limit=MAX_HEADER)[HEADER].tobytes()

@@ -151,7 +151,6 @@ class SimulatedOracle:
         return index
 
     def timestamp(self, index: int) -> float:
-        """Return the time, seconds."""
         return self.sequence.timestamp(index)
 
     def pose(self, index: int) -> np.ndarray:
@@ -167,11 +166,9 @@ class SimulatedOracle:
         return self._known(index).picture.glass
 
     def texture(self, index: int) -> np.ndarray:
-        """Return the strength of texture, float32 [H, W] in [0, 1)."""
         return self._known(index).texture
 
     def edges(self, index: int) -> VisibleEdges:
-        """Return the visible parts of the scene's straight edges."""
         return self._known(index).edges
 
     def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
