@@ -10,8 +10,7 @@ import numpy as np
 
 from vggtgeo.simulation.furniture import RoomBuilder
 from vggtgeo.simulation.scene import Scene, finish
-from vggtgeo.simulation.sensor import Sensor
-from vggtgeo.simulation.sequence import SyntheticSequence, camera_of
+from vggtgeo.simulation.sequence import Sensor, SyntheticSequence, camera_of
 from vggtgeo.simulation.shapes import Look, Vector
 from vggtgeo.simulation.trajectories import HandheldMotion, Walk
 

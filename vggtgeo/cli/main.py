@@ -29,7 +29,7 @@ from vggtgeo.cli.solve import solve
 from vggtgeo.cli.view import export, view
 from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one_line
-from vggtgeo.io.interruption import end_on_signals, ignore_signals
+from vggtgeo.io.process import end_on_signals, ignore_signals
 
 GC_THRESHOLD = 50_000
 """New objects between two garbage collections: with Python's default of 700 they take some per cent of a run."""
