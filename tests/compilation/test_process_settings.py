@@ -1,9 +1,10 @@
-"""What a call of the library sets for its process, and takes back."""
+"""What a program or a call of the library sets for its process, and takes back."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from reported import raises
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from vggtgeo.compilation import process_settings
+from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.compilation.process_settings import ENABLED, FOLDER, SHORTEST, program_settings
 
 
@@ -96,3 +98,12 @@ def test_a_process_that_was_forked_from_one_that_computed_is_told(monkeypatch: p
     for _ in range(2):
         with program_settings():
             pass
+
+
+@pytest.mark.parametrize(
+    ("version", "is_set"), [("0.8.0", True), ("0.10.2", True), ("0.11.0", False), ("1.0.0", False)]
+)
+def test_the_flag_is_set_for_versions_that_know_it(monkeypatch: pytest.MonkeyPatch, version: str, is_set: bool) -> None:
+    """Later versions of jaxlib end a process that sets the flag; oracle: the first version without it, 0.11."""
+    monkeypatch.setattr(metadata, "version", lambda name: version)
+    assert ("XLA_FLAGS" in jax_environment()) == is_set

@@ -77,13 +77,6 @@ def test_late_depth_is_that_of_the_moment_before(recording: Recording) -> None:
     assert late < 0.4 * here < 0.3 * early, (late, here, early)
 
 
-def test_late_truth_keeps_the_poses(recording: Recording) -> None:
-    # Proves that the truth's clock alone moves. Oracle: the times before.
-    late = errors_of.late_truth(recording, 0.005).truth
-    np.testing.assert_allclose(late.timestamps - recording.truth.timestamps, 0.005)
-    np.testing.assert_array_equal(late.poses, recording.truth.poses)
-
-
 def test_corners_are_dark_and_the_middle_is_not() -> None:
     # Proves the share of light that is missing. Oracle: a white image.
     sequence = _walk()
