@@ -70,16 +70,18 @@ def encoding_of(message: Any) -> str:
 def kind_of(message: Any) -> str:
     """Return the kind of image of a message, as text."""
     if message is None:
-        return "no message"
-    if isinstance(message, Unread):
-        return "damaged"
+        return "no message that can be read"
     return str(getattr(message, "encoding", "") or getattr(message, "format", ""))[:60] or "of no stated kind"
+
+
+def _check_read(message: Any, place: Path) -> None:
+    if isinstance(message, Unread):
+        raise InputError(f"`{place}` is damaged: {message.reason}")
 
 
 def image_of(message: Any, place: Path, min_bits: int = 8) -> ImageFile:
     """Return the image of a message, as `read_image_file`; raise InputError if it is invalid. place: for messages."""
-    if isinstance(message, Unread):
-        raise InputError(f"`{place}` is damaged: {message.reason}")
+    _check_read(message, place)
     if not hasattr(message, "encoding"):
         return _compressed_image(message, place, min_bits)
     if message.encoding not in COLOUR:
@@ -109,8 +111,7 @@ def _compressed_image(message: Any, place: Path, min_bits: int) -> ImageFile:
 
 def metres_of(message: Any, place: Path) -> np.ndarray:
     """Return depth, float32 [H, W], NaN for none; raise InputError if it is invalid. place: for messages."""
-    if isinstance(message, Unread):
-        raise InputError(f"`{place}` is damaged: {message.reason}")
+    _check_read(message, place)
     return _raw_metres(message, place) if hasattr(message, "encoding") else _compressed_metres(message, place)
 
 
@@ -147,13 +148,11 @@ def _compressed_metres(message: Any, place: Path) -> np.ndarray:
     headed = not content.startswith(_PNG)
     floats = encoding_of(message) == "32FC1"
     wrong = f"`{place}`: its depth ({kind_of(message)}) cannot be decoded; expected a PNG of 16 bits, not RVL"
-    if floats and not headed:
-        raise InputError(f"{wrong}, behind the two numbers that floats were coded by")
     try:
         codes = decoded(content[_HEAD if headed else 0 :], place, cv2.IMREAD_UNCHANGED)
     except InputError as error:
         raise InputError(f"{wrong} ({error})") from None
-    if codes.dtype != np.uint16 or codes.ndim != 2:
+    if codes.dtype != np.uint16 or codes.ndim != 2 or (floats and not headed):
         raise InputError(f"{wrong} (found {codes.dtype} of shape {codes.shape})")
     if floats:
         a, b = np.frombuffer(content[4:_HEAD], "<f4").astype(np.float32)
@@ -210,7 +209,7 @@ def is_registered(topic: str) -> bool:
 
 def _is_depth(name: str, message: Any) -> bool:
     """Return whether a topic is depth: by its encoding; mono16, as old drivers gave it, by the name of the topic."""
-    if message is None or isinstance(message, Unread) or _INFRARED.search(name):
+    if message is None or _INFRARED.search(name):
         return False
     if not hasattr(message, "encoding") and "compresseddepth" in f"{name} {message.format}".lower():
         return True
@@ -220,9 +219,7 @@ def _is_depth(name: str, message: Any) -> bool:
 
 def _is_image(message: Any) -> bool:
     """Return whether a message is an image in colour or grey."""
-    if message is None or isinstance(message, Unread):
-        return False
-    return not hasattr(message, "encoding") or encoding_of(message) in COLOUR
+    return message is not None and (not hasattr(message, "encoding") or encoding_of(message) in COLOUR)
 
 
 def _rank_of_image(name: str, message: Any) -> tuple[bool, bool, bool]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vggtgeo.datasets.bag_cameras import (
     CAMERA_INFO,
@@ -64,16 +65,12 @@ def no_whole_bag(folder: Path) -> str | None:
     bags = sorted(path.name for path in folder.iterdir() if path.suffix == ".bag")
     if len(bags) > 1:
         return (
-            f"`{folder}` holds {len(bags)} bags of ROS 1, `{bags[0]}` to `{bags[-1]}`; give one of them; parts of one "
-            "recording can be joined: `rosbags-convert --src` all of them `--dst` a new folder"
+            f"`{folder}` holds {len(bags)} bags of ROS 1, `{bags[0]}` to `{bags[-1]}`; give one of them, or join them: "
+            "`rosbags-convert --src` all of them `--dst` a new folder"
         )
-    file = next((path for path in sorted(folder.iterdir()) if path.suffix in ROS_2), None)
-    if file is None:
-        return None
-    return (
-        f"`{file}` is of a ROS 2 bag, and `{METADATA}`, which belongs beside it, is not there; copy it, too, or make "
-        f"it again with `ros2 bag reindex {folder}`"
-    )
+    if any(path.suffix in ROS_2 for path in folder.iterdir()):
+        return f"`{folder}` holds a ROS 2 bag without `{METADATA}`; copy it, too, or `ros2 bag reindex {folder}`"
+    return None
 
 
 @dataclass(frozen=True)
@@ -111,7 +108,7 @@ class RosBag:
                 raise InputError(f"none of the {len(times)} images of `{path}` can be read; the first: {wrong}")
             height, width = image.image.shape[:2]
             infos = {name: _first(reader, name) for name, kind in topics.items() if kind == CAMERA_INFO}
-            infos = {name: info for name, info in infos.items() if not (info is None or isinstance(info, Unread))}
+            infos = {name: info for name, info in infos.items() if info is not None}
             frame = frame_name(first[chosen.colour].header.frame_id)
             known = camera_of(path, infos, chosen.colour, (width, height), frame)
             camera = known or guess_with_warning(str(path), width, height)
@@ -135,14 +132,9 @@ class RosBag:
         if not self.poses:
             return None
         with _reader(self.path) as reader:
-            messages = list(_messages(reader, self.poses))
-        whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, Unread)]
-        if len(whole) < len(messages):
-            lost = len(messages) - len(whole)
-            warn(f"`{self.path}`: {lost} of {len(messages)} poses of `{self.poses}` are damaged; left out of the truth")
-        if not whole:
-            raise InputError(f"`{self.path}` has no pose in its topic `{self.poses}`")
-        rows = np.array(whole).reshape(-1, 8)
+            messages = _messages(reader, self.poses)
+            whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, Unread)]
+        rows = np.reshape(whole, (-1, 8))
         return trajectory_of(rows[:, 0], poses_of(rows[:, 1:4], rows[:, 4:]), self.path)
 
     def _read(self, chosen: range) -> Iterator[Frame]:
@@ -203,24 +195,18 @@ def _depth_is_usable(reader: Any, path: Path, topic: str, images: list[float], s
     def valid(message: Any, place: Path) -> np.ndarray | None:
         depth = metres_of(message, place)
         if depth.shape != size[::-1]:
-            raise InputError(
-                f"that of `{topic}` is {depth.shape[1]} x {depth.shape[0]} pixels, the images are {size[0]} x "
-                f"{size[1]}: record depth that is registered to them"
-            )
+            raise InputError(f"depth of {depth.shape[1]} x {depth.shape[0]} pixels, images of {size[0]} x {size[1]}")
         return depth if np.isfinite(depth).any() else None
 
     times, depth, wrong = _times_and_first(reader, path, topic, valid)
     if depth is None:
         reason = f" ({wrong})" if wrong else ""
-        warn(f"`{path}`: no depth image of {len(times)} has a valid pixel{reason}; reading the images only")
+        warn(f"`{path}`: no depth image of {len(times)} is valid{reason}; reading the images only")
         return False
-    ordered = np.sort(times)
-    after = np.searchsorted(ordered, images).clip(1, max(len(ordered) - 1, 1))
-    nearest = [ordered[np.minimum(row, len(ordered) - 1)] for row in (after - 1, after)]
-    alone = int((np.minimum(*(np.abs(np.array(images) - time) for time in nearest)) > MAX_DELAY).sum())
+    away, _ = cKDTree(np.reshape(times, (-1, 1))).query(np.reshape(images, (-1, 1)))
+    alone = int((away > MAX_DELAY).sum())
     if alone:
-        only = "; reading the images only" if alone == len(images) else ""
-        warn(f"`{path}`: {alone} of {len(images)} images have no depth within {MAX_DELAY} s{only}")
+        warn(f"`{path}`: {alone} of {len(images)} images have no depth within {MAX_DELAY} s")
     return alone < len(images)
 
 
@@ -295,13 +281,8 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
 
 
 def _first(reader: Any, topic: str) -> Any:
-    """Return the first undamaged message of a topic, else a damaged one, else None."""
-    damaged = None
-    for _, message in _messages(reader, topic):
-        if not isinstance(message, Unread):
-            return message
-        damaged = damaged or message
-    return damaged
+    """Return the first undamaged message of a topic, None without one."""
+    return next((message for _, message in _messages(reader, topic) if not isinstance(message, Unread)), None)
 
 
 def _pose(message: Any) -> tuple[float, ...]:
