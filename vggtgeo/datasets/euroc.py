@@ -13,14 +13,7 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.intrinsics import intrinsics_of, is_fisheye
-from vggtgeo.datasets.pose_files import (
-    check_size,
-    parsing,
-    poses_of,
-    read_matrices,
-    trajectory_of,
-    yaml_numbers,
-)
+from vggtgeo.datasets.pose_files import check_size, parsing, poses_of, read_matrices, trajectory_of, yaml_numbers
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning, warn

@@ -264,12 +264,7 @@ def _cut_to_picture(ends: np.ndarray, camera: Camera) -> np.ndarray | None:
 
 
 def _visible_parts(
-    index: int,
-    ends: np.ndarray,
-    length: float,
-    pose: np.ndarray,
-    camera: Camera,
-    maps: tuple[np.ndarray, np.ndarray],
+    index: int, ends: np.ndarray, length: float, pose: np.ndarray, camera: Camera, maps: tuple[np.ndarray, np.ndarray]
 ) -> list[tuple[np.ndarray, np.ndarray, int, float]]:
     count = max(2, int(length / _SAMPLE) + 1)
     samples = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])

@@ -179,11 +179,7 @@ def build_room(seed: int) -> Scene:
     b.plant((5.55, 0.45), 1.0)
     b.cylinder((3.3, 0.28, 0), 0.16, 0.36, Look("metal", 0.5, tint=(0.5, 0.55, 0.6)))
     b.box(
-        (3.45, 4.62, 0),
-        (0.45, 0.40, 0.35),
-        Look("wood", 0.8, tint=(1.0, 0.85, 0.6)),
-        0.2,
-        top=Look("poster:5", None),
+        (3.45, 4.62, 0), (0.45, 0.40, 0.35), Look("wood", 0.8, tint=(1.0, 0.85, 0.6)), 0.2, top=Look("poster:5", None)
     )
     b.box((3.47, 4.64, 0.35), (0.32, 0.30, 0.25), Look("board:3", None), -0.2)
     b.lamp_panel(1.6, 2.4, height, power=9.0)
