@@ -102,8 +102,11 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
             f"`units_per_metre` is {units_per_metre}; it must be from {MIN_UNITS:g} (kilometres) to {MAX_UNITS:g} "
             "(micrometres): 1000 is millimetres, 5000 TUM's"
         )
-    changed = not isinstance(sequence, FolderSequence) or type(sequence).load_depth is not FolderSequence.load_depth
-    if changed or not any(file.depth for file in sequence.files):
+    if (
+        not isinstance(sequence, FolderSequence)
+        or type(sequence).load_depth is not FolderSequence.load_depth
+        or not any(file.depth for file in sequence.files)
+    ):
         raise InputError(f"`{sequence.name}` has no depth files with a selectable unit")
     coding = replace(sequence.depth_format, units_per_metre=units_per_metre, floats_per_metre=units_per_metre)
     scaled = replace(sequence, depth_format=coding)
