@@ -69,13 +69,17 @@ class Track:
         return f"track {self.number} ({self.codec}, {self.width} x {self.height}{title})"
 
     @property
-    def has_16_bits_of_grey(self) -> bool:
-        """Return whether its pixels may be depth in millimetres."""
-        return self.pixels.startswith("gray16")
+    def says_depth(self) -> bool:
+        return bool(_DEPTH.search(self.title))
 
     @property
-    def is_depth(self) -> bool:
-        return bool(_DEPTH.search(self.title))
+    def says_infrared(self) -> bool:
+        return bool(_INFRARED.search(self.title))
+
+    @property
+    def may_be_depth(self) -> bool:
+        """Return whether its pixels may be millimetres."""
+        return self.pixels.startswith("gray16") and not self.says_infrared
 
 
 @dataclass(frozen=True)
@@ -86,28 +90,17 @@ class ChosenTracks:
     depth: Track | None
     others: tuple[Track, ...]
 
-    @property
-    def maybe_depth(self) -> tuple[Track, ...]:
-        """Tracks that are not read and may be depth, without a title that says so."""
-        untitled = (one for one in self.others if one.has_16_bits_of_grey and not _INFRARED.search(one.title))
-        return tuple(untitled) if self.depth is None else ()
-
 
 def choose_tracks(tracks: Sequence[Track]) -> ChosenTracks:
     """Choose the largest track in colour, before grey and infrared, and the 16-bit grey one whose title says depth.
 
     tracks: at least one.
     """
-    videos = [track for track in tracks if not track.cover] or list(tracks)
-    depth = next((track for track in videos if track.is_depth and track.has_16_bits_of_grey), None)
-    rank = lambda track: (
-        track.is_depth,
-        bool(_INFRARED.search(track.title)),
-        track.pixels.startswith("gray"),
-        -track.width * track.height,
-    )
-    images = min(videos, key=rank)
-    depth = None if depth is images else depth
+    grey = lambda track: track.pixels.startswith("gray")
+    rank = lambda track: (track.says_depth, track.says_infrared, grey(track), -track.width * track.height)
+    images = min([track for track in tracks if not track.cover] or tracks, key=rank)
+    depths = (track for track in tracks if track is not images and track.says_depth and track.may_be_depth)
+    depth = next(depths, None)
     return ChosenTracks(images, depth, tuple(track for track in tracks if track not in (images, depth)))
 
 
@@ -149,8 +142,7 @@ class VideoFile:
         if tracks.depth is not None and (tracks.depth.width, tracks.depth.height) != (width, height):
             raise InputError(
                 f"`{path}`: the depth of {tracks.depth} has another size than the images of {tracks.images}: register "
-                "it first (Azure Kinect: `k4a_transformation_depth_image_to_color_camera`), or leave it out with "
-                "--rgb-only"
+                "it first, or leave it out with --rgb-only"
             )
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
         if not stream.has_times:
@@ -337,11 +329,11 @@ def _tracks(path: Path, depth: bool) -> ChosenTracks:
     beside = f", depth in millimetres of {chosen.depth}" if chosen.depth else ""
     left = ", ".join(map(str, chosen.others))
     warn(f"`{path}`: images of {chosen.images}{beside}" + (f"; not read: {left}" if left else ""), NoteWarning)
-    if depth and (maybe := chosen.maybe_depth):
+    maybe = next((track for track in chosen.others if track.may_be_depth), None)
+    if depth and chosen.depth is None and maybe:
         warn(
-            f"`{path}`: {maybe[0]} may be depth (16 bits of grey), and has no title that says so: not used; `ffmpeg -i "
-            f"FILE -map 0 -c copy -metadata:s:v:{maybe[0].number} title=DEPTH NEW.mkv` gives the title, for depth in "
-            "millimetres"
+            f"`{path}`: {maybe} may be depth (16 bits of grey), and has no title that says so: not used; `ffmpeg -i "
+            f"FILE -map 0 -c copy -metadata:s:v:{maybe.number} title=DEPTH NEW.mkv` gives it the title, for millimetres"
         )
     return chosen
 
