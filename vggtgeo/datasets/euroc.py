@@ -66,10 +66,8 @@ def _camera(sensor: Path, width: int, height: int) -> Camera:
     coefficients = yaml_numbers(sensor, "distortion_coefficients")
     found = _MODEL.search(whole_text(sensor))
     fisheye = is_fisheye(f"`{sensor}`: `distortion_model`", found.group(1) if found else "")
-    try:
+    with parsing(sensor, "the coefficients of its lens"):
         return Camera(intrinsics, width, height, check_distortion(coefficients), fisheye=fisheye)
-    except InputError as error:
-        raise InputError(f"`{sensor}`: {error}") from None
 
 
 def _base(folder: Path) -> Path | None:

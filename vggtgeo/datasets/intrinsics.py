@@ -21,9 +21,12 @@ MIN_VALID = 0.5
 """Minimum share of the undistorted image that is inside the original; lenses of benchmarks keep more than 0.8."""
 MAX_ASPECT = 4.0
 """Maximum ratio of the focal lengths, either way; 1 for square pixels, up to 2 for interlaced and anamorphic ones."""
-_OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
-_FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
-"""Names of the two lens models in ROS, Kalibr, EuRoC and RealSense."""
+_OPENCV = (
+    *("none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady"),
+    *("pinhole", "simple_pinhole", "perspective", "simple_radial", "radial", "opencv"),
+)
+_FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye")
+"""Names of the two lens models in ROS, Kalibr, EuRoC, RealSense, COLMAP and nerfstudio."""
 CALIBRATION, DISTORTION = "calibration.txt", "distortion.txt"
 FISHEYE = "fisheye"
 """Last word of such a file, after four coefficients of Kannala and Brandt."""
@@ -66,8 +69,8 @@ def pinhole_of(matrix: np.ndarray) -> tuple[float, float, float, float]:
 
 def is_fisheye(where: str, model: str) -> bool:
     """Return whether a lens model is a fisheye; raise InputError for an unknown model. where: for messages."""
-    if model.lower() not in (*_OPENCV, *_FISHEYES):
-        known = ", ".join((*_OPENCV[1:], *_FISHEYES))
+    if model.lower() not in ("", *_OPENCV, *_FISHEYES):
+        known = ", ".join((*_OPENCV, *_FISHEYES))
         raise InputError(f"{where} is {model[:40]}; read are {known}: undistort the images")
     return model.lower() in _FISHEYES
 

@@ -23,7 +23,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, is_there
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
-from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
+from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of, is_fisheye
 from vggtgeo.datasets.pose_files import parsing, read_json, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
@@ -35,8 +35,6 @@ FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _EXPECTED = "`frames` with `file_path` and `transform_matrix` (4 x 4 numbers), and the camera as nerfstudio writes it"
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 _OF_FISHEYE = ("k1", "k2", "k3", "k4")
-_FISHEYE = "OPENCV_FISHEYE"
-_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
 
 @dataclass(frozen=True)
@@ -129,19 +127,11 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
         if not fx and not {"fl_x", "camera_angle_x"} & {*content, *(key for frame in frames for key in frame)}:
             return guess_with_warning(str(file.parent), width, height)
         centre = number("cx", 0.5 * across) - 0.5, number("cy", 0.5 * down) - 0.5
-        fisheye = _is_fisheye(content)
+        named = is_fisheye(f"`{file}`: `camera_model`", str(content.get("camera_model", "")))
+        fisheye = named or content.get("is_fisheye") is True  # nerfstudio, instant-ngp
         if unread := [key for key in ("k4", "k5", "k6") if number(key) and not (fisheye and key == "k4")]:
             warn(f"`{file}` has {', '.join(unread)} of its lens, left out: undistort the images")
         lens = tuple(map(number, _OF_FISHEYE if fisheye else _DISTORTION))
         distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
         intrinsics = intrinsics_of(file, (fx, number("fl_y", fx), *centre))
     return Camera(intrinsics, round(across), round(down), distortion, fisheye=fisheye).resized(width, height)
-
-
-def _is_fisheye(content: Mapping[str, Any]) -> bool:
-    """Return whether the lens is a fisheye, by `camera_model` (nerfstudio) and `is_fisheye` (instant-ngp)."""
-    model = str(content.get("camera_model", "")).upper()
-    if model not in (*_PINHOLES, _FISHEYE):
-        known = ", ".join((*_PINHOLES[1:], _FISHEYE))
-        raise InputError(f"`camera_model` is {model}; it must be one of {known}: undistort the images")
-    return model == _FISHEYE or content.get("is_fisheye") is True
