@@ -58,7 +58,7 @@ def is_bag(path: Path) -> bool:
     return path.suffix in (".bag", *ROS_2) or (path / METADATA).is_file()
 
 
-def no_whole_bag(folder: Path) -> str | None:
+def why_incomplete(folder: Path) -> str | None:
     """Return why a folder is not one bag: several ROS 1 bags, or a ROS 2 bag without its metadata; None otherwise."""
     if not folder.is_dir() or (folder / METADATA).is_file():
         return None
@@ -217,7 +217,7 @@ def _depth_camera(
     source, target = (frame_name(first[topic].header.frame_id) for topic in (chosen.depth, chosen.colour))
 
     def stated_motion() -> np.ndarray | None:
-        transforms = _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
+        transforms = _undamaged(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
         motion = motion_between(transforms, source, target) if source and target else None
         return _extrinsics(reader) if motion is None else motion
 
@@ -231,7 +231,7 @@ def _depth_camera(
 def _extrinsics(reader: Any) -> np.ndarray | None:
     """Return depth -> colour as RealSense's driver publishes it (rotation by columns); None if it does not."""
     named = [one for one in reader.connections if one.topic.endswith("depth_to_color")]
-    message = next(_whole(reader, [one for one in named if one.msgtype.endswith("/Extrinsics")]), None)
+    message = next(_undamaged(reader, [one for one in named if one.msgtype.endswith("/Extrinsics")]), None)
     if message is None:
         return None
     motion = np.eye(4)
@@ -239,7 +239,7 @@ def _extrinsics(reader: Any) -> np.ndarray | None:
     return motion
 
 
-def _whole(reader: Any, connections: list[Any]) -> Iterator[Any]:
+def _undamaged(reader: Any, connections: list[Any]) -> Iterator[Any]:
     for connection, _, raw in reader.messages(connections=connections) if connections else ():
         with suppress(Exception):  # a damaged message may raise anything
             yield reader.deserialize(raw, connection.msgtype)
@@ -253,7 +253,7 @@ def _reader(path: Path) -> Iterator[Any]:
     except ImportError:
         raise InputError(f"bags of ROS need the package rosbags; {install_hint('bags')}") from None
     place = path.parent if path.suffix in ROS_2 else path
-    if reason := no_whole_bag(place):
+    if reason := why_incomplete(place):
         raise InputError(reason)
     try:
         with AnyReader([place], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

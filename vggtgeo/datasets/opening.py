@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Protocol
 
-from vggtgeo.datasets.bags import RosBag, is_bag, no_whole_bag
+from vggtgeo.datasets.bags import RosBag, is_bag, why_incomplete
 from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim, IclNuimRaw
@@ -141,7 +141,7 @@ def _open_folder(place: Path, kind: str | None) -> Sequence:
     names = sorted(path.name for path in place.iterdir())
     other = next((name for name in names if Path(name).suffix.lower() in OTHER_PICTURES | ARCHIVES), None)
     raise InputError(
-        no_whole_bag(place)
+        why_incomplete(place)
         or (other and f"`{place}` holds `{other}`: {_NOT_READ}{_hint(place)}")
         or f"`{place}` holds {', '.join(f'`{name}`' for name in names[:4])}; expected images, folders `rgb` "
         f"and `depth`, or another layout of `vggtgeo data list`{_hint(place)}"
