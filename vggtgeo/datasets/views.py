@@ -30,7 +30,7 @@ from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.given import check_positive, check_real
+from vggtgeo.io.given import check_positive, check_within
 
 MIN_UNITS, MAX_UNITS = 1e-3, 1e6
 """Units a metre of depth files."""
@@ -96,12 +96,7 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
         InputError: the scale is implausible, or the sequence has no such depth files.
 
     """
-    check_real("units_per_metre", units_per_metre)
-    if not MIN_UNITS <= units_per_metre <= MAX_UNITS:
-        raise InputError(
-            f"`units_per_metre` is {units_per_metre}; it must be from {MIN_UNITS:g} (kilometres) to {MAX_UNITS:g} "
-            "(micrometres): 1000 is millimetres, 5000 TUM's"
-        )
+    check_within("units_per_metre", units_per_metre, MIN_UNITS, MAX_UNITS, " (1000: millimetres, 5000: TUM RGB-D)")
     if (
         not isinstance(sequence, FolderSequence)
         or type(sequence).load_depth is not FolderSequence.load_depth

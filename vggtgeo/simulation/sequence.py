@@ -17,7 +17,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_picture, write_text
-from vggtgeo.io.given import check_kind, check_real, check_whole, real_array
+from vggtgeo.io.given import check_kind, check_whole, check_within, real_array
 from vggtgeo.simulation.corridors import (
     BUILDING_WALK,
     CORRIDOR_WALK,
@@ -34,6 +34,8 @@ from vggtgeo.simulation.trajectories import HandheldMotion, Walk
 
 MAX_SAMPLES = 1000
 """Renderings for one image."""
+MAX_ERROR = 1e9
+"""Of any kind; larger ones leave nothing to estimate."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         for name in ("noise", "exposure_swing", "exposure_time", "readout_time", "depth_noise"):
-            check_real(name, getattr(self, name), "zero or a positive number")
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"`{name}` is {getattr(self, name)}; it must be zero or a positive number")
+            check_within(name, getattr(self, name), 0, MAX_ERROR)
         check_whole("blur_samples", self.blur_samples, 1, MAX_SAMPLES)
         near, far = real_array("depth_range", self.depth_range, (2,))
         if not 0 <= near < far:
@@ -104,8 +104,8 @@ WORLDS: dict[str, tuple[Callable[[int], Scene], Walk]] = {
 """The built-in worlds by name: how each is built, and how it is walked through."""
 _BAND = 16  # rows that share one pose under rolling exposure
 
-_LEAST, _MOST = 1e-4, 1e4
-"""Frames a second, and metres a second, that a walk is simulated at."""
+_PACES = 1e-4, 1e4
+"""Frames a second, and metres a second, that a walk is simulated at: beyond, times or places are the same, or none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,10 +237,8 @@ def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, spee
     check_whole("frames", frames, 1, MAX_FRAMES)
     for side in real_array("size", size, (2,)):
         check_whole("size", side, 1, MAX_SIDE)
-    for name, value in (("rate", rate), ("speed", 1.0 if speed is None else speed)):
-        check_real(name, value)
-        if not _LEAST <= value <= _MOST:  # times or places that are the same, or none
-            raise InputError(f"`{name}` is {value}; it must be from {_LEAST:g} to {_MOST:g}")
+    check_within("rate", rate, *_PACES)
+    check_within("speed", 1.0 if speed is None else speed, *_PACES)
 
 
 def camera_of(size: tuple[int, int]) -> Camera:
