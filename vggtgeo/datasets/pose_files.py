@@ -66,13 +66,11 @@ def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
         raise InputError(f"`{file}`: expected a matrix of {shape[0]} x {shape[1]} numbers") from None
 
 
-def trajectory_of(
-    times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path, of: str = "truth"
-) -> Trajectory | None:
+def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path) -> Trajectory | None:
     """Return camera -> world at `times`, sorted by time; None if no pose is valid.
 
     Warns of poses that are left out: with NaN or infinity (lost tracking), without a rotation, or with a repeated
-    time. of: a noun for the warnings.
+    time.
     """
     poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     times = np.asarray(times, np.float64)[: len(poses)]
@@ -85,10 +83,9 @@ def trajectory_of(
         (near & ~turned, "no rotation (all zeros, mirrored or scaled, say)", InputWarning),
     ):
         if lost.any():
-            text = f"`{where}`: {int(lost.sum())} of {len(poses)} poses have {why}; left out of the {of}"
-            warn(text, kind)
+            warn(f"`{where}`: {int(lost.sum())} of {len(poses)} poses have {why}; left out", kind)
     if not len(poses) and where.is_file():
-        warn(f"`{where}` has no pose: there is no {of}")
+        warn(f"`{where}` has no pose")
     if not turned.any():
         return None
     rows = np.flatnonzero(turned)
@@ -249,7 +246,7 @@ def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:
 
 
 def _with_poses(times: np.ndarray, poses: np.ndarray, file: Path) -> Trajectory:
-    found = trajectory_of(times, poses, file, "trajectory")
+    found = trajectory_of(times, poses, file)
     if found is None:
         raise InputError(f"`{file}` holds no pose")
     return found
