@@ -56,7 +56,7 @@ def bake(
     samples = _Samples(points, normals, starts, blockers)
     light = ambient * samples.openness(rng)
     for lamp in lights:
-        light += samples.lit_by(*lamp, rng)
+        light += samples.lit_by(lamp, rng)
     for row, (width, rows) in enumerate(counts):
         grid = light[starts[row] : starts[row + 1]].reshape(rows, width)
         smooth = cv2.GaussianBlur(grid, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE)
@@ -99,9 +99,8 @@ class _Samples:
         blocked = _shadowed(self.points, _AMBIENT_REACH * direction, self.blockers, self.starts)
         return 1.0 - 0.55 * blocked.mean(axis=1)
 
-    def lit_by(
-        self, centre: np.ndarray, size: tuple[float, float], power: float, reach: float, rng: np.random.Generator
-    ) -> np.ndarray:
+    def lit_by(self, lamp: tuple, rng: np.random.Generator) -> np.ndarray:
+        centre, size, power, reach = lamp
         light = np.zeros(len(self.points))
         towards = centre - self.points
         faces = np.einsum("nk,nk->n", towards, self.normals) > -0.5

@@ -60,6 +60,19 @@ class _KnownFrame:
     def view(self) -> View:
         return view_from(self.sequence.scene.surfaces, self.sequence.pose(self.index))
 
+    def points_at(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return world points float64 [n, 3] that `pixels` [n, 2] show, and whether there is a surface, bool [n].
+
+        Exact at sub-pixel places: the ray meets the surface that the nearest pixel's centre sees.
+        """
+        pose, surface = self.sequence.pose(self.index), pinhole.at_pixels(self.picture.surface, pixels)
+        there = surface != EMPTY
+        rays = pinhole.rays(np.asarray(pixels, np.float64), self.sequence.camera.intrinsics)
+        with np.errstate(divide="ignore"):
+            depth = 1.0 / inverse_depth_at(self.view, np.where(there, surface, 0), rays[:, 0], rays[:, 1])
+        points = depth[:, None] * rays
+        return (points - pose[:3, 3]) @ pose[:3, :3], there & np.isfinite(depth) & (depth > 0)
+
     @cached_property
     def gradient(self) -> tuple[np.ndarray, np.ndarray]:
         """Return that of the noise-free image along x and y, float32 [H, W], grey levels a pixel."""
@@ -175,10 +188,11 @@ class SimulatedOracle:
         """Return where `pixels` [n, 2] of frame i are in frame j, float64 [n, 2], and whether they are seen there,
         bool.
         """
-        known = self._known(index_i)
-        points, there = locate(known.view, self.pose(index_i), self.camera, known.picture, pixels)
-        target, depth = project(points, self.pose(index_j), self.camera)
-        return target, there & is_visible(target, depth, self._known(index_j).farthest)
+        points, there = self._known(index_i).points_at(pixels)
+        pose = self.pose(index_j)
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        target = pinhole.project(local, self.camera.intrinsics, NEAR)
+        return target, there & is_visible(target, local[:, 2], self._known(index_j).farthest)
 
     def _known(self, index: int) -> _KnownFrame:
         known = self._cache.pop(index, None) or _KnownFrame(self.sequence, index)
@@ -193,32 +207,6 @@ def _fingerprint(image: np.ndarray) -> tuple[int, int]:
     return zlib.crc32(data), zlib.adler32(data)
 
 
-def locate(
-    view: View, pose: np.ndarray, camera: Camera, picture: Picture, pixels: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return world points float64 [n, 3] that `pixels` [n, 2] show, and whether there is a surface, bool [n].
-
-    view, picture: of the camera at `pose`. Exact at sub-pixel places: the ray meets the surface that the nearest
-    pixel's centre sees.
-    """
-    height, width = picture.surface.shape
-    columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
-    rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
-    surface = picture.surface[rows, columns]
-    there = surface != EMPTY
-    rays = pinhole.rays(np.asarray(pixels, np.float64), camera.intrinsics)
-    with np.errstate(divide="ignore"):
-        depth = 1.0 / inverse_depth_at(view, np.where(there, surface, 0), rays[:, 0], rays[:, 1])
-    points = depth[:, None] * rays
-    return (points - pose[:3, 3]) @ pose[:3, :3], there & np.isfinite(depth) & (depth > 0)
-
-
-def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels float64 [n, 2] and depths [n] of world points [n, 3]; NaN pixels behind the camera."""
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    return pinhole.project(local, camera.intrinsics, NEAR), local[:, 2]
-
-
 def is_visible(pixels: np.ndarray, depths: np.ndarray, farthest: np.ndarray) -> np.ndarray:
     """Return whether points at `pixels` [n, 2] with depths [n] are inside the picture and not hidden: bool [n].
 
@@ -227,10 +215,8 @@ def is_visible(pixels: np.ndarray, depths: np.ndarray, farthest: np.ndarray) -> 
     height, width = farthest.shape
     with np.errstate(invalid="ignore"):
         inside = np.all((pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5), axis=1) & (depths > NEAR)
-    at = np.where(inside[:, None], pixels, 0.0)
-    columns = np.clip(np.rint(at[:, 0]).astype(int), 0, width - 1)
-    rows = np.clip(np.rint(at[:, 1]).astype(int), 0, height - 1)
-    return inside & (depths <= farthest[rows, columns] * (1 + _DEPTH_TOLERANCE))
+    nearby = pinhole.at_pixels(farthest, np.where(inside[:, None], pixels, 0.0))
+    return inside & (depths <= nearby * (1 + _DEPTH_TOLERANCE))
 
 
 def _clipped(edges: np.ndarray, pose: np.ndarray, camera: Camera) -> list[tuple[int, np.ndarray]]:
@@ -277,6 +263,6 @@ def _visible_parts(
         if np.linalg.norm(run[1, :2] - run[0, :2]) < _SHORTEST:
             continue
         points = (pinhole.rays(run[:, :2], camera.intrinsics) / run[:, 2:] - pose[:3, 3]) @ pose[:3, :3]
-        at = np.rint(samples[first : last + 1, :2]).astype(int)
-        parts.append((run[:, :2], points, index, float(maps[1][at[:, 1], at[:, 0]].mean())))
+        contrast = pinhole.at_pixels(maps[1], samples[first : last + 1, :2])
+        parts.append((run[:, :2], points, index, float(contrast.mean())))
     return parts
