@@ -13,7 +13,7 @@ The poses are those of another program (COLMAP, ARKit), often of free scale, not
 
 import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -79,7 +79,7 @@ class Nerfstudio(FolderSequence):
 
 def _images(folder: Path, content: Mapping[str, Any]) -> dict[Path, Mapping[str, Any]]:
     """Return the frames by their images, whose suffixes may be missing, or changed by a conversion."""
-    return {_below(folder, frame["file_path"], sorted(IMAGE_SUFFIXES)): frame for frame in content["frames"]}
+    return {_below(folder, frame["file_path"], IMAGE_SUFFIXES): frame for frame in content["frames"]}
 
 
 def _depth(folder: Path, frame: Mapping[str, Any]) -> Path | None:
@@ -87,18 +87,16 @@ def _depth(folder: Path, frame: Mapping[str, Any]) -> Path | None:
     return None if name is None else _below(folder, name)
 
 
-def _below(folder: Path, name: str, endings: list[str] | None = None) -> Path:
+def _below(folder: Path, name: str, suffixes: Collection[str] = ()) -> Path:
     """Return a file below the folder; others are never opened. The file of a path of another place, before the folder
     was copied, is searched by its name, here and in `images`, also with other suffixes.
     """
     path = Path(name.replace("\\", "/"))
     inside = not path.is_absolute() and ".." not in path.parts
     places = [folder / place for place in ([path] if inside else []) + [Path("images") / path.name, Path(path.name)]]
-    found = next(filter(is_there, places), None)
-    if found is None and endings:
-        known = path.suffix.lower() in endings
-        stems = [place.with_suffix("") if known else place for place in places]
-        found = next((file for stem in stems for end in endings if is_there(file := Path(f"{stem}{end}"))), None)
+    stems = [place.with_suffix("") if path.suffix.lower() in suffixes else place for place in places]
+    converted = [Path(f"{stem}{suffix}") for stem in stems for suffix in sorted(suffixes)]
+    found = next(filter(is_there, [*places, *converted]), None)
     if found is None and not inside:
         raise InputError(f"`{folder}`: {name!r} is missing below the folder of `{FILE}`")
     return found or places[0]

@@ -5,11 +5,10 @@ The camera is in `cam_params.json` beside the rooms; the depth is in 1 / 6553.5 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.image_files import DepthFormat
@@ -24,6 +23,7 @@ _PUBLISHED = (600.0, 600.0, 599.5, 339.5)
 _PUBLISHED_SIZE = (1200, 680)
 _UNITS = 6553.5
 _CAMERA = "cam_params.json"
+_EXPECTED = "`camera` with fx, fy, cx, cy and a positive `scale`, units a metre"
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,12 @@ class Replica(FolderSequence):
         ]
         places = folder / _CAMERA, folder.resolve().parent / _CAMERA
         file = next((file for file in places if file.is_file()), None)
-        scale, camera = (_UNITS, partial(_unstated_camera, folder)) if file is None else _stated(file)
+        with parsing(file or folder, _EXPECTED):
+            stated = {"scale": _UNITS} if file is None else read_json(file)["camera"]
+            scale = float(stated["scale"])
+            if not 0 < scale < math.inf:
+                raise ValueError(f"`scale` is {scale}")
+        camera = lambda *size: _unstated_camera(folder, *size) if file is None else _camera(file, stated, *size)
         return cls.listed(folder, frames, camera, DepthFormat(scale), rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
@@ -65,21 +70,10 @@ def _poses_in(file: Path) -> int | None:
         return None
 
 
-def _stated(file: Path) -> tuple[float, Callable[[int, int], Camera]]:
-    """Return the units a metre, and the camera for images of a size, of `cam_params.json`."""
-    with parsing(file, "`camera` with fx, fy, cx, cy and a positive `scale`, units a metre"):
-        stated = read_json(file)["camera"]
-        scale, size = float(stated["scale"]), (stated.get("w"), stated.get("h"))
-        if not 0 < scale < math.inf:
-            raise ValueError(f"`scale` is {scale}")
-        intrinsics = intrinsics_of(file, [stated[name] for name in ("fx", "fy", "cx", "cy")])
-
-    def camera(width: int, height: int) -> Camera:
-        if None not in size:
-            check_size(file, size, (width, height))
-        return Camera(intrinsics, width, height)
-
-    return scale, camera
+def _camera(file: Path, stated: Mapping[str, Any], width: int, height: int) -> Camera:
+    with parsing(file, _EXPECTED):
+        check_size(file, (stated.get("w", width), stated.get("h", height)), (width, height))
+        return Camera(intrinsics_of(file, [stated[name] for name in ("fx", "fy", "cx", "cy")]), width, height)
 
 
 def _unstated_camera(folder: Path, width: int, height: int) -> Camera:
