@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Self
 
 from vggtgeo.datasets.folder import LATEST, FolderSequence
-from vggtgeo.datasets.frame import MAX_DELAY
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, partners_in_time
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
@@ -77,12 +76,9 @@ def head_of(file: Path, comments: bool = False) -> list[str]:
 def _of_lists(folder: Path) -> list[_Frame]:
     images = _read_list(folder / "rgb.txt", frames=True)
     depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
-    partners = partners_in_time(images, depths)
-    if depths and (alone := partners.count(None)):
-        warn(f"`{folder}`: {alone} of {len(images)} images have no depth within {MAX_DELAY} s")
     return [
         (time, image, None if partner is None else depths[partner][1])
-        for (time, image), partner in zip(images, partners, strict=True)
+        for (time, image), partner in zip(images, partners_in_time(images, depths), strict=True)
     ]
 
 
