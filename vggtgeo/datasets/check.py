@@ -44,7 +44,8 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
         try:
             sequence = open_sequence(path, kind)
             missing, there = _without_missing(sequence)
-            frames = _sample(there)
+            count = len(there)
+            frames = list(there.frames(0, None if count else SAMPLES, max(count // SAMPLES, 1)))
             truth = sequence.ground_truth()
         except InputError as error:
             return Inspection((), (*_texts(caught), str(error)))
@@ -75,11 +76,6 @@ def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
     )
     messages = [f"{len(gone)} files that are listed are missing, `{min(gone)}` first"] if gone else []
     return messages, replace(sequence, files=files)
-
-
-def _sample(sequence: Sequence) -> list[Frame]:
-    count = len(sequence)
-    return list(sequence.frames(0, None if count else SAMPLES, max(count // SAMPLES, 1)))
 
 
 def _texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:

@@ -212,7 +212,9 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
     Raises InputError as `Trajectory.load_tum`, and for poses without times if `clock` has another number of poses.
     """
     file = Path(path)
-    columns = _columns(file) if file.is_file() else 8
+    text = whole_text(file) if file.is_file() else ""
+    lines = (line.split("#", 1)[0].replace(",", " ").split() for line in text.splitlines())
+    columns = len(next(filter(None, lines), ()))
     if columns == _KITTI:
         return _kitti(file, clock)
     if columns == _EUROC:
@@ -223,12 +225,6 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
         return found
     warn(f"`{file}`: its times are nanoseconds, and are converted", NoteWarning)
     return Trajectory(1e-9 * found.timestamps, found.poses)
-
-
-def _columns(file: Path) -> int:
-    """Return the number of columns of the first line with any."""
-    lines = (line.split("#", 1)[0].replace(",", " ").split() for line in whole_text(file).splitlines())
-    return len(next((words for words in lines if words), ()))
 
 
 def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:

@@ -80,12 +80,11 @@ class Archive:
         if total > limit:
             raise InputError(f"`{self.path}` has {total / 2**20:.0f} MiB of arrays, must be at most {limit >> 20} MiB")
         check(headers)
-        return {name: self._data(name) for name in headers}
-
-    def _data(self, name: str) -> np.ndarray:
-        # Raises ValueError for an array of objects, or of another size than its header declares.
-        with self.file.open(self.members[name]) as stream:
-            return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+        found = {}
+        for name in headers:  # a ValueError for an array of objects, or of another size than its header declares
+            with self.file.open(self.members[name]) as stream:
+                found[name] = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+        return found
 
 
 @contextmanager
