@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import psutil
-
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
@@ -97,6 +95,8 @@ def _signals() -> list[signal.Signals]:
 def peak_memory_gb() -> float:
     """Return the largest resident memory so far, GiB."""
     if sys.platform == "win32":
+        import psutil  # of all systems, but slow to import
+
         return float(psutil.Process().memory_info().peak_wset) / 2**30
     import resource  # POSIX only
 
