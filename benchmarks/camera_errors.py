@@ -34,6 +34,20 @@ ROUNDS = 2
 """Iterations for the position from which a pixel moved."""
 
 
+def in_bands_of_light(image: np.ndarray, row: int, share: float, period: float, speed: float) -> np.ndarray:
+    """Return the image, uint8 [H, W, 3], with flicker of a rolling shutter: bands of `period` rows with `share` more
+    and less light, which move by `speed` rows per image. row: of this image.
+    """
+    phase = 2 * np.pi * (np.arange(len(image))[:, None, None] + speed * row) / period
+    return np.clip(image * (1 + share * np.sin(phase)), 0, 255).astype(np.uint8)
+
+
+def compressed(image: np.ndarray, quality: int) -> np.ndarray:
+    """Return the image, uint8 [H, W, 3], RGB, after JPEG compression of this quality."""
+    _, code = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.ascontiguousarray(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])
+
+
 def motion_field(
     depth: np.ndarray, velocity: np.ndarray, intrinsics: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -19,9 +19,9 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
+from simulated_loop import simulate_loop
 
 import vggtgeo as vg
-from vggtgeo.simulation.loop import simulate_loop
 
 MODELS = (vg.cameras.Pinhole, vg.cameras.RadialTangential, vg.cameras.KannalaBrandt)
 SIGMA = 0.05

@@ -21,8 +21,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 import vggtgeo as vg
+from vggtgeo.compilation.process_settings import program_settings
 from vggtgeo.datasets.views import SequenceView
-from vggtgeo.io.process_settings import program_settings
 from vggtgeo.mapping.dense import dense_map
 from vggtgeo.slam.known_map import load_map, save_map
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose

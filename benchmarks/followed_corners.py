@@ -17,10 +17,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from camera_errors import in_bands_of_light
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.simulation.degradations import Recording, in_bands_of_light, with_images
+from vggtgeo.simulation.degradations import Recording, with_images
 from vggtgeo.slam.perception.followed_corners import common_to_rows
 from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.thresholds import MIN_COMMON

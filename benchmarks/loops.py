@@ -3,7 +3,7 @@
     taskset -c 1 .venv/bin/python benchmarks/loops.py [--keyframes 125 250 500 1000] [--solvers chosen jacobi]
         [--parts solve gradient covariances observability] [--out runs/loops]
 
-The loop is that of `vggtgeo/simulation/loop.py`: points, depth priors, aligned surfaces, edges around the loop, and a
+The loop is that of `benchmarks/simulated_loop.py`: points, depth priors, aligned surfaces, edges around the loop, and a
 guess that drifts, so that the loop does not close. Each cell is a process of its own, in float64, on one core:
 
 - solve: until it converges; time an iteration, the linear solver that the graph chose, and the errors of the camera
@@ -33,12 +33,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from simulated_loop import simulate_loop
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.reduced import AbstractReducedSolver
 
 import vggtgeo as vg
 from vggtgeo.bundle.analysis.observability import DENSE_KEYFRAMES
-from vggtgeo.simulation.loop import simulate_loop
 
 SOLVERS: dict[str, Callable[[vg.Problem], AbstractReducedSolver]] = {
     "chosen": vg.choose_reduced_solver,

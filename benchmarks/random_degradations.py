@@ -21,6 +21,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from camera_errors import compressed, in_bands_of_light
 from recordings import write
 from stress import ORDER, Case, add_run_options, excused, judge, row, run_case
 
@@ -29,8 +30,6 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation.degradations import (
     Recording,
-    compressed,
-    in_bands_of_light,
     with_depths,
     with_images,
     without_depth,

@@ -2,7 +2,7 @@
 
     .venv/bin/python benchmarks/repeated_structure.py [--seeds 0 1 2] [--sections 6]
 
-The corridor is that of `vggtgeo/simulation/repeated_corridor.py`: sections of 2 m with the same posters. It is walked
+The corridor is that of `benchmarks/repeated_corridor.py`: sections of 2 m with the same posters. It is walked
 once from end to end, and once there and back, so that only the last frames see the first ones' wall again. A row a
 walk: the ATE after the best SE(3) before the last adjustment (odometry) and after it, how many pairs of keyframes a
 window or more apart were taken as loops, how many of them are false (they join keyframes that stand three quarters of a
@@ -15,10 +15,10 @@ import argparse
 
 import jax
 import numpy as np
+from repeated_corridor import SECTION, repeated_corridor
 
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
-from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.simulation.sequence import SyntheticSequence
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames

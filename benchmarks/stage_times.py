@@ -24,9 +24,9 @@ from typing import Any
 
 import vggtgeo as vg
 from vggtgeo.cli.run import DEMO_SIZE
+from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.jax_environment import jax_environment
 
 COUNTS = ("frames", "keyframes")
 WHOLE = ("whole", "processor", "memory, GB")

@@ -39,11 +39,11 @@ from verdict_faults import FAULTS, HEALTHY, OF_DEPTH, OF_STREAM, WITHOUT_DEPTH, 
 
 import vggtgeo as vg
 from vggtgeo.benchmark.inputs import DegradedWalk
+from vggtgeo.compilation.process_settings import program_settings
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.process_settings import program_settings
 from vggtgeo.results import reconstruction
 from vggtgeo.simulation import WORLDS
 from vggtgeo.simulation.degradations import Recording, without_depth

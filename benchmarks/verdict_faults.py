@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from camera_errors import KINECT, STEREO, auto_exposed, exposed, late_depth, late_truth, vignetted
+from camera_errors import KINECT, STEREO, auto_exposed, compressed, exposed, late_depth, late_truth, vignetted
 
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import IDEAL, WORLDS, SyntheticSequence
@@ -16,7 +16,6 @@ from vggtgeo.simulation.degradations import (
     Recording,
     barrel,
     changed_lens,
-    compressed,
     growing_depth,
     jumping_depth,
     with_depths,

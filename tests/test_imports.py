@@ -15,7 +15,7 @@ ALLOWED = {
 }
 STAIR = (
     ("io",),
-    ("geometry",),
+    ("compilation", "geometry"),
     ("bundle", "datasets", "evaluation"),
     ("simulation", "slam"),
     ("mapping",),

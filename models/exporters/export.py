@@ -39,7 +39,7 @@ from vggtgeo.models.onnx.contracts import (
 )
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.peak_memory import peak_memory_gb
+from vggtgeo.io.process import peak_memory_gb
 
 OPSET = 20
 EMBEDDED = 64e6

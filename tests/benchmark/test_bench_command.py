@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from vggtgeo.benchmark import runner
 from vggtgeo.cli.main import make_app
-from vggtgeo.io.locks import locked
+from vggtgeo.io.files import locked
 
 
 @pytest.mark.parametrize(

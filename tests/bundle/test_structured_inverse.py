@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmark_modules import benchmark
 from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint, exact_model
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
 from vggtgeo.solvers.band_cholesky import BandCholesky
@@ -21,10 +22,11 @@ from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
 from vggtgeo.bundle.solver_choice import coupled_pairs, longest, narrow_order
-from vggtgeo.simulation.loop import simulate_loop
+
+loop = benchmark("simulated_loop")
 
 KEYFRAMES = 30
-WINDOW, SURFACES = simulate_loop(KEYFRAMES, points=6, reach=2, drift=0.3)
+WINDOW, SURFACES = loop.simulate_loop(KEYFRAMES, points=6, reach=2, drift=0.3)
 PROBLEM, INITIAL, _ = WINDOW.pack(intrinsics=Intrinsics(WINDOW.intrinsics, prior_sigma=2.0), terms=(SURFACES,))
 ENDS, _ = coupled_pairs(PROBLEM)
 PLACE = narrow_order(KEYFRAMES, ENDS)

@@ -10,7 +10,8 @@ import pytest
 import tiny_sequences
 from reported import raises
 
-from vggtgeo.datasets.bag_messages import Chosen, camera_of, chosen_topics, image_of, metres_of
+from vggtgeo.datasets.bag_cameras import camera_of
+from vggtgeo.datasets.bag_images import Chosen, chosen_topics, image_of, metres_of
 
 PLACE = Path("a.bag, /c, 0")
 
@@ -126,26 +127,11 @@ def test_images_of_16_bits(encoding: str, channels: int, order: str) -> None:
     assert (image_of(message, PLACE, 16).image == expected >> 4).all()
 
 
-@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
-def test_images_of_grey_and_one_colour_for_four_pixels(encoding: str) -> None:
-    # Oracle: OpenCV's own conversion of an image of few colours to planes, put together as the encoding has them.
-    image = np.repeat(np.repeat(np.array([[[200, 40, 30], [20, 90, 220]]], np.uint8), 4, 0), 4, 1)
-    planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
-    u, v = planes[4:5].reshape(2, 4), planes[5:].reshape(2, 4)
-    pairs = np.stack([u, v] if encoding == "nv12" else [v, u], axis=2).reshape(2, 8)
-    message = raw(encoding, np.concatenate([planes[:4], pairs]))
-    message.height, message.step = 4, 8
-    assert np.abs(image_of(message, PLACE).image.astype(int) - image).max() <= 4
-    message.height = 6
-    with raises("a.bag, /c, 0"):
-        image_of(message, PLACE)
-
-
 def test_the_camera_of_a_part_of_the_sensor_with_pixels_put_together() -> None:
     # Oracle: the definition of the message, on a sensor of 640 x 480 of which 400 x 200 pixels are read, two as one.
     region = SimpleNamespace(x_offset=120, y_offset=200, width=400, height=200)
     info = SimpleNamespace(width=640, height=480, binning_x=2, binning_y=2, roi=region, distortion_model="plumb_bob")
     info.k, info.d = np.array([500.0, 0, 320, 0, 510, 300, 0, 0, 1]), np.zeros(5)
-    found = camera_of(Path("a.bag"), {"/c/info": [info]}, "/c/image", (200, 100))
+    found = camera_of(Path("a.bag"), {"/c/info": info}, "/c/image", (200, 100))
     assert found is not None
     np.testing.assert_allclose(found.intrinsics, (250.0, 255.0, 100.0, 50.0))

@@ -207,30 +207,9 @@ def test_a_part_of_a_drive_of_kitti_keeps_its_times_and_its_truth(tmp_path: Path
     (tmp_path / "dataset/poses/07.txt").write_text("\n".join(poses[:5]))
     with warns("07.txt", "1", "3"):
         assert tiny.quietly_opened(drive).ground_truth().timestamps == pytest.approx([0, 0.2])
-    (drive / "times.txt").write_text("0.1\n0.3\n0.5\n")  # of these images alone, and the poses of all
-    (tmp_path / "dataset/poses/07.txt").write_text("\n".join(poses))
-    sequence = tiny.quietly_opened(drive)
-    assert [frame.timestamp for frame in sequence.frames()] == pytest.approx([0.1, 0.3, 0.5])
-    np.testing.assert_allclose(sequence.ground_truth().positions[:, 0], [0.94, 2.94, 4.94])
     (drive / "times.txt").write_text("".join(f"{0.1 * number}\n" for number in range(5)))
     with raises("07", "3", "5"):
         tiny.quietly_opened(drive)
-
-
-def test_a_part_of_a_room_of_replica_keeps_its_truth(tmp_path: Path) -> None:
-    # Proves the same of Replica: every second frame, from the second on. Oracle: what was written.
-    room = tiny.replica(tmp_path / "room")
-    whole = tiny.quietly_opened(room).ground_truth()
-    lines = (room / "traj.txt").read_text().splitlines()
-    (room / "results/frame000000.jpg").unlink()
-    part = tiny.quietly_opened(room)
-    assert [frame.timestamp for frame in part.frames()] == pytest.approx([0, 1 / 30])
-    np.testing.assert_allclose(part.ground_truth().poses, whole.poses[1:])
-    (room / "traj.txt").write_text(lines[0] + "\n")  # cut: it is not that of the first image that is there
-    with warns("traj.txt", "2"):
-        assert tiny.quietly_opened(room).ground_truth() is None
-    (room / "traj.txt").write_text("\n".join(lines[1:]) + "\n")  # of the images that are there alone
-    np.testing.assert_allclose(tiny.quietly_opened(room).ground_truth().poses, whole.poses[1:])
 
 
 def test_kitti_raw(tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
-"""Folders of images and depth, as people and programs write them: pairs, units, and what is no recording."""
+"""Folders of images and depth, as people and programs write them: pairs, lists of pairs, units, cameras, and what is no
+recording.
+"""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -11,6 +14,8 @@ from layout_checks import checked
 from reported import raises, warns
 
 from vggtgeo.datasets import open_sequence, with_depth_scale, with_rate
+from vggtgeo.datasets.tum import TumRgbd
+from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import UnusableDepthWarning
 
 
@@ -95,3 +100,95 @@ def test_the_result_of_a_run_is_no_recording(tmp_path: Path) -> None:
         (folder / name).write_text("")
     with raises("result"):
         open_sequence(folder)
+
+
+COUNT = 12
+
+
+def _pairs(folder: Path, times: list[str], name: str = "associations.txt") -> Path:
+    lines = []
+    for number, time in enumerate(times):
+        names = f"rgb/rgb{number:05d}.png", f"depth/depth{number:05d}.png"
+        tiny_sequences.write_image(folder / names[0], tiny_sequences.image(number))
+        tiny_sequences.write_image(folder / names[1], tiny_sequences.depth_codes(number))
+        lines.append(f"{time} {names[0]} {time} {names[1]}\n")
+    (folder / name).write_text("".join(lines))
+    tiny_sequences.write_calibration(folder, tiny_sequences.INTRINSICS)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["associations.txt", "association.txt", "associate.txt", "associated.txt"])
+def test_a_list_of_pairs_with_times_is_nobody_elses_benchmark(tmp_path: Path, name: str) -> None:
+    # Proves that a recording for ORB-SLAM2 keeps its own camera and times (it was taken for ICL-NUIM), and that the
+    # unit is told, but for ETH3D's `associated.txt`. Oracle: what was written.
+    times = [f"{1305031102 + 0.04 * number:.6f}" for number in range(COUNT)]
+    folder = _pairs(tmp_path / "own", times, name)
+    if name == "associated.txt":
+        sequence = open_sequence(folder)
+    else:
+        with warns("1", "5000", name):
+            sequence = open_sequence(folder)
+    assert isinstance(sequence, TumRgbd)
+    np.testing.assert_allclose(sequence.camera.intrinsics, tiny_sequences.INTRINSICS)
+    frames = list(sequence.frames())
+    np.testing.assert_allclose([frame.timestamp for frame in frames], np.float64(times), rtol=0, atol=1e-6)
+    assert [int(frame.name[-9:-4]) for frame in frames] == list(range(COUNT))
+    assert frames[1].depth[3, 7] == pytest.approx(1.017 / 5)  # 1/5000 m
+
+
+def test_a_list_of_pairs_that_counts_frames_has_thirty_a_second_and_millimetres(tmp_path: Path) -> None:
+    # Proves that numbers of frames are not taken for seconds, and that this is said. Oracle: 1/30 s.
+    folder = _pairs(tmp_path / "own", [str(number) for number in range(1, COUNT + 1)])
+    with warns("associations.txt", "30"):
+        sequence = open_sequence(folder)
+    assert isinstance(sequence, TumRgbd)
+    frames = list(sequence.frames())
+    np.testing.assert_allclose(np.diff([frame.timestamp for frame in frames]), 1 / 30)
+    assert frames[1].depth[3, 7] == pytest.approx(1.017)
+
+
+def test_the_camera_of_an_export_of_record3d(tmp_path: Path) -> None:
+    # Proves the matrix by columns of images of this size, and that another program's `metadata.json` is left alone.
+    folder = tiny.rgbd(tmp_path / "phone")
+    (folder / "intrinsic.json").unlink()
+    fx, fy, cx, cy = tiny_sequences.INTRINSICS
+    matrix = [fx, 0, 0, 0, fy, 0, cx, cy, 1]
+    size = {"w": tiny_sequences.WIDTH, "h": tiny_sequences.HEIGHT}
+    (folder / "metadata.json").write_text(json.dumps({**size, "fps": 60, "K": matrix}))
+    assert open_sequence(folder).camera == Camera(tiny_sequences.INTRINSICS, *size.values())
+    for other in ({"w": 80, "h": 60, "K": matrix}, size, [1, 2]):
+        (folder / "metadata.json").write_text(json.dumps(other))
+        assert not tiny.quietly_opened(folder).camera.known
+    (folder / "metadata.json").write_text(json.dumps({**size, "K": "none"}))
+    with raises("metadata.json", "none"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize("ending", ["", ".JPEG", None])
+def test_images_that_were_listed_elsewhere_are_found_by_their_names(tmp_path: Path, ending: str | None) -> None:
+    # Proves that a list made on another computer, outside its folder, reads the images that lie here, and if they were
+    # converted since, or listed without an ending. Oracle: the same recording as it was listed.
+    folder = tiny.nerfstudio(tmp_path / "scene")
+    plain = list(tiny.quietly_opened(folder).frames())
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        name = Path(frame["file_path"])
+        frame["file_path"] = "..\\slides\\" + (name.name if ending is None else name.stem + ending)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    for one, other in zip(tiny.quietly_opened(folder).frames(), plain, strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+
+
+def test_transforms_with_a_field_of_view_or_without_a_camera(tmp_path: Path) -> None:
+    # Proves focal length by the field of view, and a guess that is told where the file has neither. Oracle: tangent.
+    folder = tiny.nerfstudio(tmp_path / "scene")
+    content = json.loads((folder / "transforms.json").read_text())
+    bare = {key: content[key] for key in ("w", "h", "frames")}
+    (folder / "transforms.json").write_text(json.dumps({**bare, "camera_angle_x": 1.0}))
+    width = tiny_sequences.WIDTH
+    assert open_sequence(folder).camera.intrinsics[:3] == pytest.approx(
+        (0.5 * width / np.tan(0.5), 0.5 * width / np.tan(0.5), 0.5 * (width - 1))
+    )
+    (folder / "transforms.json").write_text(json.dumps(bare))
+    with warns("scene"):
+        assert not open_sequence(folder).camera.known

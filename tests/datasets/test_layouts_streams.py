@@ -12,7 +12,7 @@ from layout_checks import CAMERA, checked
 from reported import raises, warns
 
 from vggtgeo.datasets import open_sequence
-from vggtgeo.datasets.video import LiveCamera, is_live
+from vggtgeo.datasets.live_camera import LiveCamera, is_live
 from vggtgeo.results.source import Source
 
 

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 import vggtgeo as vg
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import NoteWarning
 
 
 def _path(count: int = 12) -> Trajectory:
@@ -73,12 +72,3 @@ def test_poses_of_kitti_have_the_times_of_the_truth(tmp_path: Path) -> None:
     assert vg.evaluate(tmp_path / "00.txt", _path()).se3.statistics.maximum < 1e-9
     with raises("00.txt", "12", "9"):
         load_trajectory(tmp_path / "00.txt", _path(9))
-
-
-def test_poses_of_an_estimate_are_not_left_out_of_the_truth(tmp_path: Path) -> None:
-    """A file of KITTI's poses, one of them NaN: it may be an estimate as well as a truth. Oracle: the sentence."""
-    rows = np.tile(np.eye(4)[:3].ravel(), (3, 1))
-    rows[1] = np.nan
-    np.savetxt(tmp_path / "estimate.txt", rows)
-    with warns("estimate.txt", "1", "3", warning=NoteWarning):
-        assert len(load_trajectory(tmp_path / "estimate.txt")) == 2

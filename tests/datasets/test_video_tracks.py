@@ -142,7 +142,7 @@ def test_tracks_in_colour_go_before_those_in_grey_and_covers() -> None:
         track(4, "", "yuv420p", (640, 480)),
     )
     chosen = choose_tracks(tracks)
-    assert (chosen.images.number, chosen.depth, len(chosen.others), chosen.maybe_depth) == (3, None, 4, ())
+    assert (chosen.images.number, chosen.depth, len(chosen.others)) == (3, None, 4)
 
 
 @pytest.mark.parametrize(("turns", "matrix"), [(1, (0, -1, 1, 0)), (2, (-1, 0, 0, -1)), (3, (0, 1, -1, 0))])

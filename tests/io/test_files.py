@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from reported import raises
 
-from vggtgeo.io.files import atomic_open, atomic_path, write_json, write_picture, write_text
+from vggtgeo.io.files import atomic_open, write_json, write_picture, write_text
 
 
 @contextmanager
@@ -73,22 +73,3 @@ def test_a_picture_is_written_as_a_whole_or_not_at_all(tmp_path: Path, suffix: s
         write_picture(file, np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8))
     assert file.read_bytes() == before
     assert os.listdir(file.parent) == [file.name]
-
-
-def test_the_temporary_file_lies_beside_and_keeps_the_suffix(tmp_path: Path) -> None:
-    # Proves what `os.replace` and writers that go by the suffix need. Oracle: the paths themselves.
-    with atomic_path(tmp_path / "depth.png") as temporary:
-        assert temporary.parent == tmp_path
-        assert temporary.suffix == ".png"
-        temporary.write_bytes(b"new")
-    assert (tmp_path / "depth.png").read_bytes() == b"new"
-
-
-def test_who_reads_meanwhile_keeps_the_old_content(tmp_path: Path) -> None:
-    # Proves that the file is replaced, never overwritten in place. Oracle: a reader that had it open before.
-    file = tmp_path / "trajectory.txt"
-    write_text(file, "old, and longer")
-    with open(file) as reader:
-        write_text(file, "new")
-        assert reader.read() == "old, and longer"
-    assert file.read_text() == "new"

@@ -9,7 +9,7 @@ import sys
 import pytest
 from conftest import ROOT
 
-from vggtgeo.io.peak_memory import peak_memory_gb, rusage_gb
+from vggtgeo.io.process import peak_memory_gb, rusage_gb
 
 WINDOWS = """
 import importlib, os, pkgutil, signal, sys, types

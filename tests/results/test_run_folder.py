@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.interruption import end_on_signals
-from vggtgeo.io.locks import LockedError, locked
+from vggtgeo.io.files import LockedError, locked
+from vggtgeo.io.process import end_on_signals
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.results.files import write_depth
 from vggtgeo.results.output_checks import unfinished_message

@@ -77,22 +77,6 @@ def test_late_depth_is_that_of_the_moment_before(recording: Recording) -> None:
     assert late < 0.4 * here < 0.3 * early, (late, here, early)
 
 
-def test_late_truth_keeps_the_poses(recording: Recording) -> None:
-    # Proves that the truth's clock alone moves. Oracle: the times before.
-    late = errors_of.late_truth(recording, 0.005).truth
-    np.testing.assert_allclose(late.timestamps - recording.truth.timestamps, 0.005)
-    np.testing.assert_array_equal(late.poses, recording.truth.poses)
-
-
-def test_corners_are_dark_and_the_middle_is_not() -> None:
-    # Proves the share of light that is missing. Oracle: a white image.
-    sequence = _walk()
-    white = replace(sequence.frame(0), image=np.full((91, 121, 3), 200, np.uint8), depth=None)
-    image = errors_of.vignetted(Recording([white], sequence.camera, sequence.ground_truth()), 0.3).frames[0].image
-    assert image[45, 60, 0] == 200
-    assert (image[0, 0, 0], image[-1, -1, 0]) == (140, 140)
-
-
 def test_exposure_follows_the_brightness_with_a_lag() -> None:
     # Proves the control of exposure: a step of brightness by 2 is taken away, and not at once. Oracle: the known step.
     sequence = _walk()
@@ -128,15 +112,6 @@ def test_noise_grows_with_the_square_of_depth(grain: float) -> None:
         assert abs(spread / (z**2 / 40.0 * 0.05) - 1) < 0.1, (z, spread)
 
 
-def test_depth_is_quantised_in_disparity() -> None:
-    # Proves the steps of depth. Oracle: whole multiples of the step, no farther than half of it.
-    depth = np.tile(np.linspace(1, 4, errors_of.NATIVE_WIDTH), (4, 1))
-    disparity = 40.0 / _measured(replace(CLEAN, step=0.125), depth)
-    seen = np.isfinite(disparity)
-    np.testing.assert_allclose(disparity[seen] / 0.125, np.rint(disparity[seen] / 0.125), atol=1e-3)
-    assert np.abs(disparity - 40.0 / depth)[seen].max() <= 0.0626
-
-
 def test_a_nearer_surface_casts_a_shadow_as_wide_as_the_difference_of_disparity() -> None:
     # Proves the holes beside edges: on one side alone, of `f b (1 / near - 1 / far)` pixels. Oracle: the formula.
     depth = np.full((10, errors_of.NATIVE_WIDTH), 4.0)
@@ -145,20 +120,3 @@ def test_a_nearer_surface_casts_a_shadow_as_wide_as_the_difference_of_disparity(
     assert not hole[:, 300:].any()
     assert abs(hole[5].sum() - 30) <= 1, hole[5].sum()
     assert hole[5, 299]
-
-
-def test_a_window_makes_nearer_surfaces_larger() -> None:
-    # Proves the bleeding of edges: by half a window on both sides, of the nearer surface's depth. Oracle: the window.
-    depth = np.full((60, errors_of.NATIVE_WIDTH), 4.0)
-    depth[:, 300:400] = 1.0
-    measured = _measured(replace(CLEAN, window=8.0), depth)
-    assert np.flatnonzero(np.isclose(measured[30], 1.0))[[0, -1]].tolist() == [296, 403]
-
-
-@pytest.mark.parametrize("sensor", [errors_of.KINECT, errors_of.STEREO])
-def test_nothing_is_measured_too_far_away(sensor: Any) -> None:
-    # Proves the reach of the sensors. Oracle: a wall beyond it, and one before.
-    assert np.isnan(_measured(sensor, np.full((20, 30), 1.5 * sensor.far))).all()
-    near = _measured(sensor, np.full((20, 30), 2.0))
-    assert np.isfinite(near).all()
-    assert 0 < np.abs(near - 2.0).max() < 0.08

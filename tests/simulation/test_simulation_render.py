@@ -148,16 +148,3 @@ def test_glass_shows_what_is_behind_it_and_mirrors_what_is_before_it() -> None:
     bright = np.argwhere(picture.light.sum(axis=-1) > 0.5 * picture.light.sum(axis=-1).max())
     found = bright.mean(axis=0)[::-1]
     assert np.abs(found - (u, v)).max() < 0.6, f"{found=} {(u, v)=}"
-
-
-def test_edges_are_antialiased_and_depth_is_not(shapes: Scene) -> None:
-    # Along the outline of the box colours are mixed, but every depth belongs to one surface: the exact plane depth.
-    pose = looking((-0.3, -1.5, 1.4), (-0.2, 2.0, 0.5))
-    picture = render(shapes, pose, INTRINSICS, SIZE)
-    view = view_from(shapes.surfaces, pose)
-    rows, columns = np.nonzero(picture.surface >= 0)
-    x = (columns - INTRINSICS[2]) / INTRINSICS[0]
-    y = (rows - INTRINSICS[3]) / INTRINSICS[1]
-    depth = 1 / inverse_depth_at(view, picture.surface[rows, columns], x, y)
-    assert np.array_equal(depth, picture.depth[rows, columns])
-    assert np.isfinite(picture.light).all()

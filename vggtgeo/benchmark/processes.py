@@ -27,10 +27,10 @@ from vggtgeo.benchmark.jobs import Job, Store
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.table import Row
 from vggtgeo.benchmark.worker import LOG
+from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.jax_environment import jax_environment
-from vggtgeo.io.locks import LockedError, locked
-from vggtgeo.io.peak_memory import rusage_gb
+from vggtgeo.io.files import LockedError, locked
+from vggtgeo.io.process import rusage_gb
 
 Command = Callable[[Path, Path], Sequence[str]]
 """Returns the command line of a run for its folder and the scratch folder."""

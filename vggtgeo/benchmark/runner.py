@@ -32,9 +32,8 @@ from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import write_text
+from vggtgeo.io.files import locked_folder, write_text
 from vggtgeo.io.given import path_of
-from vggtgeo.io.locks import locked_folder
 
 OUTPUTS = ("report.html", "tables.md", "runs.csv", "runs.parquet")
 """Files of a suite in its folder; the last one only with PyArrow."""

@@ -20,7 +20,7 @@ from vggtgeo.benchmark.measure import measure, truth_of_run
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.io.errors import InputError, collected_warnings
 from vggtgeo.io.files import write_json
-from vggtgeo.io.peak_memory import peak_memory_gb
+from vggtgeo.io.process import peak_memory_gb
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.run_options import RunOptions
 from vggtgeo.slam.callback import Callback

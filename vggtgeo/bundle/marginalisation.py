@@ -33,10 +33,10 @@ from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_whole, real_numbers
-from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
@@ -261,4 +261,4 @@ def _marginal_term(problem: Problem) -> MarginalPrior:
     )
 
 
-marginalise_jit = KeptProgram(marginalise, lambda problem, state, leaving: _marginal_term(problem))
+marginalise_jit = CachedProgram(marginalise, lambda problem, state, leaving: _marginal_term(problem))

@@ -26,7 +26,7 @@ from vggtgeo.bundle.pair_checks import check_connected, check_kinds
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import camera_models as cameras
-from vggtgeo.io.archives import Archive, ArrayHeader, read_archive
+from vggtgeo.io.archives import Archive, ArrayHeader, open_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.io.given import check_kind, path_of
@@ -88,7 +88,8 @@ def load_problem(
     path = path_of("path", path)
     if dtype is not None:
         check_dtype(dtype)
-    arrays = read_archive(path, "a problem", _flat)
+    with open_archive(path, "a problem") as archive:
+        arrays = _flat(archive)
     if not arrays:
         return _load_saved(path, terms, lambda name, values: _as_jax(path, name, values, dtype))
     observations = Observations(

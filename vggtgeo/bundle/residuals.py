@@ -10,12 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, prepared
 from vggtgeo.bundle.pair_checks import check_kinds, check_pair
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.readable import Readable
 from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm, node_residuals
 from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
-from vggtgeo.io.kept_program import KeptProgram
-from vggtgeo.io.readable import Readable
+from vggtgeo.compilation.program_cache import CachedProgram
 
 
 class ResidualSizes(Readable):
@@ -85,7 +85,7 @@ def _sizes_like(problem: Problem, state: State) -> ResidualSizes:
     return ResidualSizes(numbers, counts, tuple((term.name, term.unit) for term in problem.terms))
 
 
-_sizes_jit = KeptProgram(_sizes, _sizes_like)
+_sizes_jit = CachedProgram(_sizes, _sizes_like)
 
 
 def residuals_at(problem: Problem, state: State) -> dict[str, Float[Array, "..."]]:

@@ -17,10 +17,10 @@ from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.pair_checks import check_observed, check_pair
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
+from vggtgeo.bundle.readable import Readable
 from vggtgeo.bundle.solver_choice import default_solver
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
-from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.adjoint import ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import (
     CONVERGED,

@@ -27,9 +27,9 @@ from vggtgeo.cli.run import demo, run
 from vggtgeo.cli.simulate import simulate, warm_up
 from vggtgeo.cli.solve import solve
 from vggtgeo.cli.view import export, view
+from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one_line
-from vggtgeo.io.interruption import end_on_signals, ignore_signals
-from vggtgeo.io.jax_environment import jax_environment
+from vggtgeo.io.process import end_on_signals, ignore_signals
 
 GC_THRESHOLD = 50_000
 """New objects between two garbage collections: with Python's default of 700 they take some per cent of a run."""

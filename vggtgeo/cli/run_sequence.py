@@ -19,7 +19,7 @@ from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.datasets.views import reduced
 from vggtgeo.io.errors import InputError, one_line
 from vggtgeo.io.files import whole_path
-from vggtgeo.io.interruption import interruption
+from vggtgeo.io.process import interruption
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories

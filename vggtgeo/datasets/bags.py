@@ -2,12 +2,12 @@
 
 Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage`; colour before grey and infrared),
 depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
-any other; depth with a camera of its own is registered by what the bag states of it, `bag_messages.py`), the camera's
+any other; depth with a camera of its own is registered by what the bag states of it, `bag_cameras.py`), the camera's
 `CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
 name contains `truth`, `gt`, `vicon` or `mocap`. A choice among several is reported.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -15,21 +15,25 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from vggtgeo.datasets.bag_messages import (
+from vggtgeo.datasets.bag_cameras import (
     CAMERA_INFO,
-    IMAGES,
     TRANSFORMS,
-    Chosen,
     DepthCamera,
-    Unread,
     camera_of,
-    chosen_topics,
     depth_camera_of,
-    described_choice,
     frame_name,
+    motion_between,
+)
+from vggtgeo.datasets.bag_images import (
+    IMAGES,
+    Chosen,
+    Unread,
+    chosen_topics,
     image_of,
     metres_of,
+    note_choice,
     truth_topic,
 )
 from vggtgeo.datasets.folder import ImageChecks
@@ -54,23 +58,19 @@ def is_bag(path: Path) -> bool:
     return path.suffix in (".bag", *ROS_2) or (path / METADATA).is_file()
 
 
-def no_whole_bag(folder: Path) -> str | None:
+def why_incomplete(folder: Path) -> str | None:
     """Return why a folder is not one bag: several ROS 1 bags, or a ROS 2 bag without its metadata; None otherwise."""
     if not folder.is_dir() or (folder / METADATA).is_file():
         return None
     bags = sorted(path.name for path in folder.iterdir() if path.suffix == ".bag")
     if len(bags) > 1:
         return (
-            f"`{folder}` holds {len(bags)} bags of ROS 1, `{bags[0]}` to `{bags[-1]}`; give one of them; parts of one "
-            "recording can be joined: `rosbags-convert --src` all of them `--dst` a new folder"
+            f"`{folder}` holds {len(bags)} bags of ROS 1, `{bags[0]}` to `{bags[-1]}`; give one of them, or join them: "
+            "`rosbags-convert --src` all of them `--dst` a new folder"
         )
-    file = next((path for path in sorted(folder.iterdir()) if path.suffix in ROS_2), None)
-    if file is None:
-        return None
-    return (
-        f"`{file}` is of a ROS 2 bag, and `{METADATA}`, which belongs beside it, is not there; copy it, too, or make "
-        f"it again with `ros2 bag reindex {folder}`"
-    )
+    if any(path.suffix in ROS_2 for path in folder.iterdir()):
+        return f"`{folder}` holds a ROS 2 bag without `{METADATA}`; copy it, too, or `ros2 bag reindex {folder}`"
+    return None
 
 
 @dataclass(frozen=True)
@@ -95,22 +95,20 @@ class RosBag:
 
         Raises:
             InputError: there are no colour images, the depth is of another camera and the bag has no extrinsics, or
-            rosbags
-                is not installed.
+                rosbags is not installed.
 
         """
         with _reader(path) as reader:
             topics = {name: str(info.msgtype) for name, info in reader.topics.items()}
-            first = {name: _first(reader, name) for name in topics if topics[name] in IMAGES}
-            chosen = chosen_topics(path, first)
-            poses = truth_topic(topics)
-            if text := described_choice(chosen, poses):
-                warn(f"`{path}`: {text}", NoteWarning)
+            first = {name: _first(reader, name) for name, kind in topics.items() if kind in IMAGES}
+            chosen, poses = chosen_topics(path, first), truth_topic(topics)
+            note_choice(path, chosen, poses)
             times, image, wrong = _times_and_first(reader, path, chosen.colour, image_of)
             if image is None:
                 raise InputError(f"none of the {len(times)} images of `{path}` can be read; the first: {wrong}")
             height, width = image.image.shape[:2]
-            infos = _infos(reader, topics)
+            infos = {name: _first(reader, name) for name, kind in topics.items() if kind == CAMERA_INFO}
+            infos = {name: info for name, info in infos.items() if info is not None}
             frame = frame_name(first[chosen.colour].header.frame_id)
             known = camera_of(path, infos, chosen.colour, (width, height), frame)
             camera = known or guess_with_warning(str(path), width, height)
@@ -126,7 +124,6 @@ class RosBag:
         return len(self.times)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`."""
         check_selection(self.name, len(self), start, end, stride)
         return self._read(range(len(self))[start:end:stride])
 
@@ -135,14 +132,9 @@ class RosBag:
         if not self.poses:
             return None
         with _reader(self.path) as reader:
-            messages = list(_messages(reader, self.poses))
-        whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, Unread)]
-        if len(whole) < len(messages):
-            lost = len(messages) - len(whole)
-            warn(f"`{self.path}`: {lost} of {len(messages)} poses of `{self.poses}` are damaged; left out of the truth")
-        if not whole:
-            raise InputError(f"`{self.path}` has no pose in its topic `{self.poses}`")
-        rows = np.array(whole).reshape(-1, 8)
+            messages = _messages(reader, self.poses)
+            whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, Unread)]
+        rows = np.reshape(whole, (-1, 8))
         return trajectory_of(rows[:, 0], poses_of(rows[:, 1:4], rows[:, 4:]), self.path)
 
     def _read(self, chosen: range) -> Iterator[Frame]:
@@ -203,58 +195,43 @@ def _depth_is_usable(reader: Any, path: Path, topic: str, images: list[float], s
     def valid(message: Any, place: Path) -> np.ndarray | None:
         depth = metres_of(message, place)
         if depth.shape != size[::-1]:
-            raise InputError(
-                f"that of `{topic}` is {depth.shape[1]} x {depth.shape[0]} pixels, the images are {size[0]} x "
-                f"{size[1]}: record depth that is registered to them"
-            )
+            raise InputError(f"depth of {depth.shape[1]} x {depth.shape[0]} pixels, images of {size[0]} x {size[1]}")
         return depth if np.isfinite(depth).any() else None
 
     times, depth, wrong = _times_and_first(reader, path, topic, valid)
     if depth is None:
         reason = f" ({wrong})" if wrong else ""
-        warn(f"`{path}`: no depth image of {len(times)} has a valid pixel{reason}; reading the images only")
+        warn(f"`{path}`: no depth image of {len(times)} is valid{reason}; reading the images only")
         return False
-    ordered = np.sort(times)
-    after = np.searchsorted(ordered, images).clip(1, max(len(ordered) - 1, 1))
-    nearest = [ordered[np.minimum(row, len(ordered) - 1)] for row in (after - 1, after)]
-    alone = int((np.minimum(*(np.abs(np.array(images) - time) for time in nearest)) > MAX_DELAY).sum())
+    away, _ = cKDTree(np.reshape(times, (-1, 1))).query(np.reshape(images, (-1, 1)))
+    alone = int((away > MAX_DELAY).sum())
     if alone:
-        only = "; reading the images only" if alone == len(images) else ""
-        warn(f"`{path}`: {alone} of {len(images)} images have no depth within {MAX_DELAY} s{only}")
+        warn(f"`{path}`: {alone} of {len(images)} images have no depth within {MAX_DELAY} s")
     return alone < len(images)
 
 
-def _infos(reader: Any, topics: Mapping[str, str]) -> dict[str, list[Any]]:
-    """Return the undamaged messages of the `CameraInfo` topics."""
-    kinds = [name for name, kind in topics.items() if kind == CAMERA_INFO]
-    messages = {name: [message for _, message in _messages(reader, name)] for name in kinds}
-    return {name: [one for one in found if not isinstance(one, Unread)] for name, found in messages.items()}
-
-
 def _depth_camera(
-    reader: Any,
-    path: Path,
-    chosen: Chosen,
-    first: Mapping[str, Any],
-    infos: Mapping[str, Sequence[Any]],
-    camera: Camera | None,
+    reader: Any, path: Path, chosen: Chosen, first: Mapping[str, Any], infos: Mapping[str, Any], camera: Camera | None
 ) -> DepthCamera | None:
     """Return `depth_camera_of`; None if no depth image can be read."""
-    for number, (_, message) in enumerate(_messages(reader, chosen.depth)):
-        try:
-            height, width = metres_of(message, _place(path, chosen.depth, number)).shape
-        except InputError:
-            continue
-        transforms = lambda: _whole(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
-        cameras = camera, (width, height)
-        return depth_camera_of(path, chosen, first, infos, cameras, transforms, _extrinsics(reader))
-    return None
+    source, target = (frame_name(first[topic].header.frame_id) for topic in (chosen.depth, chosen.colour))
+
+    def stated_motion() -> np.ndarray | None:
+        transforms = _undamaged(reader, [one for one in reader.connections if one.msgtype in TRANSFORMS])
+        motion = motion_between(transforms, source, target) if source and target else None
+        return _extrinsics(reader) if motion is None else motion
+
+    _, depth, _ = _times_and_first(reader, path, chosen.depth, metres_of)
+    if depth is None:
+        return None
+    cameras = camera, depth.shape[::-1]
+    return depth_camera_of(path, chosen, (source, target), infos, cameras, stated_motion)
 
 
 def _extrinsics(reader: Any) -> np.ndarray | None:
     """Return depth -> colour as RealSense's driver publishes it (rotation by columns); None if it does not."""
     named = [one for one in reader.connections if one.topic.endswith("depth_to_color")]
-    message = next(_whole(reader, [one for one in named if one.msgtype.endswith("/Extrinsics")]), None)
+    message = next(_undamaged(reader, [one for one in named if one.msgtype.endswith("/Extrinsics")]), None)
     if message is None:
         return None
     motion = np.eye(4)
@@ -262,7 +239,7 @@ def _extrinsics(reader: Any) -> np.ndarray | None:
     return motion
 
 
-def _whole(reader: Any, connections: list[Any]) -> Iterator[Any]:
+def _undamaged(reader: Any, connections: list[Any]) -> Iterator[Any]:
     for connection, _, raw in reader.messages(connections=connections) if connections else ():
         with suppress(Exception):  # a damaged message may raise anything
             yield reader.deserialize(raw, connection.msgtype)
@@ -276,7 +253,7 @@ def _reader(path: Path) -> Iterator[Any]:
     except ImportError:
         raise InputError(f"bags of ROS need the package rosbags; {install_hint('bags')}") from None
     place = path.parent if path.suffix in ROS_2 else path
-    if reason := no_whole_bag(place):
+    if reason := why_incomplete(place):
         raise InputError(reason)
     try:
         with AnyReader([place], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -304,13 +281,8 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
 
 
 def _first(reader: Any, topic: str) -> Any:
-    """Return the first undamaged message of a topic, else a damaged one, else None."""
-    damaged = None
-    for _, message in _messages(reader, topic):
-        if not isinstance(message, Unread):
-            return message
-        damaged = damaged or message
-    return damaged
+    """Return the first undamaged message of a topic, None without one."""
+    return next((message for _, message in _messages(reader, topic) if not isinstance(message, Unread)), None)
 
 
 def _pose(message: Any) -> tuple[float, ...]:

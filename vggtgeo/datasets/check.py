@@ -5,13 +5,11 @@ import os
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.frame import Frame, Sequence
-from vggtgeo.datasets.images import rows_of
 from vggtgeo.datasets.kitti import Kitti
 from vggtgeo.datasets.opening import open_sequence
 from vggtgeo.geometry.trajectory import Trajectory
@@ -19,13 +17,12 @@ from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 
 SAMPLES = 20
 """Frames that are decoded."""
-PLAUSIBLE = (0.5, 6.5)
-"""Metres, of the median depth of a room, used by the verdict, too: a wrong unit is mostly outside."""
+PLAUSIBLE_MEDIAN_DEPTH = (0.5, 6.5)
+"""Metres, of a room, used by the verdict, too: a wrong unit is mostly outside."""
 _MIN_DEPTH_SHARE = 0.2
 """Share of pixels; depth cameras give 0.5 to 0.9 indoors."""
 _DARK = 8.0
-_MIN_STEPS, _USUAL = 10, 0.75
-"""Steps between image numbers, and the share that is the usual one: otherwise the images were selected by hand."""
+"""Mean grey level."""
 _GAP = 5.0
 """Times the median step between two frames."""
 _FAST, _FAST_CAR = 5.0, 60.0
@@ -47,7 +44,8 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
         try:
             sequence = open_sequence(path, kind)
             missing, there = _without_missing(sequence)
-            frames = _sample(there)
+            count = len(there)
+            frames = list(there.frames(0, None if count else SAMPLES, max(count // SAMPLES, 1)))
             truth = sequence.ground_truth()
         except InputError as error:
             return Inspection((), (*_texts(caught), str(error)))
@@ -55,7 +53,6 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
     problems = [
         *_texts(caught),
         *missing,
-        *_of_numbers(sequence),
         *_of_images(frames),
         *_of_times(frames, len(sequence)),
         *_of_depth(sequence, frames),
@@ -70,26 +67,15 @@ def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
     """Return messages about listed files that are missing, and the sequence without them."""
     if not isinstance(sequence, FolderSequence):
         return [], sequence
-    images = [file.image for file in sequence.files if not sequence.holds(file.image)]
-    depths = [file.depth for file in sequence.files if file.depth and not sequence.holds(file.depth)]
-    gone = {*images, *depths}
+    listed = (path for file in sequence.files for path in (file.image, file.depth) if path is not None)
+    gone = {path for path in listed if not sequence.holds(path)}
     files = tuple(
         replace(file, depth=None if file.depth in gone else file.depth)
         for file in sequence.files
         if file.image not in gone
     )
-    messages = [*_missing(images, len(sequence), "images"), *_missing(depths, len(sequence), "depth images")]
+    messages = [f"{len(gone)} files that are listed are missing, `{min(gone)}` first"] if gone else []
     return messages, replace(sequence, files=files)
-
-
-def _missing(gone: list[Path], count: int, what: str) -> list[str]:
-    names = f"`{gone[0]}`{', ...' if len(gone) > 1 else ''}" if gone else ""
-    return [f"{len(gone)} of {count} {what} that are listed are missing: {names}"] if gone else []
-
-
-def _sample(sequence: Sequence) -> list[Frame]:
-    count = len(sequence)
-    return list(sequence.frames(0, None if count else SAMPLES, max(count // SAMPLES, 1)))
 
 
 def _texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:
@@ -120,42 +106,21 @@ def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) ->
         facts.append(f"depth {low:.2f} to {high:.2f} m, half of it below {middle:.2f} m")
     else:
         facts.append("no depth: the scale stays free")
-    if truth is not None:
-        facts.append(f"truth: {len(truth)} poses, path {truth.length:.2f} m")
-    else:
-        facts.append("no truth")
+    facts.append("no truth" if truth is None else f"truth: {len(truth)} poses, path {truth.length:.2f} m")
     return tuple(facts)
-
-
-def _of_numbers(sequence: Sequence) -> list[str]:
-    """Return images missing by the numbers of the others: nearly all steps are the usual one, and a few are larger."""
-    images = [file.image for file in sequence.files] if isinstance(sequence, FolderSequence) else []
-    steps = np.diff(rows_of(images, None))
-    if len(steps) < _MIN_STEPS:
-        return []
-    sizes, counts = np.unique(steps, return_counts=True)
-    usual = sizes[np.argmax(counts)]
-    holes = np.flatnonzero(steps >= 2 * usual)
-    if usual < 1 or len(holes) == 0 or counts.max() < _USUAL * len(steps):
-        return []
-    first, lost = int(holes[0]), int(np.sum(steps[holes] // usual - 1))
-    where = f"`{images[first].name}` and `{images[first + 1].name}`"
-    more = f", and at {len(holes) - 1} more" if len(holes) > 1 else ""
-    images_are = "image is" if lost == 1 else "images are"
-    return [f"by their numbers {lost} {images_are} missing: between {where}{more}"]
 
 
 def _of_images(frames: list[Frame]) -> list[str]:
     if not frames:
         return ["no frame can be read"]
-    problems = []
     dark = sum(float(frame.image.mean()) < _DARK for frame in frames)
-    if dark:
-        problems.append(f"{dark} of {len(frames)} images looked at are black")
-    same = sum(np.array_equal(a.image, b.image) for a, b in itertools.pairwise(frames))
-    if same:
-        problems.append(f"{same} of {len(frames)} images looked at are the same as the one before: a frozen camera?")
-    return problems
+    problems = [f"{dark} of {len(frames)} images looked at are black"] if dark else []
+    return [*problems, *_of_repeats([frame.image for frame in frames], "images")]
+
+
+def _of_repeats(images: list[np.ndarray], what: str) -> list[str]:
+    same = sum(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in itertools.pairwise(images))
+    return [f"{same} of {len(images)} {what} looked at are the same as the one before: frozen?"] if same else []
 
 
 def _of_times(frames: list[Frame], count: int) -> list[str]:
@@ -190,12 +155,9 @@ def _of_depth(sequence: Sequence, frames: list[Frame]) -> list[str]:
     if share < _MIN_DEPTH_SHARE:
         problems.append(f"only {100 * share:.0f} % of the pixels have depth")
     middle = float(np.median(np.concatenate([depth[np.isfinite(depth)][::7] for depth in depths])))
-    if not PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
+    if not PLAUSIBLE_MEDIAN_DEPTH[0] <= middle <= PLAUSIBLE_MEDIAN_DEPTH[1]:
         problems.append(f"the median depth is {middle:.3g} m: is the unit of the depth files another one?")
-    same = sum(np.array_equal(a, b, equal_nan=True) for a, b in itertools.pairwise(depths))
-    if same:
-        problems.append(f"{same} of {len(depths)} depth images looked at are the same as the one before: frozen depth?")
-    return problems
+    return [*problems, *_of_repeats(depths, "depth images")]
 
 
 def _of_truth(truth: Trajectory | None, frames: list[Frame], fast: float) -> list[str]:

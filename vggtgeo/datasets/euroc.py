@@ -13,33 +13,21 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.intrinsics import intrinsics_of, is_fisheye
-from vggtgeo.datasets.pose_files import (
-    check_size,
-    parsing,
-    poses_of,
-    read_matrices,
-    states_list,
-    trajectory_of,
-    yaml_numbers,
-)
+from vggtgeo.datasets.pose_files import check_size, parsing, poses_of, read_matrices, trajectory_of, yaml_numbers
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning, warn
 from vggtgeo.io.text_files import whole_text
 
-_TRUTH = ("state_groundtruth_estimate0", "leica0", "vicon0")
 _MODEL = re.compile(r"^\s*distortion_model\s*:\s*['\"]?([\w-]+)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Euroc(FolderSequence):
-    """One flight, left camera. Ground truth: `state_groundtruth_estimate0`, poses of the body, transformed to the
-    camera.
-    """
+    """One flight, left camera. Truth: `state_groundtruth_estimate0`, poses of the body, transformed to the camera."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder`, or `mav0` in it, has `cam0/data.csv`."""
         return _base(folder) is not None
 
     @classmethod
@@ -52,15 +40,13 @@ class Euroc(FolderSequence):
             warn(f"`{folder}`: the IMU is not used; images alone leave the scale free", NoteWarning)
         camera_folder = base / "cam0"
         frames = [(time, camera_folder / "data" / name, None) for time, name in _images(camera_folder / "data.csv")]
-        if not frames:
-            raise InputError(f"`{camera_folder}/data.csv` has no image; it must have lines `nanoseconds,file`")
         sensor = camera_folder / "sensor.yaml"
         whole = cls.listed(folder, sorted(frames), lambda width, height: _camera(sensor, width, height))
         return replace(whole, folder=base)
 
     def ground_truth(self) -> Trajectory | None:
         """Return the true poses of the left camera, at their own times."""
-        file = self.folder / _TRUTH[0] / "data.csv"
+        file = self.folder / "state_groundtruth_estimate0" / "data.csv"
         if not file.is_file():
             return None
         rows = _numbers(file)
@@ -75,16 +61,13 @@ def _camera(sensor: Path, width: int, height: int) -> Camera:
     """Return the camera of a `sensor.yaml` for images of this size. EuRoC's lenses are "radial-tangential", those of
     TUM VI "equidistant".
     """
-    if states_list(sensor, "resolution"):
-        check_size(sensor, yaml_numbers(sensor, "resolution", 2), (width, height))
+    check_size(sensor, yaml_numbers(sensor, "resolution", 2, [width, height]), (width, height))
     intrinsics = intrinsics_of(sensor, yaml_numbers(sensor, "intrinsics"))
     coefficients = yaml_numbers(sensor, "distortion_coefficients")
     found = _MODEL.search(whole_text(sensor))
     fisheye = is_fisheye(f"`{sensor}`: `distortion_model`", found.group(1) if found else "")
-    try:
+    with parsing(sensor, "the coefficients of its lens"):
         return Camera(intrinsics, width, height, check_distortion(coefficients), fisheye=fisheye)
-    except InputError as error:
-        raise InputError(f"`{sensor}`: {error}") from None
 
 
 def _base(folder: Path) -> Path | None:

@@ -12,10 +12,11 @@ from jaxtyping import UInt8
 
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import (
+    MAX_DEPTH,
     MILLIMETRES,
+    MIN_DEPTH,
     DepthFormat,
     ImageFile,
-    floats_out_of_range,
     is_there,
     read_depth,
     read_image_file,
@@ -31,7 +32,6 @@ MIN_MEDIAN_DEPTH = 0.01
 MAX_ENLARGEMENT = 32
 """Pixels of an image to one of its depth, along a side at most; phones have 8."""
 _SAMPLES = 3
-_NAMED_EMPTY_DEPTHS = 3
 _SAME_SHAPE = 0.01
 
 
@@ -72,17 +72,14 @@ class FolderSequence:
         coding: DepthFormat = MILLIMETRES,
         **fields: Any,
     ) -> Self:
-        """Make a sequence of frames (time, image, depth), with warnings about missing and invalid depth.
+        """Make a sequence of frames (time, image, depth), in order, with warnings about missing and invalid depth.
 
-        Args:
-            folder: where the frames are.
-            frames: in the order of the sequence.
-            camera: returns the camera for the width and height of the images.
-            coding: unit of the depth files.
-            fields: further fields of the class.
-
+        camera: returns the camera for the width and height of the images. coding: unit of the depth files. fields:
+        further fields of the class.
         """
         files = tuple(FrameFile(index, *frame) for index, frame in enumerate(frames))
+        if not files:
+            raise InputError(f"`{folder}` has no images of a {cls.__name__}; `vggtgeo data list` shows its layout")
         for file in files:
             if not abs(file.timestamp) <= LATEST:
                 text = f"`{file.image.name}` has the time {file.timestamp:g}; it must be in seconds"
@@ -171,39 +168,37 @@ class FolderSequence:
                 reason = reason or f" ({error})"
                 continue
             if depth.shape != (self.camera.height, self.camera.width):
-                raise InputError(
-                    self._depth_size_message(path, depth) + ": register the depth to the images, or leave it out with "
-                    "--rgb-only"
-                )
+                size = self._depth_size_message(path, depth)
+                raise InputError(f"{size}: register the depth to the images, or leave it out with --rgb-only")
             if np.isfinite(depth).any():
                 if (middle := float(np.nanmedian(depth))) < MIN_MEDIAN_DEPTH:
                     warn(
-                        f"`{path}`: half of its depths are below {middle:.2g} m: is its unit another? "
-                        "`--depth-scale` says how many there are in a metre: 1000 are millimetres"
+                        f"`{path}`: half of its depths are below {middle:.2g} m; if its unit is another, give the "
+                        "values in a metre with `--depth-scale`: 1000 are millimetres"
                     )
                 return True
         if depths:
-            reason = reason or floats_out_of_range(depths[0])
-            text = f"none of the {len(depths)} depth images has a valid pixel{reason}; reading the images only"
-            warn(f"`{self.folder}`: {text}", UnusableDepthWarning)
+            warn(
+                f"`{self.folder}`: none of the {len(depths)} depth images has a valid pixel{reason}, {MIN_DEPTH:g} to "
+                f"{MAX_DEPTH:g} m (`--depth-scale` gives the values in a metre); reading the images only",
+                UnusableDepthWarning,
+            )
         return False
 
     def _read_all(self, files: Sequence[FrameFile]) -> Iterator[Frame]:
-        images, empty = ImageChecks(self.camera), 0
+        images, empty = ImageChecks(self.camera), []
         for file in files:
             image = images.checked(file.image, self.load_image)
             if image is None:
                 continue
             depth = self._read_depth(file) if self.has_depth else None
-            if file.depth is not None and depth is not None and not np.isfinite(depth).any():
-                empty += 1
-                if empty <= _NAMED_EMPTY_DEPTHS:
-                    warn(f"`{file.depth}` gives no valid depth; the frame is used without")
+            if depth is not None and not np.isfinite(depth).any():
+                empty.append(file.depth)
             if self.has_depth and depth is None:
                 depth = np.full((self.camera.height, self.camera.width), np.nan, np.float32)
             yield Frame(file.index, file.timestamp, image, depth, file.image.name)
-        if empty > _NAMED_EMPTY_DEPTHS:
-            warn(f"`{self.name}`: {empty} of {len(files)} depth images gave no valid depth")
+        if empty:
+            warn(f"`{self.name}`: {len(empty)} of {len(files)} depth images have no valid pixel, first `{empty[0]}`")
 
     def _read_depth(self, file: FrameFile) -> np.ndarray | None:
         """Read the depth of a frame; None if there is none, or, with a warning, if it cannot be used."""
@@ -220,7 +215,6 @@ class FolderSequence:
         return depth
 
     def _depth_size_message(self, path: Path, depth: np.ndarray) -> str:
-        """Say that a depth image has another size than the images."""
         size = f"{self.camera.width} x {self.camera.height}"
         return f"`{path}` is {depth.shape[1]} x {depth.shape[0]} pixels; the colour images are {size}"
 

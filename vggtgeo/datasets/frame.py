@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import MAX_TIME, Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind
+from vggtgeo.io.given import check_whole
 
 MAX_DELAY = 0.02
 """Maximum seconds between an image and its depth."""
@@ -54,21 +54,17 @@ class Sequence(Protocol):
     @property
     def name(self) -> str:
         """Return the name, for titles and messages."""
-        ...
 
     @property
     def camera(self) -> Camera:
         """Return the camera of all frames; `camera.known` is False if its intrinsics are a guess."""
-        ...
 
     @property
     def has_depth(self) -> bool:
         """Return whether frames have depth: every frame then has an array, all NaN if its file is invalid."""
-        ...
 
     def __len__(self) -> int:
         """Return the number of frames, unreadable ones included; of a video, the container's estimate."""
-        ...
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
         """Return the frames at positions start, start + stride, ... below end, read one by one as they are asked
@@ -76,11 +72,9 @@ class Sequence(Protocol):
 
         Warns of files that cannot be read, which are skipped; raises InputError for an invalid or empty selection.
         """
-        ...
 
     def ground_truth(self) -> Trajectory | None:
         """Return the true poses, camera -> world; None without ground truth."""
-        ...
 
 
 def check_selection(name: str, count: int, start: int, end: int | None, stride: int) -> None:
@@ -92,26 +86,23 @@ def check_selection(name: str, count: int, start: int, end: int | None, stride: 
 
 def check_range(start: int, end: int | None, stride: int) -> None:
     """Raise InputError unless `start`, `end`, `stride` select frames of a long enough sequence."""
-    for argument, given in (("start", start), ("stride", stride), ("end", 0 if end is None else end)):
-        check_kind(argument, given, numbers.Integral, "a whole number")
-    if stride < 1:
-        raise InputError(f"`stride` is {stride}; it must be at least 1")
-    if start < 0 or (end is not None and end <= start):
-        raise InputError(f"`start` is {start} and `end` {end}; they must be 0 <= start < end")
+    check_whole("start", start)
+    check_whole("stride", stride, 1)
+    if end is not None:
+        check_whole("end", end)
+        if end <= start:
+            raise InputError(f"`start` is {start} and `end` {end}; they must be 0 <= start < end")
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:
     """Raise InputError for a frame with an invalid image, depth or time, or another size than the camera's images."""
-    given: Any = frame  # of a user: annotations are not checked
-    image, depth, time = given.image, given.depth, given.timestamp
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-        raise InputError(f"`{frame.name}` has an image {described(image)}; it must be uint8 [H, W, 3], RGB")
-    if not isinstance(time, numbers.Real) or not -MAX_TIME <= given.timestamp <= MAX_TIME:
-        shown = time if isinstance(time, float) else f"{time!r:.60}"
-        raise InputError(f"`{frame.name}` has the time {shown}; it must be a number of seconds")
-    if depth is not None:
-        check_depth(f"the depth of `{frame.name}`", depth, image)
-    height, width = image.shape[:2]
+    time: Any = frame.timestamp  # of a user: annotations are not checked
+    check_image(f"the image of `{frame.name}`", frame.image)
+    if not isinstance(time, numbers.Real) or not -MAX_TIME <= frame.timestamp <= MAX_TIME:
+        raise InputError(f"the time of `{frame.name}` is {time!r:.60}; it must be a number of seconds")
+    if frame.depth is not None:
+        check_depth(f"the depth of `{frame.name}`", frame.depth, frame.image)
+    height, width = frame.image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise InputError(
             f"`{frame.name}` is {width} x {height} pixels; the camera's images are {camera.width} x {camera.height}: "
@@ -119,19 +110,27 @@ def check_frame(frame: Frame, camera: Camera) -> None:
         )
 
 
+def check_image(name: str, image: Any) -> None:
+    """Raise InputError unless an image is an array uint8 [H, W, 3]."""
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise InputError(f"{name} is {described(image)}; it must be uint8 [H, W, 3], RGB")
+
+
 def check_depth(name: str, depth: Any, image: np.ndarray) -> None:
     """Raise InputError unless depth is an array of metres with the size of its image."""
-    if isinstance(depth, np.ma.MaskedArray):
-        raise InputError(f"{name} is masked; give an array with NaN where there is none: `depth.filled(np.nan)`")
-    if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f":
-        raise InputError(f"{name} is {described(depth)}; it must be float, in metres (millimetres: divide by 1000.0)")
+    if isinstance(depth, np.ma.MaskedArray) or not isinstance(depth, np.ndarray) or depth.dtype.kind != "f":
+        raise InputError(
+            f"{name} is {described(depth)}; it must be a float array, in metres (millimetres: divide by 1000.0), with "
+            "NaN for none (a masked array: `depth.filled(np.nan)`)"
+        )
     if depth.shape != image.shape[:2]:
         raise InputError(f"{name} has the shape {depth.shape}, its image {image.shape[:2]}; make them equal")
 
 
 def described(given: Any) -> str:
     """Return type and shape of an array, the type of another value."""
-    return f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else f"of the type `{type(given).__name__}`"
+    kind = f"of the type `{type(given).__name__}`"
+    return f"{kind}, {given.dtype} {given.shape}" if isinstance(given, np.ndarray) else kind
 
 
 class NearestInTime:

@@ -11,9 +11,7 @@ with y up. Source: A. Handa et al., "A benchmark
 for RGB-D visual odometry, 3D reconstruction and SLAM", ICRA 2014.
 """
 
-import itertools
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -26,7 +24,7 @@ from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, metres_of_floats
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of, read_matrices, trajectory_of
-from vggtgeo.datasets.tum import MAX_LETTERS, read_pairs
+from vggtgeo.datasets.tum import head_of, read_pairs
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -45,34 +43,27 @@ class IclNuim(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has ICL-NUIM's `associations.txt` and no `rgb.txt`: with its ground truth, or a list
-        of frame numbers, depth first; or pairs of numbered images with its ground truth. A list of times may be of any
-        program.
+        """Return whether `folder` has no `rgb.txt`, but the ground truth with a list of pairs or numbered images, or a
+        list of frame numbers, depth first: a list of times may be of any program.
         """
         file, truth = folder / _LIST, bool(files_like(folder, "*.gt.freiburg"))
         if (folder / "rgb.txt").is_file():
             return False
         if not file.is_file():
             return truth and bool(_numbered(folder))
-        with file.open(encoding="utf-8-sig", errors="replace") as lines:
-            head = (line[:MAX_LETTERS].split("#", 1)[0].split() for line in itertools.islice(lines, 5))
-            words = next(filter(None, head), [])
-        counted = len(words) == 4 and words[0].isdecimal() and "depth" in words[1]
-        return counted or truth
+        words = next(filter(None, (line.split() for line in head_of(file))), [])
+        return truth or (len(words) == 4 and words[0].isdecimal() and "depth" in words[1])
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Read the list of pairs, or pair the images by their numbers without one."""
         pairs = read_pairs(folder / _LIST, "N") if (folder / _LIST).is_file() else _numbered(folder)
-        if not pairs:
-            raise InputError(f"`{folder}` has neither `{_LIST}` nor images `rgb/N.png` with `depth/N.png`")
         frames = [
             (number / FRAMES_PER_SECOND, folder / image, folder / depth) for number, image, depth in sorted(pairs)
         ]
         return cls.listed(folder, frames, lambda *size: _camera(folder, *size), FIVE_THOUSANDTHS)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses of the mirrored world."""
         return _truth(self.folder)
 
 
@@ -96,29 +87,22 @@ def _truth(folder: Path) -> Trajectory | None:
 
 def _numbered(folder: Path) -> list[tuple[float, str, str]]:
     """Return number, image and depth of each pair `rgb/N.png`, `depth/N.png`, as `read_pairs` does."""
-    images = [path for path in files_like(folder / "rgb", "*.png") if path.stem.isdecimal()]
-    both = [path for path in images if (folder / "depth" / path.name).is_file()]
-    return [(float(path.stem), f"rgb/{path.name}", f"depth/{path.name}") for path in both]
+    names = [path.name for path in files_like(folder / "rgb", "*.png") if path.stem.isdecimal()]
+    both = [name for name in names if (folder / "depth" / name).is_file()]
+    return [(float(Path(name).stem), f"rgb/{name}", f"depth/{name}") for name in both]
 
 
 @dataclass(frozen=True)
 class IclNuimRaw(FolderSequence):
-    """One sequence. Times are numbers of images / 30 s. Truth: that of each image's camera, else `*.gt.freiburg`,
-    mirrored in y.
-    """
+    """One rendered sequence. Truth: that of each image's camera, else `*.gt.freiburg`, mirrored in y."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has a `scene_00_0000.png` and its depth or camera beside."""
-        beside = (path.with_suffix(end) for path in _images(folder) for end in (".depth", ".txt"))
-        return any(file.is_file() for file in beside)
+        return any(path.with_suffix(end).is_file() for path in _images(folder) for end in (".depth", ".txt"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images."""
-        images = list(_images(folder))
-        if not images:
-            raise InputError(f"`{folder}` has no images `scene_00_0000.png`; expected ICL-NUIM as POV-Ray rendered it")
+        images = _images(folder)
         # The number of the scene comes first in the names: `scene_00_0012`.
         numbers = rows_of([path.with_name(path.stem.rpartition("_")[2]) for path in images], None)
         frames = [
@@ -137,7 +121,6 @@ class IclNuimRaw(FolderSequence):
         return metres_of_floats(distances / np.sqrt(1.0 + across**2 + down[:, None] ** 2))
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses of the mirrored world."""
         there = [file for file in self.files if file.image.with_suffix(".txt").is_file()]
         if not there:
             return _truth(self.folder)
@@ -145,8 +128,8 @@ class IclNuimRaw(FolderSequence):
         return trajectory_of([file.timestamp for file in there], _MIRROR @ poses @ _MIRROR, self.folder)
 
 
-def _images(folder: Path) -> Iterable[Path]:
-    return (path for path in files_like(folder, "scene_*.png") if _IMAGE.fullmatch(path.stem))
+def _images(folder: Path) -> list[Path]:
+    return [path for path in files_like(folder, "scene_*.png") if _IMAGE.fullmatch(path.stem)]
 
 
 def _pose(file: Path) -> Float[np.ndarray, "4 4"]:
@@ -154,7 +137,7 @@ def _pose(file: Path) -> Float[np.ndarray, "4 4"]:
     text = whole_text(file)
     place, ahead, up = (_vector(file, text, name) for name in ("cam_pos", "cam_dir", "cam_up"))
     pose = np.eye(4)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # no direction: a pose that is none, left out
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # invalid directions: the pose is left out
         z = ahead / np.linalg.norm(ahead)
         x = np.cross(up, z)
         x /= np.linalg.norm(x)

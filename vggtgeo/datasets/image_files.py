@@ -104,21 +104,16 @@ def eight_bits(image: np.ndarray, min_bits: int = 8) -> tuple[np.ndarray, int]:
 
 
 def image_header(content: bytes, path: Path) -> ImageHeader:
-    """Return the header of an image file; path: for messages.
-
-    Raises:
-        InputError: the file is empty, truncated, too large, or of a format that is not read.
-
+    """Return the header of an image file; raise InputError if it is empty, truncated, too large, or of a format that is
+    not read. path: for messages.
     """
     try:
-        with Image.open(io.BytesIO(content), formats=_FORMATS) as image:  # its own `getexif` of a PNG decodes the image
-            orientation = (
-                Image.Image.getexif(image).get(_ORIENTATION, 1) if image.format in ("JPEG", "MPO", "PNG", "WEBP") else 1
-            )
+        with Image.open(io.BytesIO(content), formats=_FORMATS) as image:
+            # Its own `getexif` of a PNG decodes the image.
+            tagged = image.format in ("JPEG", "MPO", "PNG", "WEBP")
+            orientation = Image.Image.getexif(image).get(_ORIENTATION, 1) if tagged else 1
             header = ImageHeader(*image.size, image.format or "", orientation if orientation in range(1, 9) else 1)
-            if header.width * header.height > MAX_PIXELS:
-                size = f"{header.width} x {header.height} pixels"
-                raise InputError(f"`{path}` declares {size}; at most {MAX_PIXELS // 10**6} million are decoded")
+            _check_values(path, header.width * header.height)
             image.verify()  # the check sums of a PNG, up to its end
     except InputError:
         raise
@@ -132,6 +127,11 @@ def image_header(content: bytes, path: Path) -> ImageHeader:
     return header
 
 
+def _check_values(path: Path, count: int) -> None:
+    if not 0 < count <= MAX_PIXELS:
+        raise InputError(f"`{path}` declares {count} pixels; at most {MAX_PIXELS // 10**6} million are decoded")
+
+
 def is_there(path: Path) -> bool:
     """Return whether a path exists; False for names that the file system does not accept."""
     try:
@@ -141,17 +141,9 @@ def is_there(path: Path) -> bool:
 
 
 def decoded(content: bytes, path: Path, flags: int, header: ImageHeader | None = None) -> np.ndarray:
-    """Return the pixels in the content of an image file, as OpenCV has them (BGR).
+    """Return the pixels in the content of an image file, as OpenCV has them (BGR); raise InputError if it is invalid.
 
-    Args:
-        content: the file.
-        path: its name, for messages.
-        flags: of `cv2.imdecode`; without effect on a JPEG.
-        header: that of the file, if it has been read.
-
-    Raises:
-        InputError: the file is damaged, too large, or not an image.
-
+    path: its name, for messages. flags: of `cv2.imdecode`; without effect on a JPEG. header: if it has been read.
     """
     if (header or image_header(content, path)).format in ("JPEG", "MPO"):
         try:
@@ -191,11 +183,8 @@ FIVE_THOUSANDTHS = DepthFormat(5000.0)
 
 
 def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
-    """Return depth, float32 metres, NaN for none, of an image, a PFM, an EXR or an array of NumPy (`.npy`).
-
-    Raises:
-        InputError: the file cannot be read, or is not one channel of uint16 or floats.
-
+    """Return depth, float32 metres, NaN for none, of an image, a PFM, an EXR or an array of NumPy (`.npy`); raise
+    InputError if the file cannot be read, or is not one channel of uint16 or floats.
     """
     codes = read_codes(path)
     codes = codes[..., 0] if codes.ndim == 3 and codes.shape[2] == 1 else codes
@@ -203,8 +192,7 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
         return metres_of_floats(codes, coding.floats_per_metre)
     if codes.dtype != np.uint16 or codes.ndim != 2:
         raise InputError(
-            f"`{path}` is {codes.dtype} of shape {codes.shape}; depth must have one channel, of uint16 or of floats in "
-            "metres"
+            f"`{path}` is {codes.dtype} of shape {codes.shape}; depth must be one channel, uint16 or float"
         )
     return metres_of_codes(codes, coding)
 
@@ -224,18 +212,6 @@ def metres_of_floats(codes: np.ndarray, per_metre: float = 1.0) -> Float[np.ndar
         return np.where((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH), depth, np.float32(np.nan))
 
 
-def floats_out_of_range(path: Path) -> str:
-    """Return a hint about the unit if a file of floats has depth and no value of it is in range; "" otherwise."""
-    codes = read_codes(path)
-    known = codes[np.isfinite(codes) & (codes > 0)] if np.issubdtype(codes.dtype, np.floating) else codes[:0]
-    if not known.size:
-        return ""
-    return (
-        f" (`{path}`: its depth is {known.min():g} to {known.max():g}; it must be {MIN_DEPTH:g} to {MAX_DEPTH:g} m: "
-        "give the values in a metre by `--depth-scale`, 1000 for millimetres)"
-    )
-
-
 def read_codes(path: Path) -> np.ndarray:
     """Return the values of an image or an array of NumPy as they are stored; raise InputError if it cannot be read."""
     if path.suffix.lower() == ".exr":
@@ -250,12 +226,7 @@ def read_codes(path: Path) -> np.ndarray:
 
 
 def exr_depth(path: Path) -> np.ndarray:
-    """Return the one channel that may be depth, float [H, W], as stored; read by OpenEXR (extra `phones`).
-
-    Raises:
-        InputError: OpenEXR is not installed, or the file is damaged, too large, or has no such channel, or several.
-
-    """
+    """Return the one channel that may be depth, float [H, W], as stored; read by OpenEXR (extra `phones`)."""
     try:
         import OpenEXR
     except ImportError:
@@ -265,9 +236,8 @@ def exr_depth(path: Path) -> np.ndarray:
         header = OpenEXR.File(str(path), header_only=True).header()
         (left, top), (right, bottom) = header["dataWindow"]
         names = [channel.name for channel in header["channels"]]
-        values = (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1) * len(names)
-        if not 0 < values <= MAX_PIXELS:  # all channels are decoded
-            raise InputError(f"`{path}` declares {values} values; at most {MAX_PIXELS // 10**6} million are decoded")
+        # All channels are decoded.
+        _check_values(path, (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1) * len(names))
         found = [name for name in names if _EXR_DEPTH.fullmatch(name)]
         if len(found) > 1:  # Blender writes colours, too: R, G, B beside Z
             found = [name for name in found if name.lower().endswith(("z", "depth", "depth.v"))] or found

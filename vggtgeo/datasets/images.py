@@ -10,7 +10,6 @@ without a camera. Depth is in millimetres (Open3D, RealSense, Kinect), or in met
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Self
 
@@ -54,18 +53,15 @@ class ImageFolder(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has an image."""
         return bool(image_files(folder))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images; raise InputError if there is none."""
         images = image_files(folder)
         if not images:
             raise InputError(f"`{folder}` has no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
         warn_of_unread(folder, images)
-        _warn_of_more(folder, len(images))
-        times = times_by_name(images)
+        times = times_or_rate(images)
         frames = [(time, image, None) for time, image in sorted(zip(times, images, strict=True))]
         return cls.listed(folder, frames, lambda *size: camera_or_guess(folder, *size))
 
@@ -79,15 +75,6 @@ def warn_of_unread(folder: Path, images: list[Path]) -> None:
     if other:
         text = f"`{folder}`: {len(other)} images (`{other[0].name}`) are of a format that is not read"
         warn(LeftOutWarning(f"{text}; left out: convert to PNG or JPEG", len(other)))
-
-
-def _warn_of_more(folder: Path, count: int) -> None:
-    """Warn of a folder below with more images: it may be the recording, and these a few images of it."""
-    for place in sorted(path for path in folder.iterdir() if path.is_dir()):
-        if (more := len(image_files(place))) > count:
-            text = f"reading its {count} images; `{place.name}` in it has {more}: give that folder to read those"
-            warn(f"`{folder}`: {text}")
-            return
 
 
 def files_like(folder: Path, pattern: str) -> list[Path]:
@@ -110,13 +97,18 @@ def image_files(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list
     return [path for path in files_like(folder, "*") if path.suffix.lower() in suffixes]
 
 
-def times_by_name(images: list[Path]) -> list[float]:
-    """Return seconds by the names if all are times, else position / 30 s."""
-    stems = [image.stem for image in images]
+def _times_by_name(files: list[Path]) -> list[float] | None:
+    """Return seconds if all names are times."""
+    stems = [file.stem for file in files]
     for pattern, unit in _UNITS:
         if all(pattern.fullmatch(stem) for stem in stems):
             return [float(stem) * unit for stem in stems]
-    return [index / FRAMES_PER_SECOND for index in range(len(images))]
+    return None
+
+
+def times_or_rate(images: list[Path]) -> list[float]:
+    """Return seconds by the names if all are times, else position / 30 s."""
+    return _times_by_name(images) or [index / FRAMES_PER_SECOND for index in range(len(images))]
 
 
 def rows_of(images: list[Path], lines: int | None) -> tuple[int, ...]:
@@ -177,10 +169,9 @@ class RgbdFolders(FolderSequence):
         """List the images and find their depths; raise InputError if they cannot be paired."""
         colour, (images, depths) = _listed(folder)
         warn_of_unread(colour, images)
-        times = times_by_name(images)
+        times = times_or_rate(images)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
         rows = sorted(zip(times, images, partners, strict=True), key=lambda row: row[0])
-        _warn_of_depth_alone(folder, depths, partners)
         camera = lambda *size: (
             camera_from_folder(folder, *size)
             or camera_from_folder(colour, *size)
@@ -235,7 +226,7 @@ def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path
         found = _by(key, images, depths)
         if found is not None:
             return found
-    image_times, depth_times = _seconds(images), _seconds(depths)
+    image_times, depth_times = _times_by_name(images), _times_by_name(depths)
     if image_times is not None and depth_times is not None:
         listed = sorted(zip(depth_times, depths, strict=True))
         rows = partners_in_time(list(zip(image_times, images, strict=True)), listed)
@@ -261,25 +252,7 @@ def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path
     return found if paired >= 0.5 * min(len(images), len(depths)) else None
 
 
-def _warn_of_depth_alone(folder: Path, depths: list[Path], partners: Sequence[Path | None]) -> None:
-    """Warn of depths without an image, unless every second or third has one (a slower colour camera)."""
-    paired = {partner for partner in partners if partner is not None}
-    alone = len(depths) - len(paired)
-    if not (alone and paired):
-        return
-    longest = max(len(list(run)) for known, run in groupby(depth in paired for depth in depths) if not known)
-    if alone < 0.5 * len(depths) or longest > len(depths) / len(paired) + 1:
-        warn(f"`{folder}`: {alone} of {len(depths)} depths have no image: are images missing?")
-
-
 def _number(path: Path) -> str | None:
     """Return the last number in a name that is not a time."""
     numbers = re.findall(r"\d+", path.stem)
-    return str(int(numbers[-1])) if numbers and _seconds([path]) is None else None
-
-
-def _seconds(paths: list[Path]) -> list[float] | None:
-    """Return times of files named `1305031102.175304.png`."""
-    if not all(re.fullmatch(r"\d+\.\d+", path.stem) for path in paths):
-        return None
-    return [float(path.stem) for path in paths]
+    return str(int(numbers[-1])) if numbers and _times_by_name([path]) is None else None

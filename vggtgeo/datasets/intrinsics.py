@@ -21,26 +21,27 @@ MIN_VALID = 0.5
 """Minimum share of the undistorted image that is inside the original; lenses of benchmarks keep more than 0.8."""
 MAX_ASPECT = 4.0
 """Maximum ratio of the focal lengths, either way; 1 for square pixels, up to 2 for interlaced and anamorphic ones."""
-_OPENCV = ("", "none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady")
-_FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4")
-"""Names of the two lens models in ROS, Kalibr, EuRoC and RealSense."""
+_OPENCV = (
+    *("none", "plumb_bob", "rational_polynomial", "radial-tangential", "radtan", "brown_conrady"),
+    *("pinhole", "simple_pinhole", "perspective", "simple_radial", "radial", "opencv"),
+)
+_FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye")
+"""Names of the two lens models in ROS, Kalibr, EuRoC, RealSense, COLMAP and nerfstudio."""
 CALIBRATION, DISTORTION = "calibration.txt", "distortion.txt"
 FISHEYE = "fisheye"
 """Last word of such a file, after four coefficients of Kannala and Brandt."""
-MATRIX = "camera-intrinsics.txt"
-JSON = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
-"""Names of cameras that recorders write."""
 
-# Colour cameras of the TUM RGB-D benchmark, 640 x 480 (fx fy cx cy, k1 k2 p1 p2 k3), from
-# https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; freiburg3 is published undistorted.
-_FREIBURG: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+
+# Colour cameras of the TUM RGB-D benchmark, freiburg1 to 3, and of Bonn RGB-D Dynamic, 640 x 480 (fx fy cx cy,
+# k1 k2 p1 p2 k3), from https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats and
+# https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset; freiburg3 is published undistorted.
+_PUBLISHED: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "3": ((535.4, 539.2, 320.1, 247.6), ()),
+    "rgbd_bonn": ((542.822841, 542.576870, 315.593520, 237.756098), (0.039903, -0.099343, -0.000730, -0.000144)),
 }
-# Bonn RGB-D Dynamic, from https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset
-_BONN = (542.822841, 542.576870, 315.593520, 237.756098), (0.039903, -0.099343, -0.000730, -0.000144)
-_FREIBURG_NAME = re.compile(r"freiburg([123])|(?:^|[_-])fr([123])(?:[_-]|$)", re.IGNORECASE)
+_RECORDING = re.compile(r"freiburg([123])|(?:^|[_-])fr([123])(?:[_-]|$)|(rgbd_bonn)", re.IGNORECASE)
 
 
 def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
@@ -68,8 +69,8 @@ def pinhole_of(matrix: np.ndarray) -> tuple[float, float, float, float]:
 
 def is_fisheye(where: str, model: str) -> bool:
     """Return whether a lens model is a fisheye; raise InputError for an unknown model. where: for messages."""
-    if model.lower() not in (*_OPENCV, *_FISHEYES):
-        known = ", ".join((*_OPENCV[1:], *_FISHEYES))
+    if model.lower() not in ("", *_OPENCV, *_FISHEYES):
+        known = ", ".join((*_OPENCV, *_FISHEYES))
         raise InputError(f"{where} is {model[:40]}; read are {known}: undistort the images")
     return model.lower() in _FISHEYES
 
@@ -82,11 +83,10 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
     `camera-intrinsics.txt` (3 x 3), else JSON of Open3D's and RealSense's recorders, else Record3D's `metadata.json`.
     Raises InputError for an invalid file.
     """
-    readers = {CALIBRATION: _read_calibration, MATRIX: _read_matrix, **dict.fromkeys(JSON, _read_json_camera)}
-    for name, read in readers.items():
+    for name, (read, expected) in _READERS.items():
         file = folder / name
         if file.is_file():
-            with parsing(file, _EXPECTED.get(name, _EXPECTED[JSON[0]])):
+            with parsing(file, expected):
                 camera = read(file, width, height)
             check_plausible(f"`{file}`", camera)
             warn_of_other_size(f"`{file}`", camera)
@@ -120,48 +120,40 @@ def camera_of_record3d(file: Path, content: Mapping[str, Any], width: int, heigh
 
 
 def check_plausible(where: str, camera: Camera) -> None:
-    """Raise InputError for a camera that is implausible for its image size.
-
-    Raises:
-        InputError: a field of view outside 1 to 170 degrees, a principal point ten image sizes away, or a distortion
-            that keeps less than half of the image.
-
+    """Raise InputError for a camera that is implausible for its image size: its field of view, the ratio of its focal
+    lengths, its principal point, or a distortion that keeps less than half of the image.
     """
     (fx, fy, cx, cy), width, height = camera.intrinsics, camera.width, camera.height
-    sides = math.atan(0.5 * width / fx), math.atan(0.5 * height / fy)
-    widest, narrowest = (math.degrees(2 * pick(sides)) for pick in (max, min))
-    size = f"for images of {width} x {height} pixels"
-    if widest > WIDEST or widest < NARROWEST:
-        angle = widest if widest > WIDEST else narrowest
+    angle = _field_of_view(camera)
+    if not NARROWEST <= angle <= WIDEST or max(fx, fy) > MAX_ASPECT * min(fx, fy):
         raise InputError(
-            f"{where}: fx {fx:g} and fy {fy:g} make a field of view of {angle:.3g} deg {size}; they must be in pixels"
-        )
-    if max(fx, fy) > MAX_ASPECT * min(fx, fy):
-        raise InputError(
-            f"{where}: fx {fx:g} and fy {fy:g} differ by more than a factor of {MAX_ASPECT:g}; give pixels"
+            f"{where}: fx {fx:g} and fy {fy:g} make a field of view of {angle:.3g} deg for images of {width} x "
+            f"{height} pixels; they must be in pixels"
         )
     if abs(cx) > FARTHEST_CENTRE * width or abs(cy) > FARTHEST_CENTRE * height:
-        raise InputError(f"{where}: the principal point ({cx:g}, {cy:g}) is far outside {size}; give pixels")
-    if any(camera.distortion):
-        valid = camera.undistorter().valid
-        share = 1.0 if valid is None else float(valid.mean())
-        if share < MIN_VALID:
-            raise InputError(
-                f"{where}: the distortion {camera.distortion} leaves {100 * share:.0f} % of the image; it must be "
-                "k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order"
-            )
+        raise InputError(
+            f"{where}: the principal point ({cx:g}, {cy:g}) is far outside images of {width} x {height} pixels"
+        )
+    valid = camera.undistorter().valid if any(camera.distortion) else None
+    if valid is not None and valid.mean() < MIN_VALID:
+        raise InputError(
+            f"{where}: the distortion {camera.distortion} leaves {100 * valid.mean():.0f} % of the image; it must be "
+            "k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order"
+        )
+
+
+def _field_of_view(camera: Camera) -> float:
+    """Return degrees along the wider side."""
+    fx, fy = camera.intrinsics[:2]
+    return math.degrees(2 * math.atan(0.5 * max(camera.width / fx, camera.height / fy)))
 
 
 def published_camera(name: str, width: int, height: int) -> Camera | None:
     """Return the published camera if `name` contains freiburg1, 2, 3 or Bonn, for 640 x 480 pixels."""
-    match = _FREIBURG_NAME.search(name)
-    if (width, height) != (640, 480):
+    match = _RECORDING.search(name)
+    if match is None or (width, height) != (640, 480):
         return None
-    if "rgbd_bonn" in name.lower():
-        return Camera(_BONN[0], width, height, _BONN[1])
-    if match is None:
-        return None
-    intrinsics, distortion = _FREIBURG[match.group(1) or match.group(2)]
+    intrinsics, distortion = _PUBLISHED[next(filter(None, match.groups())).lower()]
     return Camera(check_intrinsics(intrinsics), width, height, distortion)
 
 
@@ -203,7 +195,8 @@ def _read_json_camera(file: Path, width: int, height: int) -> Camera:
     if matrix is not None:
         found = np.reshape(matrix, 9)[[0, 4, 6, 7]].tolist()
     else:
-        found = [content.get(name, content.get(other)) for name, other in _JSON_NAMES]
+        centre = ("cx", "cy") if "cx" in content else ("ppx", "ppy")
+        found = [content[name] for name in ("fx", "fy", *centre)]
     return Camera(check_intrinsics(tuple(map(float, found))), width, height, _of_realsense(file, content))
 
 
@@ -222,12 +215,17 @@ def _of_realsense(file: Path, content: Mapping[str, Any]) -> tuple[float, ...]:
     return ()
 
 
-_EXPECTED = {
-    CALIBRATION: "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or fx fy cx cy k1 k2 k3 k4 fisheye",
-    MATRIX: "a 3 x 3 matrix of intrinsics",
-    JSON[0]: "`intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`",
+_CALIBRATION_EXPECTED = "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or fx fy cx cy k1 k2 k3 k4 fisheye"
+_JSON_EXPECTED = "`intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`"
+_READERS = {
+    CALIBRATION: (_read_calibration, _CALIBRATION_EXPECTED),
+    "camera-intrinsics.txt": (_read_matrix, "a 3 x 3 matrix of intrinsics"),
+    # Of recorders.
+    "intrinsic.json": (_read_json_camera, _JSON_EXPECTED),
+    "intrinsics.json": (_read_json_camera, _JSON_EXPECTED),
+    "camera_intrinsic.json": (_read_json_camera, _JSON_EXPECTED),
+    "camera_intrinsics.json": (_read_json_camera, _JSON_EXPECTED),
 }
-_JSON_NAMES = (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy"))
 
 
 def _numbers(text: str) -> tuple[float, ...]:
@@ -243,11 +241,10 @@ def _without_comments(file: Path) -> str:
 
 def warn_of_other_size(where: str, camera: Camera) -> None:
     """Warn of a principal point or a field of view that is implausible for images of this size."""
-    fx, fy, cx, cy = camera.intrinsics
+    cx, cy = camera.intrinsics[2:]
     centred = 0 <= cx < camera.width and 0 <= cy < camera.height
-    field_of_view = math.degrees(2 * math.atan(0.5 * max(camera.width / fx, camera.height / fy)))
-    if not centred or field_of_view < 10:
+    if not centred or _field_of_view(camera) < 10:
         warn(
-            f"{where}: principal point ({cx:g}, {cy:g}) and field of view {field_of_view:.0f} deg are odd "
+            f"{where}: principal point ({cx:g}, {cy:g}) and field of view {_field_of_view(camera):.0f} deg are odd "
             f"for images of {camera.width} x {camera.height}; was it calibrated at another image size?"
         )

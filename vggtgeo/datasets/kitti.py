@@ -14,7 +14,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_or_guess, intrinsics_of
-from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of_rows, read_matrices, trajectory_of_rows
+from vggtgeo.datasets.pose_files import parsing, poses_of_rows, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning, warn
@@ -36,20 +36,15 @@ class Kitti(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has one of the folders of images."""
         return any((folder / name).is_dir() for name in _FOLDERS)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images."""
-        places = [folder / name for name in _FOLDERS if (folder / name).is_dir()]
-        images = {place: image_files(place) for place in places}
-        place = max(places, key=lambda each: len(images[each]), default=None)  # colour, where both have as many
-        if place is None or not images[place]:
-            raise InputError(f"`{folder}` has no images in {', '.join(_FOLDERS)}; expected a drive of KITTI")
+        images = {folder / name: image_files(folder / name) for name in _FOLDERS}
+        place = max(images, key=lambda each: len(images[each]))  # colour, where both have as many
         times = _times(folder, place)
         rows = rows_of(images[place], len(times) if times else None)
-        if times and max(rows) >= len(times):
+        if times and max(rows, default=-1) >= len(times):
             raise InputError(
                 f"`{folder}` has {len(rows)} images, by their numbers up to {max(rows)} counted from 0, and "
                 f"{len(times)} times; give those of the whole drive"
@@ -107,13 +102,13 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
         folder.resolve().parent / "calib_cam_to_cam.txt",
     ):
         values = _calibration(file)
-        if _is_unrectified(file, values, name, width, height):
-            return _as_calibrated(file, values, name, width, height), 0.0
+        if _is_unrectified(file, values, name[-2:], (width, height)):
+            return _as_calibrated(file, values, name[-2:], width, height), 0.0
         for key in _LINES[name]:
             if key in values:
-                row = _numbers(file, key, values[key], 12)
-                intrinsics = intrinsics_of(file, (row[0], row[5], row[2], row[6]))
-                return Camera(intrinsics, width, height), -row[3] / row[0]
+                row = _numbers(file, values, key, 12)
+                intrinsics = intrinsics_of(file, row[[0, 5, 2, 6]].tolist())
+                return Camera(intrinsics, width, height), float(-row[3] / row[0])
     return camera_or_guess(folder, width, height), 0.0
 
 
@@ -124,22 +119,20 @@ def _calibration(file: Path) -> dict[str, str]:
     return {key.strip(): rest for key, _, rest in parts}
 
 
-def _is_unrectified(file: Path, values: Mapping[str, str], name: str, width: int, height: int) -> bool:
+def _is_unrectified(file: Path, values: Mapping[str, str], number: str, size: tuple[int, int]) -> bool:
     """Return whether images have the size before rectification, as in the drives `_extract`."""
-    original, rectified = (
-        tuple(numbers_of(values.get(key, "").split(), f"`{file}`: `{key}`"))
-        for key in (f"S_{name[-2:]}", f"S_rect_{name[-2:]}")
-    )
-    return original == (width, height) != rectified
+    if f"S_{number}" not in values:
+        return False
+    original, rectified = (tuple(_numbers(file, values, f"{key}_{number}", 2)) for key in ("S", "S_rect"))
+    return original == size != rectified
 
 
-def _as_calibrated(file: Path, values: Mapping[str, str], name: str, width: int, height: int) -> Camera:
-    matrix = _numbers(file, f"K_{name[-2:]}", values.get(f"K_{name[-2:]}", ""), 9)
-    lens = _numbers(file, f"D_{name[-2:]}", values.get(f"D_{name[-2:]}", ""), 5)
-    intrinsics = intrinsics_of(file, (matrix[0], matrix[4], matrix[2], matrix[5]))
-    return Camera(intrinsics, width, height, distortion=tuple(lens))
+def _as_calibrated(file: Path, values: Mapping[str, str], number: str, width: int, height: int) -> Camera:
+    matrix, lens = _numbers(file, values, f"K_{number}", 9), _numbers(file, values, f"D_{number}", 5)
+    intrinsics = intrinsics_of(file, matrix[[0, 4, 2, 5]].tolist())
+    return Camera(intrinsics, width, height, distortion=tuple(lens.tolist()))
 
 
-def _numbers(file: Path, key: str, text: str, count: int) -> list[float]:
+def _numbers(file: Path, values: Mapping[str, str], key: str, count: int) -> np.ndarray:
     with parsing(file, f"`{key}` of {count} numbers"):
-        return np.reshape(numbers_of(text.split(), f"`{key}`"), count).tolist()
+        return np.array(values[key].split(), np.float64).reshape(count)

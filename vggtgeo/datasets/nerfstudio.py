@@ -13,7 +13,7 @@ The poses are those of another program (COLMAP, ARKit), often of free scale, not
 
 import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -23,7 +23,7 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, is_there
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
-from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of
+from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of, is_fisheye
 from vggtgeo.datasets.pose_files import parsing, read_json, trajectory_of
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
@@ -35,8 +35,6 @@ FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _EXPECTED = "`frames` with `file_path` and `transform_matrix` (4 x 4 numbers), and the camera as nerfstudio writes it"
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 _OF_FISHEYE = ("k1", "k2", "k3", "k4")
-_FISHEYE = "OPENCV_FISHEYE"
-_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,6 @@ class Nerfstudio(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `transforms.json`."""
         return (folder / FILE).is_file()
 
     @classmethod
@@ -57,8 +54,6 @@ class Nerfstudio(FolderSequence):
         with parsing(file, _EXPECTED):
             content = read_json(file)
             images = _images(folder, content)
-            if not images:
-                raise ValueError("it lists no frames")
             order = sorted(images, key=lambda path: natural_key(str(path.relative_to(folder))))
             rows = [
                 (index / FRAMES_PER_SECOND, image, _depth(folder, images[image])) for index, image in enumerate(order)
@@ -70,7 +65,6 @@ class Nerfstudio(FolderSequence):
         return cls.listed(folder, rows, camera, coding)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the poses of the file, camera -> world."""
         file = self.folder / FILE
         frames = _images(self.folder, read_json(file))
         poses = np.array([_pose(frames[one.image]) for one in self.files])
@@ -85,7 +79,7 @@ class Nerfstudio(FolderSequence):
 
 def _images(folder: Path, content: Mapping[str, Any]) -> dict[Path, Mapping[str, Any]]:
     """Return the frames by their images, whose suffixes may be missing, or changed by a conversion."""
-    return {_below(folder, frame["file_path"], sorted(IMAGE_SUFFIXES)): frame for frame in content["frames"]}
+    return {_below(folder, frame["file_path"], IMAGE_SUFFIXES): frame for frame in content["frames"]}
 
 
 def _depth(folder: Path, frame: Mapping[str, Any]) -> Path | None:
@@ -93,18 +87,16 @@ def _depth(folder: Path, frame: Mapping[str, Any]) -> Path | None:
     return None if name is None else _below(folder, name)
 
 
-def _below(folder: Path, name: str, endings: list[str] | None = None) -> Path:
+def _below(folder: Path, name: str, suffixes: Collection[str] = ()) -> Path:
     """Return a file below the folder; others are never opened. The file of a path of another place, before the folder
     was copied, is searched by its name, here and in `images`, also with other suffixes.
     """
     path = Path(name.replace("\\", "/"))
     inside = not path.is_absolute() and ".." not in path.parts
     places = [folder / place for place in ([path] if inside else []) + [Path("images") / path.name, Path(path.name)]]
-    found = next(filter(is_there, places), None)
-    if found is None and endings:
-        known = path.suffix.lower() in endings
-        stems = [place.with_suffix("") if known else place for place in places]
-        found = next((file for stem in stems for end in endings if is_there(file := Path(f"{stem}{end}"))), None)
+    stems = [place.with_suffix("") if path.suffix.lower() in suffixes else place for place in places]
+    converted = [Path(f"{stem}{suffix}") for stem in stems for suffix in sorted(suffixes)]
+    found = next(filter(is_there, [*places, *converted]), None)
     if found is None and not inside:
         raise InputError(f"`{folder}`: {name!r} is missing below the folder of `{FILE}`")
     return found or places[0]
@@ -133,20 +125,11 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
         if not fx and not {"fl_x", "camera_angle_x"} & {*content, *(key for frame in frames for key in frame)}:
             return guess_with_warning(str(file.parent), width, height)
         centre = number("cx", 0.5 * across) - 0.5, number("cy", 0.5 * down) - 0.5
-        fisheye = _is_fisheye(content)
+        named = is_fisheye(f"`{file}`: `camera_model`", str(content.get("camera_model", "")))
+        fisheye = named or content.get("is_fisheye") is True  # nerfstudio, instant-ngp
         if unread := [key for key in ("k4", "k5", "k6") if number(key) and not (fisheye and key == "k4")]:
-            text = f"`{file}` has {', '.join(unread)} of its lens, which is not read, left out: undistort the images"
-            warn(text)
+            warn(f"`{file}` has {', '.join(unread)} of its lens, left out: undistort the images")
         lens = tuple(map(number, _OF_FISHEYE if fisheye else _DISTORTION))
         distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
         intrinsics = intrinsics_of(file, (fx, number("fl_y", fx), *centre))
     return Camera(intrinsics, round(across), round(down), distortion, fisheye=fisheye).resized(width, height)
-
-
-def _is_fisheye(content: Mapping[str, Any]) -> bool:
-    """Return whether the lens is a fisheye, by `camera_model` (nerfstudio) and `is_fisheye` (instant-ngp)."""
-    model = str(content.get("camera_model", "")).upper()
-    if model not in (*_PINHOLES, _FISHEYE):
-        known = ", ".join((*_PINHOLES[1:], _FISHEYE))
-        raise InputError(f"`camera_model` is {model}; it must be one of {known}: undistort the images")
-    return model == _FISHEYE or content.get("is_fisheye") is True

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Protocol
 
-from vggtgeo.datasets.bags import RosBag, is_bag, no_whole_bag
+from vggtgeo.datasets.bags import RosBag, is_bag, why_incomplete
 from vggtgeo.datasets.euroc import Euroc
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.datasets.icl import IclNuim, IclNuimRaw
@@ -12,6 +12,7 @@ from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, OTHER_PICTURES, is_ther
 from vggtgeo.datasets.images import ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
 from vggtgeo.datasets.kitti import Kitti
+from vggtgeo.datasets.live_camera import LiveCamera, is_live
 from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.phones import ArkitScenes, Polycam, Scanner3d, StrayScanner
 from vggtgeo.datasets.record3d import Record3d
@@ -20,7 +21,7 @@ from vggtgeo.datasets.scannet import ScanNet
 from vggtgeo.datasets.seven_scenes import SevenScenes
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
-from vggtgeo.datasets.video import LiveCamera, VideoFile, is_live
+from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.views import with_rate
 from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.given import path_of
@@ -31,11 +32,9 @@ class FolderReader(Protocol):
 
     def matches(self, folder: Path) -> bool:
         """Return whether `folder` has this layout."""
-        ...
 
     def open(self, folder: Path) -> Sequence:
         """Open the sequence in `folder`; raise InputError if it is invalid."""
-        ...
 
 
 FOLDER_KINDS: dict[str, FolderReader] = {
@@ -74,10 +73,8 @@ def open_sequence(
         depth: False to leave the depth of a bag or a video alone, which may not be that of its images' camera.
 
     The camera comes from `calibration.txt` or `camera-intrinsics.txt` in the folder, else from published values of the
-    benchmark, else it is a guess (`camera.known` is False), with an InputWarning.
-
-    Raises:
-        InputError: the path is missing or empty, or has nothing that can be read.
+    benchmark, else it is a guess (`camera.known` is False), with an InputWarning. Raises InputError if nothing can be
+    read.
 
     Example:
         >>> import vggtgeo as vg
@@ -114,10 +111,7 @@ def check_there(path: str | os.PathLike[str]) -> None:
     if not is_there(place):
         raise InputError(f"`{place}` does not exist; give a folder of images or a video file")
     if not os.access(place, os.R_OK | os.X_OK if place.is_dir() else os.R_OK):
-        raise InputError(
-            f"`{place}` may not be read by this user (permission denied); change that (`chmod -R u+rX`, as its owner), "
-            "or give a copy of your own"
-        )
+        raise InputError(f"`{place}` may not be read by this user (permission denied)")
 
 
 def _open_place(place: Path, kind: str | None, depth: bool) -> Sequence:
@@ -136,40 +130,28 @@ def _open_place(place: Path, kind: str | None, depth: bool) -> Sequence:
 def _open_folder(place: Path, kind: str | None) -> Sequence:
     if not any(place.iterdir()):
         raise InputError(f"`{place}` is empty; give a folder with images")
-    dead = _broken_links(place)
+    _warn_of_broken_links(place)
     if kind is not None:
         return FOLDER_KINDS[kind].open(place)
     if all((place / name).is_file() for name in ("summary.json", "trajectory.txt")):
         raise InputError(f"`{place}` holds the result of a run; give the recording that it was made of")
     for reader in FOLDER_KINDS.values():
         if reader.matches(place):
-            if dead:
-                warn(f"`{place}`: {dead}")
             return reader.open(place)
     names = sorted(path.name for path in place.iterdir())
     other = next((name for name in names if Path(name).suffix.lower() in OTHER_PICTURES | ARCHIVES), None)
     raise InputError(
-        no_whole_bag(place)
+        why_incomplete(place)
         or (other and f"`{place}` holds `{other}`: {_NOT_READ}{_hint(place)}")
-        or f"`{place}` holds {', '.join(f'`{name}`' for name in names[:4])}; expected a 7-Scenes folder "
-        "(`frame-XXXXXX.color.png`), a TUM RGB-D folder (`rgb.txt`), folders `rgb` and `depth`, another layout of "
-        f"`vggtgeo data list`, or a folder of images{_hint(place)}{'; ' if dead else ''}{dead}"
+        or f"`{place}` holds {', '.join(f'`{name}`' for name in names[:4])}; expected images, folders `rgb` "
+        f"and `depth`, or another layout of `vggtgeo data list`{_hint(place)}"
     )
 
 
-def _broken_links(folder: Path) -> str:
-    """Return a message on broken links in a folder and its subfolders; empty without any.
-
-    A disk is missing, or a tool for large files has not fetched their content.
-    """
-    places = (folder, *(path for path in sorted(folder.iterdir()) if path.is_dir()))
-    dead = [path for place in places for path in place.iterdir() if path.is_symlink() and not is_there(path)]
-    if not dead:
-        return ""
-    return (
-        f"{len(dead)} broken links are not read, `{min(dead).relative_to(folder)}` first; is a disk "
-        "missing, or was the content not fetched (git annex, DVC)?"
-    )
+def _warn_of_broken_links(folder: Path) -> None:
+    dead = [path for path in (*folder.iterdir(), *folder.glob("*/*")) if path.is_symlink() and not is_there(path)]
+    if dead:
+        warn(f"`{folder}`: {len(dead)} broken links are not read, `{min(dead)}` first: is a disk missing?")
 
 
 def _open_video(file: Path, depth: bool) -> Sequence:

@@ -16,7 +16,8 @@ not read. Poses are those of ARKit, not an independent ground truth: differences
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -32,7 +33,15 @@ from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
 from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.datasets.pose_files import parsing, poses_of, read_json, read_matrices, read_matrix, trajectory_of
+from vggtgeo.datasets.pose_files import (
+    check_size,
+    parsing,
+    poses_of,
+    read_json,
+    read_matrices,
+    read_matrix,
+    trajectory_of,
+)
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -47,7 +56,6 @@ _CONFIDENCE = "confidence"
 _LISTS = "odometry.csv", "camera_matrix.csv"
 """Files of Stray Scanner beside the video."""
 _FRAME = re.compile(r"frame_(\d{1,9})\.(jpe?g|png)", re.IGNORECASE)
-_MICROSECOND = 1e-6
 
 
 @dataclass(frozen=True)
@@ -63,15 +71,11 @@ class StrayScanner:
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `rgb.mp4` and one of the two lists (a recording without the other is damaged)."""
         return (folder / "rgb.mp4").is_file() and any((folder / name).is_file() for name in _LISTS)
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """Open the video; images are reduced to at most 960 pixels, by an integer factor."""
-        for file in (folder / name for name in _LISTS):
-            if not file.is_file():
-                raise InputError(f"`{file}` is missing: copy the whole recording, or give `rgb.mp4` alone, as a video")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)  # the video has no intrinsics, but the folder has
             video = VideoFile.open(folder / "rgb.mp4", depth=False)
@@ -84,11 +88,9 @@ class StrayScanner:
         intrinsics = intrinsics_of(file, (matrix[0, 0] / reduction, matrix[1, 1] / reduction, *centre))
         camera = Camera(intrinsics, width // reduction, height // reduction)
         times = tuple(_odometry(folder)[:, 0].tolist())
-        if len(video) and len(times) != len(video):
-            warn(
-                f"`{folder}`: `rgb.mp4` has {len(video)} frames, `odometry.csv` {len(times)} times; frames behind "
-                f"{min(len(video), len(times))} are left out"
-            )
+        if len(times) != len(video):
+            text = f"has {len(video)} frames, `odometry.csv` {len(times)} times"
+            warn(f"`{folder}`: `rgb.mp4` {text}; frames behind {min(len(video), len(times))} are left out")
         has_depth = bool(files_like(folder / "depth", "*.png"))
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
 
@@ -96,10 +98,9 @@ class StrayScanner:
         return min(len(self.video), len(self.times))
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`."""
         check_selection(self.name, len(self), start, end, stride)
         end = len(self) if end is None else min(end, len(self))
-        return (self._frame(frame) for frame in self.video.frames(start, end, stride))
+        return map(self._frame, self.video.frames(start, end, stride))
 
     def ground_truth(self) -> Trajectory | None:
         """Return ARKit's poses, camera -> world, which the app writes with OpenCV's axes."""
@@ -144,16 +145,12 @@ class ArkitScenes(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `lowres_wide`."""
         return (folder / "lowres_wide").is_dir()
 
     @classmethod
     def open(cls, folder: Path) -> Self:
         """List the images, and pair each with the depth nearest in time."""
-        images = _timed(folder / "lowres_wide")
-        if not images:
-            raise InputError(f"`{folder}/lowres_wide` has no images named `..._SECONDS.png`")
-        depths = _timed(folder / "lowres_depth") if (folder / "lowres_depth").is_dir() else []
+        images, depths = _timed(folder / "lowres_wide"), _timed(folder / "lowres_depth")
         frames = [(time, image, _nearest(time, depths)) for time, image in images]
         return cls.listed(folder, frames, lambda *size: _pincam(folder, *size))
 
@@ -172,21 +169,19 @@ class ArkitScenes(FolderSequence):
 def _odometry(folder: Path) -> np.ndarray:
     """Return rows of time, frame, x, y, z, qx, qy, qz, qw."""
     file = folder / "odometry.csv"
-    text = [line for line in whole_text(file).splitlines() if line.strip()]
-    header = text[0].split(",") if text else []
-    rows = read_matrices(file, len(header), skip="t") if header else np.zeros((0, 9))
+    head = whole_text(file).strip().partition("\n")[0]
+    rows = read_matrices(file, head.count(",") + 1, skip="t")
     if rows.shape[1] < 9 or not len(rows):
         raise InputError(f"`{file}`: expected lines `timestamp, frame, x, y, z, qx, qy, qz, qw` after a head")
     return rows
 
 
 def _timed(folder: Path) -> list[tuple[float, Path]]:
+    """Return the images named `..._SECONDS.png` with their times."""
     found = []
     for path in files_like(folder, "*.png"):
-        try:
+        with suppress(ValueError):
             found.append((float(path.stem.rsplit("_", 1)[-1]), path))
-        except ValueError:
-            continue
     return sorted(found)
 
 
@@ -201,26 +196,31 @@ def _pincam(folder: Path, width: int, height: int) -> Camera:
     if not files:
         raise InputError(f"`{folder}/lowres_wide_intrinsics` has no `.pincam` file: width height fx fy cx cy")
     rows = np.concatenate([read_matrices(file, 6)[:1] for file in files])
-    if (rows[:, :2] != (width, height)).any():
-        raise InputError(
-            f"`{files[0]}` is for {rows[0, 0]:g} x {rows[0, 1]:g} pixels; the images are {width} x {height}"
-        )
+    check_size(files[0], rows[0, :2].tolist(), (width, height))
     fx, fy, cx, cy = np.median(rows[:, 2:], axis=0)
     return Camera(intrinsics_of(files[0].parent, (fx, fy, cx, cy)), width, height)
 
 
 class _View(NamedTuple):
-    """What is known of one image. Fields: its files; time, seconds; camera, fx, fy, cx, cy; size, width and height of
-    the camera's images, if stated; pose float64 [4, 4], camera -> world, OpenGL's axes.
+    """What the file of an image's camera states.
+
+    Fields: time, seconds; intrinsics, fx, fy, cx, cy; size, width and height of its images, if stated; pose float64
+    [4, 4], camera -> world, OpenGL's axes.
     """
 
-    image: Path
-    depth: Path
-    confidence: Path
     time: float
-    camera: tuple[float, float, float, float]
+    intrinsics: tuple[float, float, float, float]
     size: tuple[float, float] | None
     pose: np.ndarray
+
+
+class _Files(NamedTuple):
+    """Files of one image. camera: that which `_View` is read from."""
+
+    image: Path
+    camera: Path
+    depth: Path
+    confidence: Path
 
 
 @dataclass(frozen=True)
@@ -247,36 +247,34 @@ class PhoneExport(FolderSequence):
             return trajectory_of([file.timestamp for file in self.files], poses @ FROM_OPENGL, self.folder)
 
     @classmethod
-    def views(cls, folder: Path) -> Iterable[tuple[Path, Path, Path, Path]]:
-        """Return image, file of its camera, depth and confidence of each frame, in their order."""
+    def files_of(cls, folder: Path) -> Iterator[_Files]:
+        """Yield the files of each image, in order."""
         raise NotImplementedError
 
     @classmethod
-    def stated(cls, file: Path) -> tuple[float, tuple[float, float, float, float], tuple | None, np.ndarray]:
-        """Return time, camera, size and pose of the file of a camera; see `_View`."""
+    def view_of(cls, file: Path) -> _View:
+        """Read the file of a camera."""
         raise NotImplementedError
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has an image with the file of its camera."""
-        return any(file.is_file() for _, file, *_ in cls.views(folder))
+        return any(one.camera.is_file() for one in cls.files_of(folder))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images; raise InputError if none has a valid camera."""
-        views = []
-        for image, file, depth, confidence in cls.views(folder):
+        """List the images; those without a valid camera are left out."""
+        views: dict[_Files, _View] = {}
+        for one in cls.files_of(folder):
             try:
-                views.append(_View(image, depth, confidence, *cls.stated(file)))
+                views[one] = cls.view_of(one.camera)
             except InputError as error:
-                warn(LeftOutWarning(f"{error}; `{image.name}` is left out"))
-        if not views:
-            raise InputError(f"`{folder}` has no image with a valid file of its camera")
-        times = _times(folder, [view.time for view in views])
-        frames = [(time, view.image, existing(view.depth)) for time, view in zip(times, views, strict=True)]
-        trusted = {view.depth: view.confidence for view in views if view.confidence.is_file()}
-        poses = {view.image: view.pose for view in views}
-        return cls.listed(folder, frames, lambda *size: _camera(folder, views, *size), poses=poses, confidence=trusted)
+                warn(LeftOutWarning(f"{error}; `{one.image.name}` is left out"))
+        times = _times(folder, [view.time for view in views.values()])
+        frames = [(time, one.image, existing(one.depth)) for time, one in zip(times, views, strict=True)]
+        camera = lambda *size: _camera(folder, list(views.values()), *size)
+        poses = {one.image: view.pose for one, view in views.items()}
+        trusted = {one.depth: one.confidence for one in views if one.confidence.is_file()}
+        return cls.listed(folder, frames, camera, poses=poses, confidence=trusted)
 
 
 @dataclass(frozen=True)
@@ -284,23 +282,22 @@ class Scanner3d(PhoneExport):
     """An export of 3D Scanner App."""
 
     @classmethod
-    def views(cls, folder: Path) -> Iterable[tuple[Path, Path, Path, Path]]:
+    def files_of(cls, folder: Path) -> Iterator[_Files]:
         for image in files_like(folder, "frame_*"):
             if match := _FRAME.fullmatch(image.name):
-                number = match[1]
-                depth, confidence = folder / f"depth_{number}.png", folder / f"conf_{number}.png"
-                yield image, folder / f"frame_{number}.json", depth, confidence
+                beside = (f"frame_{match[1]}.json", f"depth_{match[1]}.png", f"conf_{match[1]}.png")
+                yield _Files(image, *(folder / name for name in beside))
 
     @classmethod
-    def stated(cls, file: Path) -> tuple[float, tuple[float, float, float, float], tuple | None, np.ndarray]:
+    def view_of(cls, file: Path) -> _View:
         with parsing(file, "`intrinsics` of 9 numbers, `cameraPoseARFrame` of 16, and `time`"):
             content = read_json(file)
             matrix = np.reshape(content["intrinsics"], (3, 3)).astype(np.float64)
             matrix = matrix if matrix[0, 2] or matrix[1, 2] else matrix.T  # by columns, as ARKit has it
             pose = np.reshape(content["cameraPoseARFrame"], (4, 4)).astype(np.float64)
             pose = pose.T if pose[3, :3].any() and not pose[:3, 3].any() else pose
-            camera = intrinsics_of(file, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
-            return float(content["time"]), camera, None, pose
+            intrinsics = intrinsics_of(file, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+            return _View(float(content["time"]), intrinsics, None, pose)
 
 
 @dataclass(frozen=True)
@@ -308,7 +305,7 @@ class Polycam(PhoneExport):
     """A raw export of Polycam, or `keyframes` in it."""
 
     @classmethod
-    def views(cls, folder: Path) -> Iterable[tuple[Path, Path, Path, Path]]:
+    def files_of(cls, folder: Path) -> Iterator[_Files]:
         for place in (folder / "keyframes", folder):
             for kind in ("corrected_", ""):
                 cameras = place / f"{kind}cameras"
@@ -317,31 +314,30 @@ class Polycam(PhoneExport):
                     depth = depth if depth.is_dir() else place / "depth"
                     for image in files_like(place / f"{kind}images", "*.jpg"):
                         name = f"{image.stem}.png"
-                        yield image, cameras / f"{image.stem}.json", depth / name, place / "confidence" / name
+                        yield _Files(image, cameras / f"{image.stem}.json", depth / name, place / "confidence" / name)
                     return
 
     @classmethod
-    def stated(cls, file: Path) -> tuple[float, tuple[float, float, float, float], tuple | None, np.ndarray]:
+    def view_of(cls, file: Path) -> _View:
         with parsing(file, "`fx`, `fy`, `cx`, `cy`, `width`, `height` and `t_00` to `t_23`"):
             content = read_json(file)
-            camera = intrinsics_of(file, [content[key] for key in ("fx", "fy", "cx", "cy")])
+            intrinsics = intrinsics_of(file, [content[key] for key in ("fx", "fy", "cx", "cy")])
             pose = np.eye(4)
             pose[:3] = [[content[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
             size = float(content["width"]), float(content["height"])
-            return float(content.get("timestamp", file.stem)) * _MICROSECOND, camera, size, pose
+            return _View(float(content.get("timestamp", file.stem)) * 1e-6, intrinsics, size, pose)
 
 
 def _times(folder: Path, stated: list[float]) -> list[float]:
     """Return those of the files where they rise, else 30 frames a second."""
     if np.isfinite(stated).all() and all(before < after for before, after in pairwise(stated)):
         return stated
-    text = f"the times of its images do not increase; {FRAMES_PER_SECOND:g} frames a second are assumed"
-    warn(f"`{folder}`: {text}")
+    warn(f"`{folder}`: the times do not increase; {FRAMES_PER_SECOND:g} frames a second are assumed")
     return [index / FRAMES_PER_SECOND for index in range(len(stated))]
 
 
 def _camera(folder: Path, views: list[_View], width: int, height: int) -> Camera:
     """Return the median of the intrinsics of all frames; autofocus changes them by a few tenths of a per cent."""
     size = views[0].size or (width, height)
-    middle = intrinsics_of(folder, np.median([view.camera for view in views], axis=0))
+    middle = intrinsics_of(folder, np.median([view.intrinsics for view in views], axis=0))
     return Camera(middle, round(size[0]), round(size[1])).resized(width, height)

@@ -66,13 +66,11 @@ def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
         raise InputError(f"`{file}`: expected a matrix of {shape[0]} x {shape[1]} numbers") from None
 
 
-def trajectory_of(
-    times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path, of: str = "truth"
-) -> Trajectory | None:
+def trajectory_of(times: Sequence[float] | np.ndarray, poses: np.ndarray, where: Path) -> Trajectory | None:
     """Return camera -> world at `times`, sorted by time; None if no pose is valid.
 
     Warns of poses that are left out: with NaN or infinity (lost tracking), without a rotation, or with a repeated
-    time. of: a noun for the warnings.
+    time.
     """
     poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     times = np.asarray(times, np.float64)[: len(poses)]
@@ -85,10 +83,9 @@ def trajectory_of(
         (near & ~turned, "no rotation (all zeros, mirrored or scaled, say)", InputWarning),
     ):
         if lost.any():
-            text = f"`{where}`: {int(lost.sum())} of {len(poses)} poses have {why}; left out of the {of}"
-            warn(text, kind)
+            warn(f"`{where}`: {int(lost.sum())} of {len(poses)} poses have {why}; left out", kind)
     if not len(poses) and where.is_file():
-        warn(f"`{where}` has no pose: there is no {of}")
+        warn(f"`{where}` has no pose")
     if not turned.any():
         return None
     rows = np.flatnonzero(turned)
@@ -102,13 +99,13 @@ def trajectory_of_rows(
     """Return `trajectory_of` images whose poses are these lines of a file; warn of lines beyond its end."""
     there = [place for place, row in enumerate(rows) if row < len(poses)]
     beyond = len(rows) - len(there)
-    if beyond and len(poses):
+    if beyond:
         warn(
             f"`{where}`: {beyond} of {len(rows)} images, by their numbers up to {max(rows)} counted from 0, are beyond "
             f"its end (poses: {len(poses)}) and have no truth"
         )
-        if not there:
-            return None
+    if not there:
+        return None
     return trajectory_of([times[place] for place in there], poses[[rows[place] for place in there]], where)
 
 
@@ -134,23 +131,23 @@ def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray
     return poses
 
 
-def yaml_numbers(file: Path, key: str, count: int | None = None) -> list[float]:
+def yaml_numbers(
+    file: Path, key: str, count: int | None = None, unstated: Sequence[float] | None = None
+) -> Sequence[float]:
     """Return the list of numbers after `key:` in a YAML file as the benchmarks write them: `key: [1, 2, 3]`.
 
-    Raises InputError if it is missing, or does not have `count` values (None: any number).
+    unstated: the default if it is missing. Raises InputError if it is missing without a default, or does not have
+    `count` values (None: any number).
     """
     found = re.search(rf"^\s*{re.escape(key)}\s*:\s*\[([^\]]*)\]", whole_text(file), re.MULTILINE)
+    if found is None and unstated is not None:
+        return unstated
     if found is None:
         raise InputError(f"`{file}` has no list `{key}: [...]`")
     words = found.group(1).replace(",", " ").split()
     if count is not None and len(words) != count:
         raise InputError(f"`{file}`: `{key}` has {len(words)} numbers; expected {count}")
     return numbers_of(words, f"`{file}`: `{key}`")
-
-
-def states_list(file: Path, key: str) -> bool:
-    """Return whether a YAML file has a list `key: [...]`."""
-    return re.search(rf"^\s*{re.escape(key)}\s*:\s*\[", whole_text(file), re.MULTILINE) is not None
 
 
 def numbers_of(words: Sequence[str], what: str) -> list[float]:
@@ -185,10 +182,7 @@ def same_size(stated: Sequence[object], size: tuple[int, int]) -> bool:
 def check_size(file: Path, stated: Sequence[object], size: tuple[int, int]) -> None:
     """Raise InputError if a camera's file is of images of another size."""
     if not same_size(stated, size):
-        raise InputError(
-            f"`{file}` is of images of {stated[0]} x {stated[1]} pixels; those here are {size[0]} x {size[1]}: write "
-            "the camera of these into it"
-        )
+        raise InputError(f"`{file}` is for {stated[0]} x {stated[1]} pixels; the images are {size[0]} x {size[1]}")
 
 
 def have_rotations(poses: np.ndarray) -> np.ndarray:
@@ -218,7 +212,9 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
     Raises InputError as `Trajectory.load_tum`, and for poses without times if `clock` has another number of poses.
     """
     file = Path(path)
-    columns = _columns(file) if file.is_file() else 8
+    text = whole_text(file) if file.is_file() else ""
+    lines = (line.split("#", 1)[0].replace(",", " ").split() for line in text.splitlines())
+    columns = len(next(filter(None, lines), ()))
     if columns == _KITTI:
         return _kitti(file, clock)
     if columns == _EUROC:
@@ -231,18 +227,12 @@ def load_trajectory(path: str | os.PathLike[str], clock: Trajectory | None = Non
     return Trajectory(1e-9 * found.timestamps, found.poses)
 
 
-def _columns(file: Path) -> int:
-    """Return the number of columns of the first line with any."""
-    lines = (line.split("#", 1)[0].replace(",", " ").split() for line in whole_text(file).splitlines())
-    return len(next((words for words in lines if words), ()))
-
-
 def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:
     rows = read_matrices(file, _KITTI)
     if clock is not None and len(clock) != len(rows):
         raise InputError(
-            f"`{file}` has poses without times (12 columns, KITTI), and {len(rows)} of them beside {len(clock)} of the "
-            "truth; give one for each of those, or a file with times, `timestamp tx ty tz qx qy qz qw`"
+            f"`{file}` has {len(rows)} poses without times (12 columns), the truth {len(clock)}; give as many, or "
+            "a file with times, `timestamp tx ty tz qx qy qz qw`"
         )
     poses = poses_of_rows(rows)
     times = np.arange(float(len(rows))) if clock is None else clock.timestamps
@@ -252,7 +242,7 @@ def _kitti(file: Path, clock: Trajectory | None) -> Trajectory:
 
 
 def _with_poses(times: np.ndarray, poses: np.ndarray, file: Path) -> Trajectory:
-    found = trajectory_of(times, poses, file, "trajectory")
+    found = trajectory_of(times, poses, file)
     if found is None:
         raise InputError(f"`{file}` holds no pose")
     return found

@@ -73,10 +73,7 @@ class Record3d(FolderSequence):
         try:
             names = _names(folder)
         except UNREADABLE as error:
-            raise InputError(
-                f"`{folder}` is damaged or truncated, must be a zip archive of Record3D ({error}); share it "
-                "from the app again"
-            ) from None
+            raise InputError(f"`{folder}` is damaged, must be a zip archive of Record3D: {error}") from None
         numbered = {int(match.group(1)): folder / name for name in sorted(names) if (match := _IMAGE.fullmatch(name))}
         if not names & {METADATA, EXPORTED} or not numbered:
             raise InputError(f"`{folder}` must be a recording of Record3D, with `{METADATA}` and `rgbd/0.jpg`, ...")
@@ -94,23 +91,17 @@ class Record3d(FolderSequence):
 
     @property
     def file(self) -> Path:
-        """Return the file of the metadata."""
         return self.folder / (EXPORTED if (self.folder / EXPORTED).is_file() else METADATA)
 
     def metadata(self) -> Mapping[str, Any]:
         """Return the metadata; raise InputError unless they are a JSON object."""
-        where = self.file
-        content = json_in(self._content(where, MAX_TEXT), where)
-        if not isinstance(content, dict):
-            raise InputError(f"`{where}` must be a JSON object with `K`, `fps` and `poses`")
-        return content
+        with parsing(self.file, "a JSON object with `K`, `fps` and `poses`"):
+            return dict(json_in(self._content(self.file, MAX_TEXT), self.file))
 
     def holds(self, path: Path) -> bool:
-        """Return whether the archive or folder has this file."""
-        return (self._root / path.relative_to(self.folder).as_posix()).is_file()
+        return self._inside(path).is_file()
 
     def stored_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """Return the image in a file of the archive."""
         return image_in(self._content(path), path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
@@ -138,14 +129,17 @@ class Record3d(FolderSequence):
         found = poses_of(rows[:, 4:], rows[:, :4])[[numbers[row] for row in there]] @ FROM_OPENGL
         return trajectory_of([self.files[row].timestamp for row in there], found, where)
 
-    def _content(self, path: Path, most: int = MAX_BYTES) -> bytes:
-        """Return the content of a file in the folder or archive; at most `most` bytes of a folder's."""
+    def _content(self, path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+        """Return the content of a file in the folder or archive; at most `max_bytes` of a folder's."""
         if self.folder.is_dir():
-            return content_of(path, most)
+            return content_of(path, max_bytes)
         try:
-            return (self._root / path.relative_to(self.folder).as_posix()).read_bytes()
+            return self._inside(path).read_bytes()
         except UNREADABLE as error:
             raise InputError(f"`{path}` cannot be read: {error}") from None
+
+    def _inside(self, path: Path) -> Path | zipfile.Path:
+        return self._root / path.relative_to(self.folder).as_posix()
 
     @cached_property
     def _root(self) -> Path | zipfile.Path:
@@ -176,18 +170,15 @@ def _names(place: Path) -> set[str]:
 
 
 def _depth_of(image: Path) -> Path:
-    """Return the path of an image's depth."""
-    if image.parent.name == "rgbd":
-        return image.with_suffix(".depth")
-    return image.parent.parent / "depth" / f"{image.stem}.exr"
+    exported = image.parent.name != "rgbd"
+    return image.parent.parent / "depth" / f"{image.stem}.exr" if exported else image.with_suffix(".depth")
 
 
 def _decoder() -> Callable[..., Any]:
     try:
         from imagecodecs import lzfse_decode
     except ImportError:
-        hint = install_hint("phones")
-        raise InputError(f"depth of Record3D (LZFSE) needs the package imagecodecs; {hint}") from None
+        raise InputError(f"depth (LZFSE) needs the package imagecodecs; {install_hint('phones')}") from None
     return cast(Callable[..., Any], lzfse_decode)
 
 
@@ -208,10 +199,9 @@ def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image
 def _times(metadata: Mapping[str, Any], numbers: list[int]) -> list[float]:
     """Return the times of the images, seconds: those of the file if they increase, else by its frame rate."""
     stamps = metadata.get("frameTimestamps") or ()
-    if len(stamps) > numbers[-1]:
-        times = [float(stamps[number]) for number in numbers]
-        if all(after > before for before, after in pairwise(times)):
-            return times
+    times = [float(stamps[number]) for number in numbers] if len(stamps) > numbers[-1] else []
+    if times and all(after > before for before, after in pairwise(times)):
+        return times
     rate = float(metadata.get("fps") or FRAMES_PER_SECOND)
     return [number / rate for number in numbers]
 

@@ -5,15 +5,14 @@ The camera is in `cam_params.json` beside the rooms; the depth is in 1 / 6553.5 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.image_files import DepthFormat
-from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key, rows_of
+from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
 from vggtgeo.datasets.pose_files import check_size, parsing, read_json, read_matrices, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
@@ -24,6 +23,7 @@ _PUBLISHED = (600.0, 600.0, 599.5, 339.5)
 _PUBLISHED_SIZE = (1200, 680)
 _UNITS = 6553.5
 _CAMERA = "cam_params.json"
+_EXPECTED = "`camera` with fx, fy, cx, cy and a positive `scale`, units a metre"
 
 
 @dataclass(frozen=True)
@@ -35,28 +35,28 @@ class Replica(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `traj.txt` and `results/frame...`."""
         return (folder / "traj.txt").is_file() and any((folder / "results").glob("frame*"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the frames."""
-        images = sorted((folder / "results").glob("frame*"), key=lambda path: natural_key(path.name))
-        if not images:
-            raise InputError(f"`{folder}` has no `results/frameXXXXXX.jpg`; expected a room of Replica")
+        images = files_like(folder / "results", "frame*")
         rows = rows_of(images, _poses_in(folder / "traj.txt"))
         depths = (image.with_name(image.stem.replace("frame", "depth") + ".png") for image in images)
         frames = [
             ((row - rows[0]) / FRAMES_PER_SECOND, image, existing(depth))
             for row, image, depth in zip(rows, images, depths, strict=True)
         ]
-        places = (folder / _CAMERA, folder.resolve().parent / _CAMERA)
+        places = folder / _CAMERA, folder.resolve().parent / _CAMERA
         file = next((file for file in places if file.is_file()), None)
-        scale, camera = (_UNITS, partial(_unstated_camera, folder)) if file is None else _stated(file)
+        with parsing(file or folder, _EXPECTED):
+            stated = {"scale": _UNITS} if file is None else read_json(file)["camera"]
+            scale = float(stated["scale"])
+            if not 0 < scale < math.inf:
+                raise ValueError(f"`scale` is {scale}")
+        camera = lambda *size: _unstated_camera(folder, *size) if file is None else _camera(file, stated, *size)
         return cls.listed(folder, frames, camera, DepthFormat(scale), rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses."""
         file = self.folder / "traj.txt"
         poses = read_matrices(file, 16)
         return trajectory_of_rows([one.timestamp for one in self.files], self.rows, poses, file)
@@ -70,21 +70,10 @@ def _poses_in(file: Path) -> int | None:
         return None
 
 
-def _stated(file: Path) -> tuple[float, Callable[[int, int], Camera]]:
-    """Return the units a metre, and the camera for images of a size, of `cam_params.json`."""
-    with parsing(file, "`camera` with fx, fy, cx, cy and a positive `scale`, units a metre"):
-        stated = read_json(file)["camera"]
-        scale, size = float(stated["scale"]), (stated.get("w"), stated.get("h"))
-        if not 0 < scale < math.inf:
-            raise ValueError(f"`scale` is {scale}")
-        intrinsics = intrinsics_of(file, [stated[name] for name in ("fx", "fy", "cx", "cy")])
-
-    def camera(width: int, height: int) -> Camera:
-        if None not in size:
-            check_size(file, size, (width, height))
-        return Camera(intrinsics, width, height)
-
-    return scale, camera
+def _camera(file: Path, stated: Mapping[str, Any], width: int, height: int) -> Camera:
+    with parsing(file, _EXPECTED):
+        check_size(file, (stated.get("w", width), stated.get("h", height)), (width, height))
+        return Camera(intrinsics_of(file, [stated[name] for name in ("fx", "fy", "cx", "cy")]), width, height)
 
 
 def _unstated_camera(folder: Path, width: int, height: int) -> Camera:
@@ -92,8 +81,5 @@ def _unstated_camera(folder: Path, width: int, height: int) -> Camera:
         return Camera(_PUBLISHED, width, height)
     own = camera_from_folder(folder, width, height)
     if own is None:
-        raise InputError(
-            f"`{folder}` has no `{_CAMERA}`, which belongs beside it; its images have another size than "
-            f"those of the published camera, {_PUBLISHED_SIZE[0]} x {_PUBLISHED_SIZE[1]} pixels"
-        )
+        raise InputError(f"`{folder}` has no `{_CAMERA}`, in it or beside it, and its images are not 1200 x 680 pixels")
     return own

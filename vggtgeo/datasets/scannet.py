@@ -16,6 +16,7 @@ Source: A. Dai et al., "ScanNet", CVPR 2017.
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -49,18 +50,14 @@ class ScanNet(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has `color`, `depth`, `pose` and `intrinsic`, or images beside `_info.txt`."""
         if all((folder / name).is_dir() for name in ("color", "depth", "pose", "intrinsic")):
             return True
         return _info(folder) is not None and bool(files_like(folder, "frame-*.color.*"))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the frames that have an image."""
         place = folder / "color"
         images = image_files(place, _COLOUR) if place.is_dir() else files_like(folder, "frame-*.color.*")
-        if not images:
-            raise InputError(f"`{place}` has no images; it must be an exported scan of ScanNet")
         frames = [
             (_number(image, index) / FRAMES_PER_SECOND, image, _depth(folder, image))
             for index, image in enumerate(images)
@@ -95,26 +92,22 @@ class ScanNet(FolderSequence):
     def load_depth(self, path: Path) -> np.ndarray:
         """Return the depth at the colour camera, with the intrinsics of the depth camera."""
         depth = super().load_depth(path)
-        if depth.shape != (self.camera.height, self.camera.width) or self._at_one_place:
-            return depth
-        return self._registration(depth)
-
-    @property
-    def _at_one_place(self) -> bool:
-        return bool((self.motion == np.eye(4)).all())
+        wrong = depth.shape != (self.camera.height, self.camera.width)  # reported by the base
+        return depth if wrong or self._registration is None else self._registration(depth)
 
     @cached_property
-    def _registration(self) -> DepthRegistration:
-        return DepthRegistration.of(self.camera, self.camera, self.motion)
+    def _registration(self) -> DepthRegistration | None:
+        """Return None if the cameras are at one place."""
+        one_place = np.array_equal(self.motion, np.eye(4))
+        return None if one_place else DepthRegistration.of(self.camera, self.camera, self.motion)
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the true poses."""
         there = [(one.timestamp, _beside(self.folder, one.image, "pose", ".txt")) for one in self.files]
         there = [(time, file) for time, file in there if file.is_file()]
         if not there:
             return None
         poses = np.array([read_matrix(file, (4, 4)) for _, file in there])
-        if not self._at_one_place:
+        if self._registration is not None:
             with np.errstate(invalid="ignore"):  # of lost frames, which have infinities
                 poses = poses @ np.linalg.inv(self.motion)
         return trajectory_of([time for time, _ in there], poses, self.folder / "pose")
@@ -138,10 +131,8 @@ def _depth(folder: Path, image: Path) -> Path | None:
 
 def _info(folder: Path) -> Path | None:
     """Return the file of both cameras that SensReader in C++ writes; None for another program's `info.txt`."""
-    own, other = folder / "_info.txt", folder / "info.txt"
-    if own.is_file():
-        return own
-    return other if other.is_file() and "m_calibration" in whole_text(other) else None
+    files = (folder / name for name in ("_info.txt", "info.txt"))
+    return next((file for file in files if file.is_file() and "m_calibration" in whole_text(file)), None)
 
 
 def _intrinsics(folder: Path, camera: str) -> tuple[float, float, float, float]:
@@ -173,12 +164,8 @@ def _calibration(folder: Path, what: str, camera: str, unstated: np.ndarray | No
 
 def _size(folder: Path, depths: Sequence[Path | None]) -> tuple[int, int]:
     """Return width and height of the first depth image that can be read."""
-    reason = ""
     for file in filter(None, depths):
-        try:
+        with suppress(InputError):
             height, width = read_depth(file, MILLIMETRES).shape
-        except InputError as error:
-            reason = reason or f" ({error})"
-            continue
-        return width, height
-    raise InputError(f"`{folder}` has no depth image that can be read{reason}; the camera's size is unknown")
+            return width, height
+    raise InputError(f"`{folder}` has no depth image that can be read; the camera's size is unknown")

@@ -23,7 +23,7 @@ from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
 from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, NoteWarning, warn
+from vggtgeo.io.errors import NoteWarning, warn
 
 FRAMES_PER_SECOND = 30.0
 COLOUR_TRUTH = "groundtruth-colour.txt"
@@ -53,7 +53,6 @@ class SevenScenes(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has colour frames of this layout, or sequences `seq-XX` that have."""
         return bool(_colour_files(folder)) or bool(_sequences(folder))
 
     @classmethod
@@ -103,14 +102,9 @@ def _sequences(folder: Path) -> list[Path]:
 
 def _first_sequence(folder: Path) -> Path:
     sequences = _sequences(folder)
-    if not sequences:
-        raise InputError(f"`{folder}` has no `frame-XXXXXX.color.png|jpg`; expected a sequence of 7-Scenes")
     if len(sequences) > 1:
-        warn(
-            f"`{folder}` holds {len(sequences)} sequences; reading `{sequences[0].name}`: give the folder of "
-            "another to read that"
-        )
-    return sequences[0]
+        warn(f"`{folder}` holds {len(sequences)} sequences; reading `{sequences[0].name}`: give the folder of another")
+    return sequences[0] if sequences else folder
 
 
 def _beside(image: Path, suffix: str) -> Path:

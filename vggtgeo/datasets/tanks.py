@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_or_guess
-from vggtgeo.datasets.pose_files import parsing, read_json, read_matrix, trajectory_of
+from vggtgeo.datasets.pose_files import have_rotations, parsing, read_json, read_matrix, trajectory_of
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -33,7 +33,6 @@ class TanksAndTemples(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has a `*_COLMAP_SfM.log`."""
         return bool(files_like(folder, f"*{_LOG}"))
 
     @classmethod
@@ -41,11 +40,9 @@ class TanksAndTemples(FolderSequence):
         """List the images, in the folder itself, in `images`, or in a folder of the scene's name."""
         places = [folder, folder / "images", folder / folder.resolve().name]
         images = next((found for place in places if place.is_dir() and (found := image_files(place))), [])
-        if not images:
-            raise InputError(f"`{folder}` has no images; expected a scene of Tanks and Temples")
         # The first image is `000001.jpg`, and 0 in the log.
         rows = rows_of(images, None)
-        first = min(1, *rows)
+        first = min([1, *rows])
         frames = [((row - first) / FRAMES_PER_SECOND, image, None) for row, image in zip(rows, images, strict=True)]
         return cls.listed(folder, frames, lambda *size: camera_or_guess(folder, *size))
 
@@ -76,10 +73,7 @@ class TanksAndTemples(FolderSequence):
         points = PointCloud.load_ply(file).points.astype(np.float64)
         inside = points[self.judged(points)]
         if not len(inside):
-            raise InputError(
-                f"`{file}` has {len(points)} points, none of them in the volume of `{scene}.json`; give the scan and "
-                "the volume of this scene, as they are downloaded"
-            )
+            raise InputError(f"`{file}` has {len(points)} points, none of them in the volume of `{scene}.json`")
         return inside
 
     def judged(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -96,13 +90,11 @@ class TanksAndTemples(FolderSequence):
 def _similarity(file: Path) -> Float[np.ndarray, "4 4"]:
     """Return the matrix of a file; raise InputError unless it is a similarity transformation."""
     matrix = read_matrix(file, (4, 4))
-    turn = matrix[:3, :3]
     with np.errstate(all="ignore"):
-        squares = turn @ turn.T
-        even = np.isfinite(matrix).all() and np.allclose(squares, squares[0, 0] * np.eye(3), atol=0.01 * squares[0, 0])
-        scales = bool(even and squares[0, 0] > 0 and np.linalg.det(turn) > 0)
-    if not scales or not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-3):
-        raise InputError(f"`{file}` must be a scale, rotation and translation of the world, got {matrix.tolist()}")
+        rigid = matrix.copy()
+        rigid[:3, :3] /= np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
+        if not np.isfinite(rigid).all() or not have_rotations(rigid[None])[0]:
+            raise InputError(f"`{file}` must be a scale, rotation and translation of the world, got {matrix.tolist()}")
     return matrix
 
 

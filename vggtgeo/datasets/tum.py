@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Self
 
 from vggtgeo.datasets.folder import LATEST, FolderSequence
-from vggtgeo.datasets.frame import MAX_DELAY
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, partners_in_time
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
@@ -20,9 +19,9 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, LeftOutWarning, warn
 from vggtgeo.io.text_files import whole_text
 
-MAX_LETTERS = 200
+_MAX_LETTERS = 200
 _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")
-MAX_FRAMES = 1e6
+_MAX_FRAMES = 1e6
 """Integers up to this one are numbers of frames, not times."""
 _Entry = tuple[float, Path]
 _Frame = tuple[float, Path, Path | None]
@@ -34,7 +33,6 @@ class TumRgbd(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has an `rgb.txt`, or a list of pairs."""
         return _list_of(folder) is not None
 
     @classmethod
@@ -65,32 +63,31 @@ def _list_of(folder: Path) -> Path | None:
 def _recording(folder: Path) -> str:
     """Return the recording that the list names, `# file: 'rgbd_dataset_freiburg1_desk.bag'`: folders may be renamed."""
     file = folder / "rgb.txt"
-    if not file.is_file():
-        return ""
+    return " ".join(line.partition("file:")[2] for line in head_of(file, comments=True)) if file.is_file() else ""
+
+
+def head_of(file: Path, comments: bool = False) -> list[str]:
+    """Return the first lines of a list, without comments, or those alone."""
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        head = [line[:MAX_LETTERS] for line in itertools.islice(lines, 5)]
-    return " ".join(line.partition("file:")[2] for line in head if line.startswith("#"))
+        head = [line[:_MAX_LETTERS] for line in itertools.islice(lines, 5)]
+    return [line for line in head if line.startswith("#") == comments]
 
 
 def _of_lists(folder: Path) -> list[_Frame]:
     images = _read_list(folder / "rgb.txt", frames=True)
     depths = _read_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
-    partners = partners_in_time(images, depths)
-    if depths and (alone := partners.count(None)):
-        warn(f"`{folder}`: {alone} of {len(images)} images have no depth within {MAX_DELAY} s")
     return [
         (time, image, None if partner is None else depths[partner][1])
-        for (time, image), partner in zip(images, partners, strict=True)
+        for (time, image), partner in zip(images, partners_in_time(images, depths), strict=True)
     ]
 
 
 def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
     """Return the frames, and the unit of their depth: millimetres if the list counts frames, as no benchmark does."""
     pairs = read_pairs(file, "TIME")
-    counted = all(time.is_integer() and abs(time) < MAX_FRAMES for time, *_ in pairs)
+    counted = all(time.is_integer() and abs(time) < _MAX_FRAMES for time, *_ in pairs)
     if counted:
-        rate = f"{FRAMES_PER_SECOND:g} a second"
-        warn(f"`{file}`: its first column counts frames; {rate} are assumed, and depth in millimetres")
+        warn(f"`{file}` counts frames: {FRAMES_PER_SECOND:g} a second are assumed, and depth in millimetres")
     elif file.name != _PAIRS[0]:
         warn(f"`{file}`: depth is taken in 1/5000 m, as TUM RGB-D has it; millimetres need --depth-scale 1000")
     depths = {
@@ -102,8 +99,8 @@ def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
 
 
 def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
-    """Return time and name of the image, and name of its depth, of each line of a list of pairs, in either order; raise
-    InputError naming an invalid line. time: noun of the first column.
+    """Return time and name of the image, and name of its depth, of each line of a list of pairs, in either order. time:
+    noun of the first column.
     """
     pairs = []
     for words in _rows(file, 4, f"{time} rgb/{time}.png {time} depth/{time}.png"):
@@ -114,8 +111,6 @@ def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:
 
 def _read_list(file: Path, frames: bool = False) -> list[_Entry]:
     """Return the entries by time; frames: whether each is a frame, which is counted if it is left out."""
-    if not file.is_file():
-        raise InputError(f"`{file}` is missing; expected a list with lines `timestamp file`")
     entries = [(float(time), file.parent / name) for time, name in _rows(file, 2, "timestamp file")]
     return _in_order(file, entries, frames)
 
@@ -132,8 +127,9 @@ def _rows(file: Path, columns: int, expected: str) -> list[list[str]]:
         except ValueError:
             valid = False
         if not valid:
-            text = f"found {line[:MAX_LETTERS]!r}; expected `{expected}`, times in seconds"
-            raise InputError(f"`{file}`, line {number}: {text}")
+            raise InputError(
+                f"`{file}`, line {number}: found {line[:_MAX_LETTERS]!r}; expected `{expected}`, times in seconds"
+            )
         rows.append([word.strip() for word in words])
     if not rows:
         raise InputError(f"`{file}` lists nothing; expected lines `{expected}`")

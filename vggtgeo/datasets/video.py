@@ -1,5 +1,4 @@
-"""A video file, decoded frame by frame by PyAV, and its tracks: which are the images, which their depth; and live
-cameras: a webcam (`webcam:0`) or a stream by its address (`rtsp://...`, `http://...`), read by OpenCV.
+"""A video file, decoded frame by frame by PyAV, and its tracks: which are the images, which their depth.
 
 Action cameras write a small preview beside the recording; k4arecorder writes COLOR, DEPTH and IR into one Matroska
 file.
@@ -12,10 +11,9 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import monotonic
 from typing import Any, Self
 
 import av
@@ -23,7 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from vggtgeo.datasets.frame import Frame, NearestInTime, check_range, check_selection
+from vggtgeo.datasets.frame import Frame, NearestInTime, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, metres_of_codes
 from vggtgeo.datasets.intrinsics import MAX_ASPECT, camera_from_folder, guess_with_warning
 from vggtgeo.geometry.camera import Camera
@@ -49,11 +47,6 @@ _UNNAMED = "VideoHandler"
 """Title that FFmpeg gives a track without one."""
 
 
-_WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
-"""Digits of a webcam's number."""
-_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://.+", re.IGNORECASE)
-
-
 @dataclass(frozen=True)
 class Track:
     """A stream of video.
@@ -76,14 +69,17 @@ class Track:
         return f"track {self.number} ({self.codec}, {self.width} x {self.height}{title})"
 
     @property
-    def has_16_bits_of_grey(self) -> bool:
-        """Return whether its pixels may be depth in millimetres."""
-        return self.pixels.startswith("gray16")
+    def says_depth(self) -> bool:
+        return bool(_DEPTH.search(self.title))
 
     @property
-    def is_depth(self) -> bool:
-        """Return whether its title says so."""
-        return bool(_DEPTH.search(self.title))
+    def says_infrared(self) -> bool:
+        return bool(_INFRARED.search(self.title))
+
+    @property
+    def may_be_depth(self) -> bool:
+        """Return whether its pixels may be millimetres."""
+        return self.pixels.startswith("gray16") and not self.says_infrared
 
 
 @dataclass(frozen=True)
@@ -94,28 +90,17 @@ class ChosenTracks:
     depth: Track | None
     others: tuple[Track, ...]
 
-    @property
-    def maybe_depth(self) -> tuple[Track, ...]:
-        """Tracks that are not read and may be depth, without a title that says so."""
-        untitled = (one for one in self.others if one.has_16_bits_of_grey and not _INFRARED.search(one.title))
-        return tuple(untitled) if self.depth is None else ()
-
 
 def choose_tracks(tracks: Sequence[Track]) -> ChosenTracks:
     """Choose the largest track in colour, before grey and infrared, and the 16-bit grey one whose title says depth.
 
     tracks: at least one.
     """
-    videos = [track for track in tracks if not track.cover] or list(tracks)
-    depth = next((track for track in videos if track.is_depth and track.has_16_bits_of_grey), None)
-    rank = lambda track: (
-        track.is_depth,
-        bool(_INFRARED.search(track.title)),
-        track.pixels.startswith("gray"),
-        -track.width * track.height,
-    )
-    images = min(videos, key=rank)
-    depth = None if depth is images else depth
+    grey = lambda track: track.pixels.startswith("gray")
+    rank = lambda track: (track.says_depth, track.says_infrared, grey(track), -track.width * track.height)
+    images = min([track for track in tracks if not track.cover] or tracks, key=rank)
+    depths = (track for track in tracks if track is not images and track.says_depth and track.may_be_depth)
+    depth = next(depths, None)
     return ChosenTracks(images, depth, tuple(track for track in tracks if track not in (images, depth)))
 
 
@@ -140,9 +125,7 @@ class VideoFile:
     def open(cls, path: Path, depth: bool = True) -> Self:
         """Read the header and the first frame. depth: False to leave a track of depth alone.
 
-        Raises:
-            InputError: no frame can be decoded, or the depth has another size than the images.
-
+        Raises InputError if no frame can be decoded, or the depth has another size than the images.
         """
         _check_content(path)
         tracks = _tracks(path, depth)
@@ -151,7 +134,7 @@ class VideoFile:
             if first is None:
                 raise InputError(
                     f"`{path}` has no frame that can be decoded (its codec: {tracks.images.codec}): it is damaged, or "
-                    "of a kind that FFmpeg does not decode; `ffmpeg -i FILE -c:v libx264 NEW.mp4` converts others"
+                    "of a kind that FFmpeg does not decode"
                 )
             width, height = _shown_size(first)
             aspect = stream.pixel_aspect if 1 / MAX_ASPECT <= stream.pixel_aspect <= MAX_ASPECT else 1.0
@@ -159,15 +142,11 @@ class VideoFile:
         if tracks.depth is not None and (tracks.depth.width, tracks.depth.height) != (width, height):
             raise InputError(
                 f"`{path}`: the depth of {tracks.depth} has another size than the images of {tracks.images}: register "
-                "it first (Azure Kinect: `k4a_transformation_depth_image_to_color_camera`), or leave it out with "
-                "--rgb-only"
+                "it first, or leave it out with --rgb-only"
             )
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
         if not stream.has_times:
-            warn(
-                f"`{path}` is a stream without times: is its header damaged? {stream.rate:g} frames a second are "
-                "assumed: give `--fps` if it has others"
-            )
+            warn(f"`{path}` has no times: {stream.rate:g} frames a second are assumed; give `--fps` if it has others")
         rate = stream.rate if 0 < stream.rate < FASTEST else _FALLBACK_RATE
         return cls(path, path.name, camera, rate, max(stream.count, 1), tracks, tracks.depth is not None)
 
@@ -184,7 +163,6 @@ class VideoFile:
         return self._decode(range(start, sys.maxsize if end is None else end, stride))
 
     def ground_truth(self) -> Trajectory | None:
-        """Return None."""
         return None
 
     def _decode(self, chosen: range) -> Iterator[Frame]:
@@ -215,14 +193,11 @@ class VideoFile:
         if others:
             text = f"{len(others)} frames are not {size[0]} x {size[1]} pixels as the first ({others[0]})"
             warn(LeftOutWarning(f"`{self.name}`: {text}; they are skipped", len(others)))
-        if index < min(chosen.stop, self.count):
-            counts = f"ends after {index} frames; its header says {self.count}"
-            text = f"`{self.name}` {counts}: is the file cut off, or damaged, or was it trimmed?"
-            warn(text)  # not as left out: the count of an MKV is an estimate where the rate varies
+        if index < min(chosen.stop, self.count):  # no LeftOutWarning: an MKV of varying rate has an estimated count
+            warn(f"`{self.name}` ends after {index} frames; its header says {self.count}: is the file cut off?")
 
     @contextmanager
     def _streams(self) -> Iterator[tuple[_Stream, NearestInTime | None]]:
-        """Return the images, and the depth where it is read."""
         with _open_stream(self.path, self.tracks.images) as images:
             if self.tracks.depth is None or not self.has_depth:
                 yield images, None
@@ -260,7 +235,7 @@ class VideoFile:
 
 
 class _Stream:
-    """One stream of an open file.
+    """One stream of an open container of `av`.
 
     rate: frames a second as stated, 0 for none. count: frames as stated, or by the stated duration, 0 for none. start:
     time of the first frame, seconds of the file. pixel_aspect: width of a stored pixel over its height (1440 x 1080 are
@@ -268,7 +243,6 @@ class _Stream:
     """
 
     def __init__(self, container: Any, index: int) -> None:
-        """container: of `av`. index: of the stream among all of the file."""
         self._container = container
         self._stream = stream = container.streams[index]
         stream.thread_type = "AUTO"
@@ -282,22 +256,16 @@ class _Stream:
     def frames(self) -> Iterator[tuple[int, Any]]:
         """Yield each decoded frame, and how many packets before it could not be decoded."""
         failed = 0
-        packets = self._container.demux(self._stream)
-        while True:
-            try:
-                packet = next(packets, None)
-            except av.error.FFmpegError:  # of the container: there is nothing to be read behind it
-                return
-            if packet is None:
-                return
-            try:
-                decoded = packet.decode()
-            except av.error.FFmpegError:
-                failed += 1
-                continue
-            for frame in decoded:
-                yield failed, frame
-                failed = 0
+        with suppress(av.error.FFmpegError):  # of the container: there is nothing to be read behind it
+            for packet in self._container.demux(self._stream):
+                try:
+                    decoded = packet.decode()
+                except av.error.FFmpegError:
+                    failed += 1
+                    continue
+                for frame in decoded:
+                    yield failed, frame
+                    failed = 0
 
     def time(self, frame: Any) -> float:
         """Return seconds of a frame since the stream's start; NaN if it has no time."""
@@ -325,19 +293,16 @@ def _shown_size(frame: Any) -> tuple[int, int]:
     return (frame.height, frame.width) if round(frame.rotation / 90) % 2 else (frame.width, frame.height)
 
 
-@contextmanager
-def _open_container(path: Path) -> Iterator[Any]:
-    """Open a video file; raise InputError if FFmpeg cannot."""
+def _open_container(path: Path) -> Any:
+    """Open a video file, a context manager; raise InputError if FFmpeg cannot."""
     try:
-        container = av.open(os.path.abspath(path))  # what is before a `:` would be a protocol otherwise
+        return av.open(os.path.abspath(path))  # what is before a `:` would be a protocol otherwise
     except (av.error.FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(
             f"`{path}` cannot be opened as a video ({reason}): it is damaged, or not a video; give an MP4, MOV, MKV, "
             "AVI or WebM"
         ) from None
-    with container:
-        yield container
 
 
 @contextmanager
@@ -364,11 +329,11 @@ def _tracks(path: Path, depth: bool) -> ChosenTracks:
     beside = f", depth in millimetres of {chosen.depth}" if chosen.depth else ""
     left = ", ".join(map(str, chosen.others))
     warn(f"`{path}`: images of {chosen.images}{beside}" + (f"; not read: {left}" if left else ""), NoteWarning)
-    if depth and (maybe := chosen.maybe_depth):
+    maybe = next((track for track in chosen.others if track.may_be_depth), None)
+    if depth and chosen.depth is None and maybe:
         warn(
-            f"`{path}`: {', '.join(map(str, maybe))} may be depth (16 bits of grey), and has no title that says so:"
-            f" not used; `ffmpeg -i FILE -map 0 -c copy -metadata:s:v:{maybe[0].number} title=DEPTH NEW.mkv` gives "
-            "the title, for depth in millimetres"
+            f"`{path}`: {maybe} may be depth (16 bits of grey), and has no title that says so: not used; `ffmpeg -i "
+            f"FILE -map 0 -c copy -metadata:s:v:{maybe.number} title=DEPTH NEW.mkv` gives it the title, for millimetres"
         )
     return chosen
 
@@ -387,95 +352,3 @@ def _check_content(path: Path) -> None:
         head = file.read(_HEAD)
     if not _NO_TEXT.search(head):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")
-
-
-def is_live(text: str) -> bool:
-    """Return whether `text` names a webcam or a stream, not a file."""
-    return _WEBCAM.fullmatch(text) is not None or _ADDRESS.fullmatch(text) is not None
-
-
-@dataclass(frozen=True)
-class LiveCamera:
-    """Frames of a live camera, without depth and ground truth, until the stream ends or the run is interrupted.
-
-    The length is unknown (0). Times are those of arrival.
-    """
-
-    source: str
-    camera: Camera
-    has_depth: bool = False
-
-    @classmethod
-    def open(cls, source: str) -> Self:
-        """Open a camera and read one frame for the size; raise InputError if no camera answers."""
-        capture = _capture(source)
-        try:
-            there, image = capture.read()
-            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        finally:
-            capture.release()
-        if not there:
-            raise InputError(f"`{_public(source)}` gives no frame: is the camera connected, and not in use?")
-        height, width = image.shape[:2]
-        if _ADDRESS.fullmatch(source) and math.isfinite(count) and count > 0:  # a live camera has no length
-            warn(
-                f"`{_public(source)}` is a recording of {count:.0f} frames, whose times would be those of arrival: "
-                "download it first (`curl -O ADDRESS`), and give the file"
-            )
-        return cls(source, guess_with_warning(_public(source), width, height))
-
-    @property
-    def name(self) -> str:
-        """Return the source without its password."""
-        return _public(self.source)
-
-    def __len__(self) -> int:
-        return 0
-
-    def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """Return the frames start, start + stride, ... below end as they arrive; frames that are not requested in time
-        are lost.
-        """
-        check_range(start, end, stride)
-        return self._read(start, end, stride)
-
-    def ground_truth(self) -> Trajectory | None:
-        """Return None: there is no ground truth."""
-        return None
-
-    def _read(self, start: int, end: int | None, stride: int) -> Iterator[Frame]:
-        capture = _capture(self.source)
-        began = last = monotonic()
-        index = 0
-        try:
-            while (end is None or index < end) and capture.grab():
-                now = max(monotonic(), last + 1e-6)
-                if index >= start and (index - start) % stride == 0:
-                    there, image = capture.retrieve()
-                    if there:
-                        yield Frame(
-                            index, now - began, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), None, f"{self.name}, {index}"
-                        )
-                last = now
-                index += 1
-        finally:
-            capture.release()
-
-
-def _public(source: str) -> str:
-    """Return an address without the user's name and password."""
-    return re.sub(r"//[^/?#]*@", "//", source)
-
-
-def _capture(source: str) -> cv2.VideoCapture:
-    webcam = _WEBCAM.fullmatch(source)
-    logging: Any = cv2.utils.logging
-    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the error below replaces its warnings
-    try:
-        capture = cv2.VideoCapture(int(webcam.group(1) or 0) if webcam else source)
-    finally:
-        logging.setLogLevel(level)
-    if not capture.isOpened():
-        capture.release()
-        raise InputError(f"`{_public(source)}` cannot be opened: is the camera connected, and the address right?")
-    return capture

@@ -1,10 +1,9 @@
 """Views of a sequence: with other intrinsics, without depth or ground truth, or with smaller images; and frames of any
 iterable: a list, a generator, a live camera.
 
-The pipeline detects and judges corners in pixels. Pixel noise and search radii are constants, measured on images of 540
-x 360 to 752 x 480. Phones record 1920 x 1080 and 3840 x 2160, where corners are blurred over several pixels and the
-same error is many pixels: a sequence without intrinsics that initializes at 540 x 360 does not when it is enlarged to
-3840 x 2160.
+Images are reduced because the pipeline judges corners in pixels: pixel noise and search radii are constants, measured
+on images of 540 x 360 to 752 x 480. In the images of phones, 1920 x 1080 and more, corners are blurred over several
+pixels.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import numpy as np
 
 from vggtgeo.datasets.bags import RosBag
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.frame import Frame, Sequence, check_depth, check_frame, check_selection, described
+from vggtgeo.datasets.frame import Frame, Sequence, check_depth, check_frame, check_image, check_selection, described
 from vggtgeo.datasets.image_files import MAX_DEPTH, MIN_DEPTH
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
@@ -31,7 +30,7 @@ from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.given import check_positive
+from vggtgeo.io.given import check_positive, check_within
 
 MIN_UNITS, MAX_UNITS = 1e-3, 1e6
 """Units a metre of depth files."""
@@ -94,17 +93,15 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
     """Return the sequence whose depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
 
     Raises:
-        InputError: the scale is not positive, implausible, or the sequence has no such depth files.
+        InputError: the scale is implausible, or the sequence has no such depth files.
 
     """
-    check_positive("units_per_metre", units_per_metre, "units a metre")
-    if not MIN_UNITS <= units_per_metre <= MAX_UNITS:
-        raise InputError(
-            f"the depth's scale is {float(units_per_metre):g} units a metre, and depth files have {MIN_UNITS:g} "
-            f"(kilometres) to {MAX_UNITS:g} (micrometres): 1000 is millimetres, 5000 TUM's"
-        )
-    plain = isinstance(sequence, FolderSequence) and type(sequence).load_depth is FolderSequence.load_depth
-    if not (plain and isinstance(sequence, FolderSequence) and any(file.depth for file in sequence.files)):
+    check_within("units_per_metre", units_per_metre, MIN_UNITS, MAX_UNITS, " (1000: millimetres, 5000: TUM RGB-D)")
+    if (
+        not isinstance(sequence, FolderSequence)
+        or type(sequence).load_depth is not FolderSequence.load_depth
+        or not any(file.depth for file in sequence.files)
+    ):
         raise InputError(f"`{sequence.name}` has no depth files with a selectable unit")
     coding = replace(sequence.depth_format, units_per_metre=units_per_metre, floats_per_metre=units_per_metre)
     scaled = replace(sequence, depth_format=coding)
@@ -123,7 +120,6 @@ class ReducedSequence(SequenceView):
     """`source` with smaller images and depth; `camera` is that of the reduced images."""
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`."""
         return _reduced_frames(self.source.frames(start, end, stride), self.source.camera, self.camera)
 
 
@@ -136,9 +132,7 @@ def reduced(source: FrameStream, max_pixels: int) -> FrameStream: ...
 
 
 def reduced(source: Sequence | FrameStream, max_pixels: int) -> Sequence | FrameStream:
-    """Return the frames and camera reduced to about `max_pixels` pixels; the source itself if its images are smaller,
-    or if `max_pixels` is 0.
-    """
+    """Return frames and camera reduced to about `max_pixels` pixels; the source itself if it is smaller, or for 0."""
     camera = reduced_camera(source.camera, max_pixels)
     if camera == source.camera:
         return source
@@ -198,30 +192,22 @@ def frame_stream(frames: Iterable[Any], camera: Camera | None = None) -> FrameSt
     first = next(counted, None)
     if first is None:
         raise InputError("`frames` is empty; give at least one frame")
+    _warn_of_unit(first)
     height, width = first.image.shape[:2]
-    source = _of_one_kind(first, counted)
+    source = _in_order(itertools.chain([first], counted))
     return FrameStream(camera or Camera.guess(width, height), first.depth is not None, source)
 
 
-def _of_one_kind(first: Frame, others: Iterator[Frame]) -> Iterator[Frame]:
-    """Yield all frames; warn of depth that later frames alone have, and of depth in another unit."""
-    last, warned = first, first.depth is not None
-    _warn_of_unit(first)
-    yield first
-    for frame in others:
-        if frame.index <= last.index:
+def _in_order(frames: Iterator[Frame]) -> Iterator[Frame]:
+    last = -1
+    for frame in frames:
+        if frame.index <= last:
             raise InputError(
-                f"`{frame.name}` has the index {frame.index} after {last.index}; number the frames from 0 on, as "
-                "`enumerate` does"
+                f"`{frame.name}` has the index {frame.index} after {last}; number the frames from 0 on, as `enumerate` "
+                "does"
             )
-        if frame.depth is not None and not warned:
-            warn(
-                f"`{frame.name}` has depth, and `{first.name}` had none: depth is used where the first frame has it, "
-                "all NaN if need be; reading the images only"
-            )
-            warned = True
         yield frame
-        last = frame
+        last = frame.index
 
 
 def _warn_of_unit(frame: Frame) -> None:
@@ -231,22 +217,17 @@ def _warn_of_unit(frame: Frame) -> None:
         return
     if not ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
         warn(
-            f"the depth of `{frame.name}` goes from {np.nanmin(depth):g} to {np.nanmax(depth):g}, and none of it is "
-            f"from {MIN_DEPTH:g} to {MAX_DEPTH:g} m: are these metres (millimetres: divide by 1000.0)? It is not used"
+            f"the depth of `{frame.name}` goes from {np.nanmin(depth):g} to {np.nanmax(depth):g}; it is used from "
+            f"{MIN_DEPTH:g} to {MAX_DEPTH:g} m: are these metres (millimetres: divide by 1000.0)?"
         )
 
 
 def _frame(item: Any, index: int) -> Frame:
     if isinstance(item, Frame):
-        given: Any = item.image
-        if not isinstance(given, np.ndarray) or given.ndim != 3:
-            raise InputError(f"`frames[{index}]` has an image {described(given)}; it must be uint8 [H, W, 3], RGB")
+        check_image(f"the image of `frames[{index}]`", item.image)
         return copied(item)
     image, depth = item if isinstance(item, tuple) and len(item) == 2 else (item, None)
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-        raise InputError(
-            f"`frames[{index}]` is {described(image)}; it must be a `Frame`, uint8 [H, W, 3], or (image, depth)"
-        )
+    check_image(f"`frames[{index}]`", image)
     if depth is not None:
         check_depth(f"the depth of `frames[{index}]`", depth, image)
         depth = depth.astype(np.float32)

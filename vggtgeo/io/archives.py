@@ -13,7 +13,8 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -40,11 +41,10 @@ class ArrayHeader:
 
     @property
     def bytes(self) -> int:
-        """Return the size of the data."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
-def array_header(stream: IO[bytes] | io.BufferedIOBase) -> ArrayHeader:
+def _header(stream: io.BufferedIOBase | IO[bytes]) -> ArrayHeader:
     """Read the header of an array in NumPy's format, up to its data; raise ValueError if it is invalid."""
     formats = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, _, dtype = formats[np.lib.format.read_magic(stream)](stream)
@@ -53,7 +53,7 @@ def array_header(stream: IO[bytes] | io.BufferedIOBase) -> ArrayHeader:
 
 @dataclass(frozen=True)
 class Archive:
-    """An open `.npz` file, as `read_archive` passes it."""
+    """An open `.npz` file."""
 
     path: Path
     members: Mapping[str, zipfile.ZipInfo]
@@ -70,39 +70,31 @@ class Archive:
     ) -> dict[str, np.ndarray]:
         """Return arrays by name; `check` is called with their headers before any data are read.
 
-        Raises:
-            InputError: all arrays have more than `limit` bytes.
-
+        Raises InputError if all arrays have more than `limit` bytes.
         """
         headers = {}
         for name in names:
             with self.file.open(self.members[name]) as stream:
-                headers[name] = array_header(stream)
+                headers[name] = _header(stream)
         total = sum(header.bytes for header in headers.values())
         if total > limit:
             raise InputError(f"`{self.path}` has {total / 2**20:.0f} MiB of arrays, must be at most {limit >> 20} MiB")
         check(headers)
-        return {name: self._data(name) for name in headers}
+        found = {}
+        for name in headers:  # a ValueError for an array of objects, or of another size than its header declares
+            with self.file.open(self.members[name]) as stream:
+                found[name] = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+        return found
 
-    def _data(self, name: str) -> np.ndarray:
-        # Raises ValueError for an array of objects, or of another size than its header declares.
-        with self.file.open(self.members[name]) as stream:
-            return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
-
-def read_archive(path: Path, what: str, use: Callable[[Archive], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Open `path`, call `use` and return its result; what: a noun for messages ("a map").
-
-    Raises:
-        InputError: the file is missing or damaged, or raised by `use`.
-
-    """
+@contextmanager
+def open_archive(path: Path, what: str) -> Iterator[Archive]:
+    """Open `path`; raise InputError if it is missing or damaged. what: a noun for messages ("a map")."""
     if not path.is_file():
         raise InputError(f"`{path}` does not exist or is not a file; give the file of {what}")
     try:
         with path.open("rb") as handle, zipfile.ZipFile(handle) as file:
-            members = {info.filename.removesuffix(".npy"): info for info in file.infolist()}
-            return use(Archive(path, members, file))
+            yield Archive(path, {info.filename.removesuffix(".npy"): info for info in file.infolist()}, file)
     except InputError:
         raise
     except UNREADABLE as error:

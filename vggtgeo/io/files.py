@@ -1,8 +1,8 @@
-"""Atomic writes: a reader of a file sees the old content or the new, never a part.
+"""Atomic writes: a reader of a file sees the old content or the new, never a part; and locks.
 
 The content is written to a temporary file in the same folder (so that `os.replace` stays within one file system),
 flushed to the disk, and renamed in one step. After an exception or Ctrl-C the temporary file is removed, and the old
-file is unchanged.
+file is unchanged. Locks of files and folders are released by the system when the process ends.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ import json
 import os
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 import cv2
 import numpy as np
+from filelock import FileLock, Timeout
 
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import path_of
 
 
@@ -80,3 +82,53 @@ def write_picture(path: Path, image: np.ndarray, options: Sequence[int] = ()) ->
     # Encoded first: OpenCV does not report a full disk, and leaves a part of an image.
     with atomic_open(path, "wb") as file:
         file.write(cv2.imencode(path.suffix, image, options)[1].tobytes())
+
+
+LockedError = Timeout
+"""Another process holds the lock."""
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a lock on the file `path`, which is created, and removed at the end if it is empty.
+
+    Raises:
+        LockedError: another process holds the lock.
+        OSError: the file cannot be created, or is a link.
+
+    """
+    lock = FileLock(path, blocking=False)
+    lock.acquire()
+    own = path.stat()
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # the folder may have been moved, and another be in its place
+            if os.path.samestat(own, path.stat()) and not own.st_size:
+                path.unlink()
+        lock.release()
+
+
+@contextmanager
+def locked_folder(folder: Path, name: str, user: str) -> Iterator[None]:
+    """Hold a folder, created if missing, by the lock `name` in it. user: what holds it ("run").
+
+    Raises:
+        InputError: another process holds it, or it is not writable.
+
+    """
+    with ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(locked(folder / name))
+        except LockedError:
+            raise InputError(f"`{folder}` is in use by another {user}; give another folder with `-o`") from None
+        except OSError as error:
+            raise not_written(folder, error) from None
+        yield
+
+
+def not_written(folder: Path, error: OSError, reserve: int = 0) -> InputError:
+    """Return the error for a folder that is not writable. reserve: bytes that a run needs there."""
+    room = f"; a run needs {reserve // 2**20} MB" if reserve else ""
+    return InputError(f"`{folder}` cannot be written: {error.strerror or error}{room}: give another folder with `-o`")

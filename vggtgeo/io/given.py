@@ -59,6 +59,13 @@ def check_positive(name: str, given: Any, unit: str) -> None:
         raise InputError(f"`{name}` is {given}; it must be positive {unit}")
 
 
+def check_within(name: str, given: Any, low: float, high: float, units: str = "") -> None:
+    """Raise InputError unless `given` is a number from `low` to `high`."""
+    check_real(name, given)
+    if not low <= given <= high:
+        raise InputError(f"`{name}` is {given}; it must be from {low:g} to {high:g}{units}")
+
+
 def real_numbers(name: str, given: Any) -> np.ndarray:
     """Return an array of real numbers or booleans.
 

@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vggtgeo.io.archives import MAX_BYTES, Archive, read_archive
+from vggtgeo.io.archives import MAX_BYTES, Archive, open_archive
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 
@@ -113,21 +113,17 @@ class Format:
 
     def _parts(self, path: Path, with_data: bool) -> tuple[dict[str, Any], np.ndarray]:
         """Return the header, checked, and the data, empty if they are not read."""
-        header: dict[str, Any] = {}
-
-        def parts(archive: Archive) -> dict[str, np.ndarray]:
-            header.update(self._header(archive))
-            limit = MAX_BYTES if self.compressed else archive.path.stat().st_size
-            return archive.read([DATA] if with_data else [], limit=limit)
-
-        return header, read_archive(path, self._article, parts).get(DATA, np.zeros(0, np.uint8))
+        with open_archive(path, self._article) as archive:
+            header = self._header(archive)
+            limit = MAX_BYTES if self.compressed else path.stat().st_size
+            data = archive.read([DATA], limit=limit)[DATA] if with_data else np.zeros(0, np.uint8)
+        return header, data
 
     @property
     def _article(self) -> str:
         return f"{'an' if self.kind[0] in 'aeiou' else 'a'} {self.kind}"
 
     def _header(self, archive: Archive) -> dict[str, Any]:
-        """Return the header, checked."""
         if set(archive.members) != {HEADER, DATA}:
             raise InputError(f"`{archive.path}` is not {self._article} of vggtgeo: it must have `header` and `data`")
         text = archive.read([HEADER], limit=MAX_HEADER)[HEADER].tobytes()

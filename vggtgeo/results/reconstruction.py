@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.compilation.process_settings import program_settings
 from vggtgeo.datasets import Sequence
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning, collected_warnings
 from vggtgeo.io.given import check_kind
-from vggtgeo.io.interruption import Interruption, interruption
-from vggtgeo.io.process_settings import program_settings
+from vggtgeo.io.process import Interruption, interruption
 from vggtgeo.mapping.dense import check_dense, dense_map
 from vggtgeo.report import RunRecord
 from vggtgeo.results.checkpoints import digest_of_map, load_checkpoint, run_identity

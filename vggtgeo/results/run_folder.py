@@ -21,9 +21,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import write_text
-from vggtgeo.io.interruption import interruption
-from vggtgeo.io.locks import locked_folder, not_written
+from vggtgeo.io.files import locked_folder, not_written, write_text
+from vggtgeo.io.process import interruption
 from vggtgeo.results.checkpoints import frames_kept
 from vggtgeo.results.output_checks import CHECKPOINT, NAMES, NOTE, SUMMARY, UNFINISHED, check_output
 

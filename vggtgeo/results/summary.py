@@ -18,7 +18,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.peak_memory import peak_memory_gb
+from vggtgeo.io.process import peak_memory_gb
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import submap_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty

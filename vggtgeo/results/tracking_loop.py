@@ -13,7 +13,7 @@ from vggtgeo.datasets import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
-from vggtgeo.io.interruption import Interruption
+from vggtgeo.io.process import Interruption
 from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, Notice, RunSoFar, check_same_frame
 from vggtgeo.results.source import Source
 from vggtgeo.slam.callback import Callback

@@ -97,11 +97,7 @@ def door(rng: np.random.Generator, size: int) -> np.ndarray:
         cv2.rectangle(image, (box[0][0] + 8, box[0][1] + 6), (box[1][0] - 8, box[1][1] - 6), (190, 156, 114), 2, _LINE)
     cv2.rectangle(image, (int(0.89 * size), int(0.47 * size)), (int(0.94 * size), int(0.55 * size)), (60, 60, 62), -1)
     cv2.rectangle(
-        image,
-        (int(0.76 * size), int(0.495 * size)),
-        (int(0.94 * size), int(0.51 * size)),
-        (196, 196, 200),
-        -1,
+        image, (int(0.76 * size), int(0.495 * size)), (int(0.94 * size), int(0.51 * size)), (196, 196, 200), -1
     )
     cv2.rectangle(image, (0, 0), (size - 1, size - 1), (70, 50, 32), 5)
     return _upright(image)
@@ -200,14 +196,7 @@ def sign(rng: np.random.Generator, size: int) -> np.ndarray:
     image = _canvas(rng, size, (30, 60, 110), (40, 72, 126))
     text = str(int(rng.integers(100, 999)))
     cv2.putText(
-        image,
-        text,
-        (int(0.08 * size), int(0.62 * size)),
-        cv2.FONT_HERSHEY_DUPLEX,
-        size / 75,
-        (245,) * 3,
-        4,
-        _LINE,
+        image, text, (int(0.08 * size), int(0.62 * size)), cv2.FONT_HERSHEY_DUPLEX, size / 75, (245,) * 3, 4, _LINE
     )
     return _upright(image)
 

@@ -31,6 +31,21 @@ _UNKNOWN = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
 """Depth from outside an image."""
 
 
+def with_images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
+    """Return the recording with each image, uint8 [H, W, 3], changed, by a function of image and row."""
+    frames = [replace(frame, image=change(frame.image, row)) for row, frame in enumerate(recording.frames)]
+    return replace(recording, frames=frames)
+
+
+def with_depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
+    """Return the recording with each depth, float32 [H, W], changed, by a function of depth and row."""
+    frames = [
+        frame if frame.depth is None else replace(frame, depth=change(frame.depth, row).astype(np.float32))
+        for row, frame in enumerate(recording.frames)
+    ]
+    return replace(recording, frames=frames)
+
+
 def as_it_is(recording: Recording, rng: np.random.Generator) -> Recording:
     """Return the recording undisturbed."""
     return recording
@@ -51,12 +66,9 @@ def bars(recording: Recording, rng: np.random.Generator) -> Recording:
     """Draw black bars above and below, 13 % of the height each."""
     height = round(0.13 * recording.frames[0].image.shape[0])
 
-    def paint(image: np.ndarray, row: int) -> np.ndarray:
-        image = image.copy()
-        image[:height] = image[-height:] = 0
-        return image
-
-    return with_images(recording, paint)
+    inside = np.zeros((recording.frames[0].image.shape[0], 1, 1), np.uint8)
+    inside[height:-height] = 1
+    return with_images(recording, lambda image, row: image * inside)
 
 
 def text(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -95,17 +107,13 @@ def person(recording: Recording, rng: np.random.Generator) -> Recording:
         left = int((0.5 + 0.5 * np.sin(0.15 * row)) * (width - pattern.shape[1]))
         return slice(left, left + pattern.shape[1])
 
-    def paint(image: np.ndarray, row: int) -> np.ndarray:
-        image = image.copy()
-        image[height // 5 :, place(row)] = pattern[height // 5 :]
-        return image
+    def covered_by(picture: np.ndarray, row: int, cover: np.ndarray | float) -> np.ndarray:
+        picture = picture.copy()
+        picture[height // 5 :, place(row)] = cover
+        return picture
 
-    def near(depth: np.ndarray, row: int) -> np.ndarray:
-        depth = depth.copy()
-        depth[height // 5 :, place(row)] = 1.2
-        return depth
-
-    return with_depths(with_images(recording, paint), near)
+    seen = with_images(recording, lambda image, row: covered_by(image, row, pattern[height // 5 :]))
+    return with_depths(seen, lambda depth, row: covered_by(depth, row, 1.2))
 
 
 def dark(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -177,10 +185,7 @@ def rolling_shutter(recording: Recording, rng: np.random.Generator, seconds: flo
 
 
 def wrong_focal(
-    recording: Recording,
-    rng: np.random.Generator,
-    factor: float = 1.15,
-    aside: tuple[float, float] = (0.0, 0.0),
+    recording: Recording, rng: np.random.Generator, factor: float = 1.15, aside: tuple[float, float] = (0.0, 0.0)
 ) -> Recording:
     """Change the calibration: `factor` times the focal length, and a centre moved by `aside`, pixels."""
     fx, fy, cx, cy = recording.camera.intrinsics
@@ -202,57 +207,26 @@ def without_depth(recording: Recording, rng: np.random.Generator) -> Recording:
     return replace(recording, frames=[replace(frame, depth=None) for frame in recording.frames])
 
 
-DEGRADATIONS: dict[str, Degradation] = {
-    "base": as_it_is,
-    **{change.__name__: change for change in (dirty_lens, bars, text, board, person, dark, centimetres)},
-    **{change.__name__: change for change in (growing_depth, jumping_depth, other_depth, shuffled, barrel)},
-    **{change.__name__: change for change in (zooming, changed_lens, rolling_shutter, wrong_focal)},
-    **{change.__name__: change for change in (covered, without_depth)},
-}
+_CHANGES: tuple[Degradation, ...] = (
+    *(dirty_lens, bars, text, board, person, dark, centimetres, growing_depth, jumping_depth, other_depth, shuffled),
+    *(barrel, zooming, changed_lens, rolling_shutter, wrong_focal, covered, without_depth),
+)
+DEGRADATIONS = {"base": as_it_is, **{change.__name__: change for change in _CHANGES}}
 
 
 def _through_lens(recording: Recording, factor: Callable[[int], float]) -> Recording:
     """Return image and depth with so many times the focal length."""
     cx, cy = recording.camera.intrinsics[2:]
 
+    size = (recording.camera.width, recording.camera.height)
+
     def grown(row: int) -> np.ndarray:
         times = factor(row)
         return np.array([[times, 0.0, (1.0 - times) * cx], [0.0, times, (1.0 - times) * cy]])
 
-    def depth_through(depth: np.ndarray, row: int) -> np.ndarray:
-        return cv2.warpAffine(depth, grown(row), depth.shape[::-1], flags=cv2.INTER_NEAREST, **_UNKNOWN)
-
-    seen = with_images(recording, lambda image, row: cv2.warpAffine(image, grown(row), image.shape[1::-1]))
-    return with_depths(seen, depth_through)
-
-
-def with_images(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
-    """Return the recording with each image, uint8 [H, W, 3], changed, by a function of image and row."""
-    frames = [replace(frame, image=change(frame.image, row)) for row, frame in enumerate(recording.frames)]
-    return replace(recording, frames=frames)
-
-
-def in_bands_of_light(image: np.ndarray, row: int, share: float, period: float, speed: float) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], with flicker of a rolling shutter: bands of `period` rows with `share` more
-    and less light, which move by `speed` rows per image. row: of this image.
-    """
-    phase = 2 * np.pi * (np.arange(len(image))[:, None, None] + speed * row) / period
-    return np.clip(image * (1 + share * np.sin(phase)), 0, 255).astype(np.uint8)
-
-
-def compressed(image: np.ndarray, quality: int) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], RGB, after JPEG compression of this quality."""
-    _, code = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.ascontiguousarray(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])
-
-
-def with_depths(recording: Recording, change: Callable[[np.ndarray, int], np.ndarray]) -> Recording:
-    """Return the recording with each depth, float32 [H, W], changed, by a function of depth and row."""
-    frames = [
-        frame if frame.depth is None else replace(frame, depth=change(frame.depth, row).astype(np.float32))
-        for row, frame in enumerate(recording.frames)
-    ]
-    return replace(recording, frames=frames)
+    seen = with_images(recording, lambda image, row: cv2.warpAffine(image, grown(row), size))
+    nearest = {"flags": cv2.INTER_NEAREST, **_UNKNOWN}
+    return with_depths(seen, lambda depth, row: cv2.warpAffine(depth, grown(row), size, **nearest))
 
 
 ROUNDS = 4

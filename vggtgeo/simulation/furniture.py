@@ -57,13 +57,7 @@ class RoomBuilder(SceneBuilder):
         self.rectangle((x0, y0, base), (x1 - x0, y1 - y0, 0), (0, 0, height), look, edges=edges)
 
     def skirting(
-        self,
-        start: Vector,
-        end: Vector,
-        height: float,
-        depth: float,
-        look: Look = DARK,
-        base: float = 0.0,
+        self, start: Vector, end: Vector, height: float, depth: float, look: Look = DARK, base: float = 0.0
     ) -> float:
         """Add a skirting board along a wall; return the length of the wall."""
         length = float(np.hypot(end[0] - start[0], end[1] - start[1]))

@@ -20,7 +20,7 @@ from vggtgeo.simulation.atlas import look_up, pack_shelves
 from vggtgeo.simulation.shapes import Blockers, Surfaces
 
 _WIDTH = 2048
-_AMBIENT_REACH = 0.8
+_AMBIENT_REACH, _AMBIENT_RAYS = 0.8, 12
 _BATCH = 60000  # segments times boxes tested at once: small enough for the cache
 _GROUP = 256  # points at most whose far boxes are left out at once
 _LAMP_CELLS = 3  # a lamp is sampled once in each of 3 x 3 cells
@@ -53,9 +53,10 @@ def bake(
     points, normals = surfaces.points(which, s, t)
     points += 0.012 * normals
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    light = _ambient(points, normals, blockers, starts, ambient, rng)
+    samples = _Samples(points, normals, starts, blockers)
+    light = ambient * samples.openness(rng)
     for lamp in lights:
-        light += _direct(points, normals, blockers, starts, lamp, rng)
+        light += samples.lit_by(lamp, rng)
     for row, (width, rows) in enumerate(counts):
         grid = light[starts[row] : starts[row + 1]].reshape(rows, width)
         smooth = cv2.GaussianBlur(grid, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE)
@@ -81,48 +82,42 @@ def _texels(surfaces: Surfaces, counts: np.ndarray) -> tuple[np.ndarray, ...]:
     return np.concatenate(which), np.concatenate(s), np.concatenate(t), counts.prod(axis=1)
 
 
-def _ambient(
-    points: np.ndarray,
-    normals: np.ndarray,
-    blockers: Blockers,
-    starts: np.ndarray,
-    base: float,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    rays = 12
-    direction = rng.standard_normal((len(points), rays, 3), dtype=np.float32)
-    direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-6)
-    direction += normals[:, None]  # a uniform sphere on the tip of the normal: cosine-weighted directions
-    direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-6)
-    blocked = _shadowed(points, _AMBIENT_REACH * direction, blockers, starts)
-    return base * (1.0 - 0.55 * blocked.mean(axis=1))
+@dataclass(frozen=True)
+class _Samples:
+    """Points [n, 3] on surfaces with their normals; starts: first sample of each surface."""
 
+    points: np.ndarray
+    normals: np.ndarray
+    starts: np.ndarray
+    blockers: Blockers
 
-def _direct(
-    points: np.ndarray,
-    normals: np.ndarray,
-    blockers: Blockers,
-    starts: np.ndarray,
-    lamp: tuple,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    centre, size, power, reach = lamp
-    light = np.zeros(len(points))
-    towards = centre - points
-    near = np.nonzero((np.sum(towards**2, axis=1) < reach**2) & (np.einsum("nk,nk->n", towards, normals) > -0.5))[0]
-    to_lamp = np.repeat(towards[near][:, None], _LAMP_CELLS**2, axis=1)
-    cells = np.stack(np.divmod(np.arange(_LAMP_CELLS**2), _LAMP_CELLS), axis=1)
-    to_lamp[..., :2] += ((cells + rng.uniform(0, 1, (len(near), len(cells), 2))) / _LAMP_CELLS - 0.5) * size
-    square = np.sum(to_lamp**2, axis=2)
-    distance = np.sqrt(square)
-    cosine = np.maximum(np.einsum("nk,nsk->ns", normals[near], to_lamp), 0) / distance
-    downward = np.clip(to_lamp[..., 2] / distance, 0, 1)
-    gain = power * cosine * downward * np.clip(1 - (distance / reach) ** 4, 0, 1) / (square + 0.5)
-    lit = np.nonzero(gain.max(axis=1, initial=0.0) > 1e-4)[0]
-    spans = np.searchsorted(near[lit], starts)
-    shadow = _shadowed(points[near[lit]], 0.97 * to_lamp[lit], blockers, spans)
-    light[near[lit]] = (gain[lit] * ~shadow).mean(axis=1)
-    return light
+    def openness(self, rng: np.random.Generator) -> np.ndarray:
+        direction = rng.standard_normal((len(self.points), _AMBIENT_RAYS, 3), dtype=np.float32)
+        direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-6)
+        direction += self.normals[:, None]  # a uniform sphere on the tip of the normal: cosine-weighted directions
+        direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-6)
+        blocked = _shadowed(self.points, _AMBIENT_REACH * direction, self.blockers, self.starts)
+        return 1.0 - 0.55 * blocked.mean(axis=1)
+
+    def lit_by(self, lamp: tuple, rng: np.random.Generator) -> np.ndarray:
+        centre, size, power, reach = lamp
+        light = np.zeros(len(self.points))
+        towards = centre - self.points
+        faces = np.einsum("nk,nk->n", towards, self.normals) > -0.5
+        near = np.nonzero((np.sum(towards**2, axis=1) < reach**2) & faces)[0]
+        to_lamp = np.repeat(towards[near][:, None], _LAMP_CELLS**2, axis=1)
+        cells = np.stack(np.divmod(np.arange(_LAMP_CELLS**2), _LAMP_CELLS), axis=1)
+        to_lamp[..., :2] += ((cells + rng.uniform(0, 1, (len(near), len(cells), 2))) / _LAMP_CELLS - 0.5) * size
+        square = np.sum(to_lamp**2, axis=2)
+        distance = np.sqrt(square)
+        cosine = np.maximum(np.einsum("nk,nsk->ns", self.normals[near], to_lamp), 0) / distance
+        downward = np.clip(to_lamp[..., 2] / distance, 0, 1)
+        gain = power * cosine * downward * np.clip(1 - (distance / reach) ** 4, 0, 1) / (square + 0.5)
+        lit = np.nonzero(gain.max(axis=1, initial=0.0) > 1e-4)[0]
+        spans = np.searchsorted(near[lit], self.starts)
+        shadow = _shadowed(self.points[near[lit]], 0.97 * to_lamp[lit], self.blockers, spans)
+        light[near[lit]] = (gain[lit] * ~shadow).mean(axis=1)
+        return light
 
 
 def _shadowed(points: np.ndarray, rays: np.ndarray, blockers: Blockers, starts: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -22,7 +23,6 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.raster import EMPTY, NEAR, View, encode, inverse_depth_at, view_from
 from vggtgeo.simulation.render import Picture
-from vggtgeo.simulation.scene import Scene
 from vggtgeo.simulation.sequence import SyntheticSequence
 
 _HALF_STRENGTH = 6.0  # grey levels a pixel of gradient in the weaker direction that count as strength 0.5
@@ -48,12 +48,69 @@ class VisibleEdges:
 
 
 @dataclass(frozen=True, eq=False)
-class _Known:
-    picture: Picture
-    view: View
-    texture: np.ndarray
-    farthest: np.ndarray
-    edges: list[VisibleEdges]  # empty until they are asked for, which most frames never are
+class _KnownFrame:
+    sequence: SyntheticSequence
+    index: int
+
+    @cached_property
+    def picture(self) -> Picture:
+        return self.sequence.picture(self.index)
+
+    @cached_property
+    def view(self) -> View:
+        return view_from(self.sequence.scene.surfaces, self.sequence.pose(self.index))
+
+    def points_at(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return world points float64 [n, 3] that `pixels` [n, 2] show, and whether there is a surface, bool [n].
+
+        Exact at sub-pixel places: the ray meets the surface that the nearest pixel's centre sees.
+        """
+        pose, surface = self.sequence.pose(self.index), pinhole.at_pixels(self.picture.surface, pixels)
+        there = surface != EMPTY
+        rays = pinhole.rays(np.asarray(pixels, np.float64), self.sequence.camera.intrinsics)
+        with np.errstate(divide="ignore"):
+            depth = 1.0 / inverse_depth_at(self.view, np.where(there, surface, 0), rays[:, 0], rays[:, 1])
+        points = depth[:, None] * rays
+        return (points - pose[:3, 3]) @ pose[:3, :3], there & np.isfinite(depth) & (depth > 0)
+
+    @cached_property
+    def gradient(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return that of the noise-free image along x and y, float32 [H, W], grey levels a pixel."""
+        grey = cv2.cvtColor(encode(self.picture.light), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        return cv2.Scharr(grey, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(grey, cv2.CV_32F, 0, 1) / 32
+
+    @cached_property
+    def texture(self) -> np.ndarray:
+        """Return how well each pixel can be localised from texture alone: float32 [H, W] in [0, 1).
+
+        g / (g + 6), g the root of the smaller eigenvalue of the structure tensor (Gaussian, 2 px): straight edges do
+        not count, corners and texture do.
+        """
+        dx, dy = self.gradient
+        xx, yy, xy = (cv2.GaussianBlur(product, (0, 0), 2.0) for product in (dx * dx, dy * dy, dx * dy))
+        smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+        strength = np.sqrt(np.maximum(smaller, 0.0))
+        return np.asarray(strength / (strength + _HALF_STRENGTH), np.float32)
+
+    @cached_property
+    def farthest(self) -> np.ndarray:
+        """Return the largest depth within a pixel of each pixel, float32 [H, W], metres: what hides nothing nearer."""
+        depth = np.nan_to_num(self.picture.depth, nan=np.inf).astype(np.float32)
+        return np.asarray(cv2.dilate(depth, np.ones((3, 3), np.uint8)))
+
+    @cached_property
+    def edges(self) -> VisibleEdges:
+        """Return the visible parts of the scene's edges that are at least `_SHORTEST` pixels long."""
+        pose, camera = self.sequence.pose(self.index), self.sequence.camera
+        contrast = cv2.dilate(np.hypot(*self.gradient), np.ones((3, 3), np.uint8))
+        parts: list[tuple[np.ndarray, np.ndarray, int, float]] = []
+        for index, ends in _clipped(self.sequence.scene.edges, pose, camera):
+            length = float(np.linalg.norm(ends[1, :2] - ends[0, :2]))
+            if length >= _SHORTEST:
+                parts += _visible_parts(index, ends, length, pose, camera, (self.farthest, contrast))
+        if not parts:
+            return VisibleEdges(np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros(0, int), np.zeros(0))
+        return VisibleEdges(*map(np.array, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +123,7 @@ class SimulatedOracle:
     sequence: SyntheticSequence
     kept: int = _KEPT_FRAMES
     _given: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
-    _cache: OrderedDict[int, _Known] = field(default_factory=OrderedDict, repr=False)
-    _poses: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
+    _cache: OrderedDict[int, _KnownFrame] = field(default_factory=OrderedDict, repr=False)
 
     @property
     def name(self) -> str:
@@ -104,21 +160,15 @@ class SimulatedOracle:
         """Return the frame of an image; raise InputError for an image that is not of `frames`."""
         index = self._given.get(_fingerprint(image))
         if index is None:
-            raise InputError(
-                "`image` is not of this simulated sequence; stubs know only frames of the oracle's `frames()`: run the "
-                "pipeline on the oracle, unchanged"
-            )
+            raise InputError("`image` is not of the oracle's `frames()`: run the pipeline on the oracle, unchanged")
         return index
 
     def timestamp(self, index: int) -> float:
-        """Return the time, seconds."""
         return self.sequence.timestamp(index)
 
     def pose(self, index: int) -> np.ndarray:
         """Return the true pose, world -> camera, float64 [4, 4]."""
-        if index not in self._poses:
-            self._poses[index] = self.sequence.pose(index)
-        return self._poses[index].copy()
+        return self.sequence.pose(index)
 
     def depth(self, index: int) -> np.ndarray:
         """Return the true depth float64 [H, W], metres, NaN = none."""
@@ -129,36 +179,27 @@ class SimulatedOracle:
         return self._known(index).picture.glass
 
     def texture(self, index: int) -> np.ndarray:
-        """Return the strength of texture, float32 [H, W] in [0, 1)."""
         return self._known(index).texture
 
     def edges(self, index: int) -> VisibleEdges:
-        """Return the visible parts of the scene's straight edges."""
-        known = self._known(index)
-        if not known.edges:
-            known.edges.append(visible_edges(self.sequence.scene, self.pose(index), self.camera, known.picture))
-        return known.edges[0]
+        return self._known(index).edges
 
     def correspond(self, index_i: int, index_j: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where `pixels` [n, 2] of frame i are in frame j, float64 [n, 2], and whether they are seen there,
         bool.
         """
-        known = self._known(index_i)
-        points, there = locate(known.view, self.pose(index_i), self.camera, known.picture, pixels)
-        target, depth = project(points, self.pose(index_j), self.camera)
-        return target, there & is_visible(target, depth, self._known(index_j).farthest)
+        points, there = self._known(index_i).points_at(pixels)
+        pose = self.pose(index_j)
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        target = pinhole.project(local, self.camera.intrinsics, NEAR)
+        return target, there & is_visible(target, local[:, 2], self._known(index_j).farthest)
 
-    def _known(self, index: int) -> _Known:
-        known = self._cache.pop(index, None) or self._learn(index)
+    def _known(self, index: int) -> _KnownFrame:
+        known = self._cache.pop(index, None) or _KnownFrame(self.sequence, index)
         self._cache[index] = known
         if len(self._cache) > self.kept:
             self._cache.popitem(last=False)
         return known
-
-    def _learn(self, index: int) -> _Known:
-        picture = self.sequence.picture(index)
-        view = view_from(self.sequence.scene.surfaces, self.pose(index))
-        return _Known(picture, view, texture_strength(picture), farthest_depth(picture), [])
 
 
 def _fingerprint(image: np.ndarray) -> tuple[int, int]:
@@ -166,84 +207,16 @@ def _fingerprint(image: np.ndarray) -> tuple[int, int]:
     return zlib.crc32(data), zlib.adler32(data)
 
 
-def texture_strength(picture: Picture) -> np.ndarray:
-    """Return how well each pixel can be localised from texture alone: float32 [H, W] in [0, 1).
-
-    g / (g + 6), g the root of the smaller eigenvalue of the structure tensor (Gaussian, 2 px) of the noise-free
-    image in grey levels: straight edges do not count, corners and texture do.
-    """
-    grey = cv2.cvtColor(encode(picture.light), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    dx, dy = cv2.Scharr(grey, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(grey, cv2.CV_32F, 0, 1) / 32
-    xx, yy, xy = (cv2.GaussianBlur(product, (0, 0), 2.0) for product in (dx * dx, dy * dy, dx * dy))
-    smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
-    gradient = np.sqrt(np.maximum(smaller, 0.0))
-    return np.asarray(gradient / (gradient + _HALF_STRENGTH), np.float32)
-
-
-def locate(
-    view: View, pose: np.ndarray, camera: Camera, picture: Picture, pixels: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return world points float64 [n, 3] that `pixels` [n, 2] show, and whether there is a surface, bool [n].
-
-    view, picture: of the camera at `pose`. Exact at sub-pixel places: the ray meets the surface that the nearest
-    pixel's centre sees.
-    """
-    height, width = picture.surface.shape
-    columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
-    rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
-    surface = picture.surface[rows, columns]
-    there = surface != EMPTY
-    rays = pinhole.rays(np.asarray(pixels, np.float64), camera.intrinsics)
-    with np.errstate(divide="ignore"):
-        depth = 1.0 / inverse_depth_at(view, np.where(there, surface, 0), rays[:, 0], rays[:, 1])
-    points = depth[:, None] * rays
-    return (points - pose[:3, 3]) @ pose[:3, :3], there & np.isfinite(depth) & (depth > 0)
-
-
-def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels float64 [n, 2] and depths [n] of world points [n, 3]; NaN pixels behind the camera."""
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    return pinhole.project(local, camera.intrinsics, NEAR), local[:, 2]
-
-
-def farthest_depth(picture: Picture) -> np.ndarray:
-    """Return the largest depth within a pixel of each pixel, float32 [H, W], metres: what hides nothing nearer."""
-    depth = np.nan_to_num(picture.depth, nan=np.inf).astype(np.float32)
-    return np.asarray(cv2.dilate(depth, np.ones((3, 3), np.uint8)))
-
-
 def is_visible(pixels: np.ndarray, depths: np.ndarray, farthest: np.ndarray) -> np.ndarray:
     """Return whether points at `pixels` [n, 2] with depths [n] are inside the picture and not hidden: bool [n].
 
-    farthest: of `farthest_depth`. A point is hidden if all surfaces within a pixel of it are nearer by over 1 %.
+    farthest: of `_KnownFrame`. A point is hidden if all surfaces within a pixel of it are nearer by over 1 %.
     """
     height, width = farthest.shape
     with np.errstate(invalid="ignore"):
         inside = np.all((pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5), axis=1) & (depths > NEAR)
-    at = np.where(inside[:, None], pixels, 0.0)
-    columns = np.clip(np.rint(at[:, 0]).astype(int), 0, width - 1)
-    rows = np.clip(np.rint(at[:, 1]).astype(int), 0, height - 1)
-    return inside & (depths <= farthest[rows, columns] * (1 + _DEPTH_TOLERANCE))
-
-
-def visible_edges(scene: Scene, pose: np.ndarray, camera: Camera, picture: Picture) -> VisibleEdges:
-    """Return the visible parts of the scene's edges that are at least `_SHORTEST` pixels long."""
-    maps = (farthest_depth(picture), _gradient(picture))
-    parts: list[tuple[np.ndarray, np.ndarray, int, float]] = []
-    for index, ends in _clipped(scene.edges, pose, camera):
-        length = float(np.linalg.norm(ends[1, :2] - ends[0, :2]))
-        if length >= _SHORTEST:
-            parts += _visible_parts(index, ends, length, pose, camera, maps)
-    if not parts:
-        return VisibleEdges(np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros(0, int), np.zeros(0))
-    pixels, points, edge, contrast = zip(*parts, strict=True)
-    return VisibleEdges(np.array(pixels), np.array(points), np.array(edge), np.array(contrast))
-
-
-def _gradient(picture: Picture) -> np.ndarray:
-    grey = cv2.cvtColor(encode(picture.light), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    size = np.hypot(cv2.Scharr(grey, cv2.CV_32F, 1, 0), cv2.Scharr(grey, cv2.CV_32F, 0, 1)) / 32
-    return cv2.dilate(size, np.ones((3, 3), np.uint8))
+    nearby = pinhole.at_pixels(farthest, np.where(inside[:, None], pixels, 0.0))
+    return inside & (depths <= nearby * (1 + _DEPTH_TOLERANCE))
 
 
 def _clipped(edges: np.ndarray, pose: np.ndarray, camera: Camera) -> list[tuple[int, np.ndarray]]:
@@ -277,12 +250,7 @@ def _cut_to_picture(ends: np.ndarray, camera: Camera) -> np.ndarray | None:
 
 
 def _visible_parts(
-    index: int,
-    ends: np.ndarray,
-    length: float,
-    pose: np.ndarray,
-    camera: Camera,
-    maps: tuple[np.ndarray, np.ndarray],
+    index: int, ends: np.ndarray, length: float, pose: np.ndarray, camera: Camera, maps: tuple[np.ndarray, np.ndarray]
 ) -> list[tuple[np.ndarray, np.ndarray, int, float]]:
     count = max(2, int(length / _SAMPLE) + 1)
     samples = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
@@ -295,6 +263,6 @@ def _visible_parts(
         if np.linalg.norm(run[1, :2] - run[0, :2]) < _SHORTEST:
             continue
         points = (pinhole.rays(run[:, :2], camera.intrinsics) / run[:, 2:] - pose[:3, 3]) @ pose[:3, :3]
-        at = np.rint(samples[first : last + 1, :2]).astype(int)
-        parts.append((run[:, :2], points, index, float(maps[1][at[:, 1], at[:, 0]].mean())))
+        contrast = pinhole.at_pixels(maps[1], samples[first : last + 1, :2])
+        parts.append((run[:, :2], points, index, float(contrast.mean())))
     return parts

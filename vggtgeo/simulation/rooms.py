@@ -3,19 +3,21 @@
 `office`: an open-plan floor of 16 x 11 x 2.8 m with islands of desks, shelves and boards.
 
 `room`: a living room of 6 x 5 x 3 m with a desk corner.
+
+`hall`: an atrium of 36 x 22 x 8 m with columns, a gallery, banners and high windows; large and far.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from vggtgeo.simulation.furniture import BRICK, DARK, PLASTER, Place, RoomBuilder, sides_of
+from vggtgeo.simulation.furniture import BRICK, DARK, METAL, PLASTER, WOOD, Place, RoomBuilder, sides_of
 from vggtgeo.simulation.scene import Scene, finish
 from vggtgeo.simulation.shapes import Look, Vector
 from vggtgeo.simulation.trajectories import Walk
 
-_SIZE = (16.0, 11.0)
-_HEIGHT = 2.8
+_OFFICE_SIZE = (16.0, 11.0)
+_OFFICE_HEIGHT = 2.8
 _ON_THE_WALL = {"poster": 0.3, "painting": 0.2, "board": 0.15, "whiteboard": 0.1, "window": 0.15, "door": 0.1}
 
 OFFICE_WALK = Walk(
@@ -47,11 +49,11 @@ OFFICE_WALK = Walk(
 def build_office(seed: int) -> Scene:
     """Build four islands of four desks, lined by shelves, boards, doors and windows."""
     b = RoomBuilder(seed)
-    b.floor_and_ceiling((0, 0), _SIZE, _HEIGHT, Look("carpet", 1.3), Look("ceiling", 1.2, detail=0.05))
+    b.floor_and_ceiling((0, 0), _OFFICE_SIZE, _OFFICE_HEIGHT, Look("carpet", 1.3), Look("ceiling", 1.2, detail=0.05))
     looks = (BRICK, PLASTER, PLASTER.tinted(0.86, 0.93, 1.0), PLASTER.tinted(1.0, 0.95, 0.85))
-    for side, (start, end) in enumerate(sides_of(_SIZE)):
-        b.wall(start, end, _HEIGHT, looks[side])
-        _dress(b, start, end, b.skirting(start, end, 0.10, 0.015), side)
+    for side, (start, end) in enumerate(sides_of(_OFFICE_SIZE)):
+        b.wall(start, end, _OFFICE_HEIGHT, looks[side])
+        _dress_office(b, start, end, b.skirting(start, end, 0.10, 0.015), side)
     variant = 0
     for x in (4.5, 11.5):
         for y in (3.4, 7.7):
@@ -60,7 +62,7 @@ def build_office(seed: int) -> Scene:
     _pillars_and_corners(b)
     for x in (2.7, 6.2, 9.8, 13.3):
         for y in (1.9, 5.5, 9.1):
-            b.lamp_panel(x, y, _HEIGHT, power=6.0, reach=7.0)
+            b.lamp_panel(x, y, _OFFICE_HEIGHT, power=6.0, reach=7.0)
     return finish(b, "office", ambient=0.34, exposure=0.70, texel=0.14)
 
 
@@ -80,7 +82,7 @@ def _island(b: RoomBuilder, at: Vector, variant: int) -> None:
     b.box(place(0, 0, 0.75), (0.03, 1.2, 0.35), panel)
 
 
-def _dress(b: RoomBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
+def _dress_office(b: RoomBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
     """Add things on one wall, about one in 2 m, in an order drawn from the seed."""
     along, number = 1.1, 10 * side
     while along < length - 1.0:
@@ -105,7 +107,7 @@ def _pillars_and_corners(b: RoomBuilder) -> None:
     b.cabinet((15.72, 3.1), -0.5 * np.pi, (1.2, 0.45, 0.8), "books:8")
     b.sofa((0.5, 7.4), 0.5 * np.pi, (0.24, 0.30, 0.12), 1.8)
     b.cabinet((0.28, 3.4), 0.5 * np.pi, (1.2, 0.45, 0.8), "books:7")
-    b.box((8.0, 7.7, 0), (0.5, 0.5, _HEIGHT), Look("concrete", 1.4))
+    b.box((8.0, 7.7, 0), (0.5, 0.5, _OFFICE_HEIGHT), Look("concrete", 1.4))
     b.box((8.0, 7.44, 1.2), (0.40, 0.02, 0.56), DARK, front=Look("poster:61", None))
     b.box((8.0, 7.96, 1.2), (0.40, 0.02, 0.56), DARK, np.pi, front=Look("poster:62", None))
     b.table((8.0, 6.75), 0.0)
@@ -177,13 +179,101 @@ def build_room(seed: int) -> Scene:
     b.plant((5.55, 0.45), 1.0)
     b.cylinder((3.3, 0.28, 0), 0.16, 0.36, Look("metal", 0.5, tint=(0.5, 0.55, 0.6)))
     b.box(
-        (3.45, 4.62, 0),
-        (0.45, 0.40, 0.35),
-        Look("wood", 0.8, tint=(1.0, 0.85, 0.6)),
-        0.2,
-        top=Look("poster:5", None),
+        (3.45, 4.62, 0), (0.45, 0.40, 0.35), Look("wood", 0.8, tint=(1.0, 0.85, 0.6)), 0.2, top=Look("poster:5", None)
     )
     b.box((3.47, 4.64, 0.35), (0.32, 0.30, 0.25), Look("board:3", None), -0.2)
     b.lamp_panel(1.6, 2.4, height, power=9.0)
     b.lamp_panel(4.3, 2.6, height, power=9.0)
     return finish(b, "room", ambient=0.30, exposure=0.62, texel=0.08)
+
+
+_HALL_SIZE = (36.0, 22.0)
+_HALL_HEIGHT = 8.0
+_CONCRETE = Look("concrete", 2.6, tint=(1.25, 1.22, 1.18), detail=0.10)
+
+HALL_WALK = Walk(
+    way=np.array(
+        [
+            [6.0, 5.0, 1.60],
+            [14.0, 4.2, 1.55],
+            [22.0, 5.2, 1.60],
+            [30.5, 5.0, 1.60],
+            [31.5, 11.0, 1.55],
+            [29.5, 15.2, 1.60],
+            [21.0, 14.2, 1.60],
+            [18.0, 10.6, 1.60],
+            [14.0, 14.3, 1.60],
+            [6.0, 14.6, 1.55],
+            [4.6, 10.0, 1.60],
+        ]
+    ),
+    speed=1.0,
+    corner=0.9,
+    turn=0.9,
+    glance=0.5,
+    pitch=-0.03,
+)
+
+
+def build_hall(seed: int) -> Scene:
+    """Build two rows of columns, a gallery on the north side, windows high up, and islands of seats and kiosks."""
+    b = RoomBuilder(seed)
+    floor, ceiling = Look("terrazzo", 2.4, detail=0.07), Look("metal", 2.5, detail=0.06)
+    b.floor_and_ceiling((0, 0), _HALL_SIZE, _HALL_HEIGHT, floor, ceiling)
+    for side, (start, end) in enumerate(sides_of(_HALL_SIZE)):
+        b.wall(start, end, _HALL_HEIGHT, BRICK if side == 2 else _CONCRETE)
+        _dress_hall(b, start, end, b.skirting(start, end, 0.15, 0.02), side)
+    for x in np.arange(6.0, 31.0, 6.0):
+        for y in (7.6, 16.6):
+            b.cylinder((x, y, 0), 0.38, _HALL_HEIGHT, _CONCRETE)
+            b.cylinder((x, y, 0), 0.50, 0.35, Look("terrazzo", 1.2))
+        b.beam((x, 0, 7.5), (x, _HALL_SIZE[1], 7.5), (0.35, 0.6), METAL)
+    _gallery(b)
+    _islands(b)
+    for x in np.arange(3.0, 36.0, 6.0):
+        for y in (4.0, 11.0, 18.0):
+            b.lamp_panel(float(x), y, _HALL_HEIGHT, (1.8, 1.8), power=34.0, reach=14.0)
+    return finish(b, "hall", ambient=0.36, exposure=0.62, texel=0.30)
+
+
+def _dress_hall(b: RoomBuilder, start: Vector, end: Vector, length: float, side: int) -> None:
+    """Add high windows, banners, and doors and posters at eye level."""
+    number = 20 * side
+    for along in np.arange(3.0, length - 1.5, 6.0):
+        look = Look(f"window:{number % 4}", None, emission=0.9)
+        b.hang(start, end, float(along), 4.6, (2.6, 2.8), look, 0.06, METAL)
+        banner = Look(f"poster:{40 + number % 6}", None)
+        if side != 1:
+            b.hang(start, end, float(along) + 3.0, 3.6, (1.3, 3.2), banner, 0.03)
+        number += 1
+    along = 1.8
+    while along < length - 1.2:
+        kind = b.rng.choice(["door", "poster", "painting", "board", "sign"])
+        look = Look(f"{kind}:{int(b.rng.integers(0, 5))}", None)
+        if kind == "door":
+            b.hang(start, end, along, 0.0, (1.0, 2.1), look, 0.06, WOOD)
+        else:
+            size = (0.5, 0.35) if kind == "sign" else (1.2, 1.5)
+            b.hang(start, end, along, 1.1 if kind != "sign" else 1.7, size, look, 0.03)
+        along += float(b.rng.uniform(2.0, 3.4))
+
+
+def _gallery(b: RoomBuilder) -> None:
+    """Add a slab at 3.6 m along the north side with its railing."""
+    sx, sy = _HALL_SIZE
+    b.box((0.5 * sx, sy - 2.0, 3.5), (sx, 4.0, 0.35), _CONCRETE, top=Look("terrazzo", 2.4))
+    b.railing((0.1, sy - 3.9, 3.85), (sx - 0.1, sy - 3.9, 3.85), 1.1, METAL, 1.5)
+
+
+def _islands(b: RoomBuilder) -> None:
+    for index, (x, y) in enumerate(((10.0, 9.6), (25.5, 9.2), (17.8, 6.9), (24.0, 17.6), (9.0, 18.5), (33.5, 17.5))):
+        b.kiosk((x, y), 0.3 * index, 50 + 2 * index % 8)
+    for index, x in enumerate((9.0, 15.0, 21.0, 27.0)):
+        b.bench((x, 1.2), np.pi)
+        b.bench((x + 1.0, 17.0), 0.0)
+        b.plant((x + 2.0, 1.0), 1.6 + 0.1 * index)
+    for x, y, yaw in ((12.4, 11.4, 0.5), (22.6, 11.2, -0.7), (26.5, 11.8, 2.4)):
+        b.sofa((x, y), yaw, (0.35, 0.12, 0.10), 2.2)
+        b.plant((x + 1.6, y + 0.6), 1.5)
+    b.box((1.8, 16.0, 0), (0.9, 4.0, 1.1), WOOD, top=Look("terrazzo", 1.5))
+    b.box((2.28, 16.0, 0.2), (3.2, 0.02, 0.7), DARK, 0.5 * np.pi, front=Look("painting:9", None))

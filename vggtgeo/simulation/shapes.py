@@ -33,7 +33,6 @@ class Look:
     emission: float = 0.0
 
     def tinted(self, red: float, green: float, blue: float) -> Look:
-        """Return the same look in another tint."""
         return replace(self, tint=(red, green, blue))
 
 

@@ -20,8 +20,7 @@ from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import pinhole
-from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real, check_whole
+from vggtgeo.io.given import check_whole, check_within
 from vggtgeo.solvers.kernels import AbstractKernel
 
 SIZE = (320, 240)
@@ -149,12 +148,9 @@ def simulate_window(
     for name, value, least in (("keyframes", keyframes, 2), ("points", points, 0), ("lines", lines, 0)):
         check_whole(name, value, least)
     check_whole("seed", seed)
-    errors = {"noise": noise, "outliers": outliers, "depth_error": depth_error, "start_error": start_error}
-    for name, error in errors.items():
-        check_real(name, error)
-        most = 1.0 if name == "outliers" else _MAX_ERROR
-        if not 0 <= error <= most:
-            raise InputError(f"`{name}` is {error}; it must be from 0 to {most:g}")
+    for name, error in (("noise", noise), ("depth_error", depth_error), ("start_error", start_error)):
+        check_within(name, error, 0, _MAX_ERROR)
+    check_within("outliers", outliers, 0, 1)
     rng = np.random.default_rng(seed)
     poses = _arc(keyframes)
     host = np.repeat(np.arange(keyframes), points)

@@ -68,7 +68,6 @@ class HandheldMotion:
         return cls(path, step, walk.speed, _waves(np.random.default_rng([seed, 17])))
 
     def at_speed(self, speed: float) -> Self:
-        """Return the same walk at `speed` metres a second."""
         return replace(self, speed=speed)
 
     @property

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmark_modules import benchmark
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
-from vggtgeo.simulation.repeated_corridor import SECTION, repeated_corridor
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import LOOP_GATE
@@ -21,6 +21,8 @@ from vggtgeo.slam.sparse_map.map import loop_edges
 from vggtgeo.slam.tracking.fusion import with_systematic
 from vggtgeo.slam.tracking.odometry import Odometry
 from vggtgeo.slam.window_steps import merge_pending_window
+
+corridor = benchmark("repeated_corridor")
 
 STEP, SIDE = 0.2, 50
 """Metres between keyframes, and keyframes along each side of the corridor."""
@@ -72,7 +74,7 @@ def test_true_loops_stay_and_false_ones_that_agree_go(seed: int, bias: float) ->
     ones, also where its errors are all alike and larger than stated. Oracle: which loops are true.
     """
     rng, true = np.random.default_rng(seed), _there_and_back()
-    section = round(SECTION / STEP)
+    section = round(corridor.SECTION / STEP)
     loops = _loops(rng, true, range(6), 2 * SIDE)
     # A keyframe one section further looks as if it stood a section back.
     for row in range(section, SIDE):
@@ -115,7 +117,7 @@ def test_submaps_are_joined_by_the_larger_cluster() -> None:
     """
     rng, true = np.random.default_rng(0), _there_and_back()
     motions = [motion for motion in _odometry(rng, true, 0.0) if motion.second != 2 * SIDE]
-    wrong, right = _loops(rng, true, range(3), 2 * SIDE, SECTION), _loops(rng, true, range(6), 2 * SIDE)
+    wrong, right = _loops(rng, true, range(3), 2 * SIDE, corridor.SECTION), _loops(rng, true, range(6), 2 * SIDE)
     kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(3, 9)), np.flatnonzero(kept)
     assert not consistent_loops(right[:1], motions, LOOP_GATE).any()
@@ -171,7 +173,7 @@ def test_a_rendered_corridor_of_equal_sections_is_not_folded() -> None:
     """
     # The window of test_pipeline.py, so that it is compiled once. With all loops of this walk the map is 95 cm off.
     settings = SlamSettings(window=WindowSettings(size=4, point_slots=96, line_slots=48))
-    sequence = repeated_corridor(0, 2, returns=True)
+    sequence = corridor.repeated_corridor(0, 2, returns=True)
     roles, truth = default_roles(has_depth=True), sequence.ground_truth()
     before = merge_pending_window(list(run_frames(sequence.frames(), sequence.camera, roles, settings, Clock()))[-1])
     after = finish(before, roles, settings)
@@ -180,5 +182,5 @@ def test_a_rendered_corridor_of_equal_sections_is_not_folded() -> None:
     assert error(after) < 2 * error(before), f"{100 * error(before):.2f} -> {100 * error(after):.2f} cm"
     edges = loop_edges(after.map, settings.window.size)
     places = np.array([rigid.centre(sequence.pose(keyframe.frame)) for keyframe in after.keyframes])
-    assert all(np.linalg.norm(places[first] - places[second]) < 0.5 * SECTION for first, second in edges)
+    assert all(np.linalg.norm(places[first] - places[second]) < 0.5 * corridor.SECTION for first, second in edges)
     assert edges

@@ -9,6 +9,7 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 import pytest
+from benchmark_modules import benchmark
 from degenerate_scenes import packed, without_matches_of
 from recorded_run import recorded_run
 from reported import pattern
@@ -17,12 +18,13 @@ from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
-from vggtgeo.simulation.loop import simulate_loop
 from vggtgeo.slam.global_map import global_adjustment, pose_uncertainty
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma, sparse_worst
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.tracking.evidence import tangent
+
+loop = benchmark("simulated_loop")
 
 
 def test_keyframes_have_the_deviations_of_their_covariances() -> None:
@@ -57,7 +59,7 @@ def test_a_sparse_factor_gives_the_same_deviations() -> None:
     """Of a ring of keyframes with surfaces, whose information has no band, and of one that is held; oracle: the
     covariances by a dense matrix.
     """
-    window, surfaces = simulate_loop(30, points=10, reach=2)
+    window, surfaces = loop.simulate_loop(30, points=10, reach=2)
     problem, state, _ = window.pack(terms=(surfaces,))
     known = vg.covariances(problem, state)
     asked = np.array([0, 3, 16, 29])
@@ -74,7 +76,7 @@ def test_a_sparse_factor_gives_the_same_deviations() -> None:
 
 def test_a_large_graph_without_a_band_is_asked_in_places(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keyframes between those that are asked get what lies between them. Oracle: the dense covariances."""
-    window, surfaces = simulate_loop(30, points=10, reach=2)
+    window, surfaces = loop.simulate_loop(30, points=10, reach=2)
     problem, state, _ = window.pack(terms=(surfaces,))
     exact = keyframe_sigma(problem, state, 30)
     monkeypatch.setattr(pose_uncertainty, "DENSE_KEYFRAMES", 20)

@@ -7,13 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from benchmark_modules import benchmark
 from recorded_run import recorded_run
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.simulation.degradations import in_bands_of_light
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 
 
@@ -35,7 +35,7 @@ def test_corners_are_followed_through_bands_of_light(turned: bool) -> None:
     turn = lambda image: np.ascontiguousarray(np.rot90(image)) if turned else image
     frames = []
     for number, frame in enumerate(recorded_run().frames[:4]):
-        image = in_bands_of_light(frame.image, number, share=0.3, period=50, speed=40)
+        image = benchmark("camera_errors").in_bands_of_light(frame.image, number, share=0.3, period=50, speed=40)
         frames.append(replace(frame, image=turn(image), depth=turn(frame.depth)))
     recorder = recorded(frames)
     if turned:  # to where they were before: `rot90` puts column c of row r at row W - 1 - c, column r

@@ -23,6 +23,7 @@ from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
 from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.readable import Readable
 from vggtgeo.bundle.residuals import count_rows
 from vggtgeo.bundle.terms.node import CameraTerm, NodeTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
@@ -30,7 +31,6 @@ from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, real_numbers
-from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.flat_directions import flat_stiffness

@@ -9,7 +9,7 @@ from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import residuals_at
-from vggtgeo.io.kept_program import KeptProgram
+from vggtgeo.compilation.program_cache import CachedProgram
 
 CHANCE = 1e-3
 """Significance level of the test."""
@@ -21,7 +21,7 @@ def _energies(problem: Problem, state: State) -> Float[Array, "e p"]:
     return problem.points.kernel.rho(problem.points.weight * jnp.sum(residual**2, -1)) / 2
 
 
-_energies_jit = KeptProgram(_energies, lambda problem, state: problem.points.weight)
+_energies_jit = CachedProgram(_energies, lambda problem, state: problem.points.weight)
 
 
 def gain(

@@ -35,9 +35,9 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.relative_pose import RelativePose
+from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import POSE_GATE
-from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.global_map.global_shape import padded_count
 from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, relative_pose_rows
 from vggtgeo.slam.tracking.evidence import STEP_GROWTH, tangent
@@ -69,7 +69,7 @@ def _solve_graph(problem: Problem, initial: State, solver: SchurLevenbergMarquar
     return solve(problem, initial, solver=solver, graduation=GRADUATION, diagnosis=False)
 
 
-solve_graph_jit = KeptProgram(_solve_graph, partial(solution_like, diagnosis=False))
+solve_graph_jit = CachedProgram(_solve_graph, partial(solution_like, diagnosis=False))
 
 
 class LoopClosure(RelativePose):

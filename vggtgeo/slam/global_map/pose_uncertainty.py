@@ -20,8 +20,8 @@ from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
+from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie, rigid
-from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
@@ -215,4 +215,4 @@ def _largest_variance(blocks: Float[Array, "h 3 3"]) -> Float[Array, " h"]:
     return jnp.where(known, largest, jnp.inf)
 
 
-sigma_jit = KeptProgram(_sigma, lambda problem, state, solver, asked: (asked, asked))
+sigma_jit = CachedProgram(_sigma, lambda problem, state, solver, asked: (asked, asked))

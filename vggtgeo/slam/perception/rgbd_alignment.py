@@ -22,10 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
-from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.perception.rgbd_view import LEVELS, Points, RgbdView
 from vggtgeo.slam.precision import in_double_precision
 
@@ -245,7 +245,7 @@ def _nothing() -> _Terms:
     return _Terms(nothing, nothing, jnp.float32(0))
 
 
-_align: KeptProgram[tuple[jax.Array, jax.Array, _Terms]] = KeptProgram(
+_align: CachedProgram[tuple[jax.Array, jax.Array, _Terms]] = CachedProgram(
     _aligned, lambda source, target, start, *settings: (start, start, _nothing())
 )
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from vggtgeo.datasets.check import PLAUSIBLE
+from vggtgeo.datasets.check import PLAUSIBLE_MEDIAN_DEPTH
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.models.onnx.bounds import Refusals
@@ -173,7 +173,7 @@ def check_unit(claim: Claim, corners: CornerTracks) -> list[Finding]:
     if not claim.metric or not len(depths):
         return []
     near, middle = np.quantile(depths, [0.1, 0.5])
-    if near >= thresholds.MIN_SENSOR_DEPTH and PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
+    if near >= thresholds.MIN_SENSOR_DEPTH and PLAUSIBLE_MEDIAN_DEPTH[0] <= middle <= PLAUSIBLE_MEDIAN_DEPTH[1]:
         return []
     text = (
         f"lengths may not be metres: the median depth of the corners is {middle:.2g} m, and a tenth of them is within "

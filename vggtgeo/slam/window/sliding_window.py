@@ -19,8 +19,8 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import rigid
-from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
@@ -80,7 +80,7 @@ def _solve(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) ->
     return solve(problem, initial, solver=solver, diagnosis=False)
 
 
-solve_jit = KeptProgram(_solve, partial(solution_like, diagnosis=False))
+solve_jit = CachedProgram(_solve, partial(solution_like, diagnosis=False))
 
 
 def window_size(settings: SlamSettings) -> PaddedSize:

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import vggtgeo as vg
-from vggtgeo.io import kept_program
-from vggtgeo.io.kept_program import KeptProgram
+from vggtgeo.compilation import program_cache
+from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.slam.window.sliding_window import solve_jit
 
 TRACED: list[str] = []
@@ -41,8 +41,8 @@ def _as_pair(first: jax.Array, second: jax.Array, factor: float) -> Pair:
 def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Where programs are kept, of this module, too."""
     place = tmp_path / "programs"
-    monkeypatch.setattr(kept_program, "_folder", lambda: place)
-    monkeypatch.setattr(kept_program, "LASTING", (*kept_program.LASTING, __name__.split(".")[0]))
+    monkeypatch.setattr(program_cache, "_folder", lambda: place)
+    monkeypatch.setattr(program_cache, "LASTING", (*program_cache.LASTING, __name__.split(".")[0]))
     TRACED.clear()
     return place
 
@@ -57,14 +57,14 @@ def _expected(found: Pair, factor: float) -> None:
 
 def test_another_process_traces_nothing(folder: Path) -> None:
     """A second program object is a second process: it reads what the first wrote; oracle: NumPy, and a count."""
-    _expected(KeptProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
-    _expected(KeptProgram(pair, _as_pair)(jnp.asarray(ONE), jnp.asarray(TWO), 3.0), 3.0)
+    _expected(CachedProgram(pair, _as_pair)(ONE, TWO, 3.0), 3.0)
+    _expected(CachedProgram(pair, _as_pair)(jnp.asarray(ONE), jnp.asarray(TWO), 3.0), 3.0)
     assert TRACED == ["pair"]
     assert len(list(folder.iterdir())) == 1
 
 
 def test_shapes_and_static_parts_have_programs_of_their_own(folder: Path) -> None:
-    program = KeptProgram(pair, _as_pair)
+    program = CachedProgram(pair, _as_pair)
     for factor in (3.0, 4.0, 3.0):
         _expected(program(ONE, TWO, factor), factor)
     assert program(np.ones(2), np.ones(2), 3.0).sum.shape == (2,)
@@ -78,7 +78,7 @@ def test_a_program_takes_what_a_program_returned(folder: Path) -> None:
     """
     compiled: list[str] = []
     count = lambda name, seconds, **_: compiled.append(name) if "backend_compile" in name else None
-    program = KeptProgram(pair, _as_pair)
+    program = CachedProgram(pair, _as_pair)
     first = program(jnp.asarray(ONE), jnp.asarray(TWO), 3.0)
     jax.monitoring.register_event_duration_secs_listener(count)
     try:
@@ -92,10 +92,10 @@ def test_a_program_takes_what_a_program_returned(folder: Path) -> None:
 ELSEWHERE = """
 import jax, numpy as np
 jax.config.update("jax_num_cpu_devices", 2)
-import test_kept_program as own
-from vggtgeo.io import kept_program
-kept_program.LASTING = (*kept_program.LASTING, "test_kept_program")
-program = kept_program.KeptProgram(own.pair, own._as_pair)
+import test_program_cache as own
+from vggtgeo.compilation import program_cache
+program_cache.LASTING = (*program_cache.LASTING, "test_program_cache")
+program = program_cache.CachedProgram(own.pair, own._as_pair)
 for device in (*jax.devices(), jax.devices()[0]):
     found = program(jax.device_put(own.ONE, device), jax.device_put(own.TWO, device), 3.0)
     assert found.sum.devices() == {device}, found.sum.devices()
@@ -115,15 +115,15 @@ def test_arrays_on_another_device_stay_there(tmp_path: Path) -> None:
 
 
 def test_changed_sources_have_another_program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    KeptProgram(pair, _as_pair)(ONE, TWO, 3.0)
-    monkeypatch.setattr(kept_program, "_sources", lambda: "changed")
-    KeptProgram(pair, _as_pair)(ONE, TWO, 3.0)
+    CachedProgram(pair, _as_pair)(ONE, TWO, 3.0)
+    monkeypatch.setattr(program_cache, "_sources", lambda: "changed")
+    CachedProgram(pair, _as_pair)(ONE, TWO, 3.0)
     assert TRACED == ["pair", "pair"]
     assert len(list(folder.iterdir())) == 2
 
 
 def test_traced_arguments_pass_through(folder: Path) -> None:
-    program = KeptProgram(pair, _as_pair)
+    program = CachedProgram(pair, _as_pair)
     slope = jax.grad(lambda first: jnp.sum(program(first, jnp.asarray(TWO), 3.0).scaled))(jnp.asarray(ONE))
     np.testing.assert_array_equal(slope, np.full(3, 3.0))
     assert not folder.exists()
@@ -131,10 +131,10 @@ def test_traced_arguments_pass_through(folder: Path) -> None:
 
 def test_without_a_cache_nothing_is_kept() -> None:
     """JAX's own switches decide: its folder, and whether it keeps anything."""
-    assert kept_program._folder() == Path(jax.config.jax_compilation_cache_dir) / "programs"
+    assert program_cache._folder() == Path(jax.config.jax_compilation_cache_dir) / "programs"
     jax.config.update("jax_enable_compilation_cache", False)
     try:
-        assert kept_program._folder() is None
+        assert program_cache._folder() is None
     finally:
         jax.config.update("jax_enable_compilation_cache", True)
 
@@ -146,7 +146,7 @@ def test_a_kept_solve_is_the_solve(folder: Path) -> None:
     problem, initial, _ = window.pack()
     solver = vg.SchurLevenbergMarquardt(max_iterations=8, record_iterations=True)
     for _ in range(2):
-        found = KeptProgram(solve_jit._function, solve_jit._result)(problem, initial, solver)
+        found = CachedProgram(solve_jit._function, solve_jit._result)(problem, initial, solver)
     assert len(list(folder.iterdir())) == 1
     expected = jax.jit(lambda p, i: vg.solve(p, i, solver=solver, diagnosis=False))(problem, initial)
     assert jax.tree.structure(found) == jax.tree.structure(expected)

@@ -36,7 +36,7 @@ LASTING = ("vggtgeo", "optimistix", "equinox", "lineax", "jaxlie", "jax", "numpy
 VERSIONS = ("optimistix", "equinox", "lineax", "jaxlie", "jax", "jaxlib", "numpy")
 
 
-class KeptProgram(Generic[_Result]):
+class CachedProgram(Generic[_Result]):
     """A pure function of pytrees, compiled for each structure and shape it is called with.
 
     Falls back on `equinox.filter_jit` for traced arguments, for arrays on other devices than the first CPU, and where
@@ -63,7 +63,7 @@ class KeptProgram(Generic[_Result]):
             program = self._programs.setdefault(key, _Program())
         with program.lock:  # one thread prepares, others with the same key wait
             if program.call is None:
-                program.call = self._kept(args) or self._plain
+                program.call = self._cached(args) or self._plain
         return program.call(*args)
 
     @property
@@ -71,7 +71,7 @@ class KeptProgram(Generic[_Result]):
         """Return the number of structures and shapes of the calls so far."""
         return len(self._programs)
 
-    def _kept(self, args: tuple[Any, ...]) -> Callable[..., _Result] | None:
+    def _cached(self, args: tuple[Any, ...]) -> Callable[..., _Result] | None:
         """Return a call of the cached program for such arguments; None if there is none and it cannot be cached."""
         folder, named = _folder(), _lasting_name((self._function, args))
         if folder is None or named is None:

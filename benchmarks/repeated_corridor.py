@@ -10,8 +10,7 @@ import numpy as np
 
 from vggtgeo.simulation.furniture import RoomBuilder
 from vggtgeo.simulation.scene import Scene, finish
-from vggtgeo.simulation.sensor import Sensor
-from vggtgeo.simulation.sequence import SyntheticSequence, camera_of
+from vggtgeo.simulation.sequence import Sensor, SyntheticSequence, camera_of
 from vggtgeo.simulation.shapes import Look, Vector
 from vggtgeo.simulation.trajectories import HandheldMotion, Walk
 
@@ -37,7 +36,7 @@ def repeated_corridor(
         size: (width, height) of the images, pixels.
 
     Example:
-        >>> from vggtgeo.simulation.repeated_corridor import repeated_corridor
+        >>> from repeated_corridor import repeated_corridor
         >>> sequence = repeated_corridor(sections=2, size=(32, 24))
         >>> next(sequence.frames()).image.shape
         (24, 32, 3)

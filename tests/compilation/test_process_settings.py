@@ -1,9 +1,10 @@
-"""What a call of the library sets for its process, and takes back."""
+"""What a program or a call of the library sets for its process, and takes back."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 
 import jax
@@ -13,8 +14,9 @@ from jax.experimental.compilation_cache import compilation_cache
 from reported import raises
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from vggtgeo.io import process_settings
-from vggtgeo.io.process_settings import ENABLED, FOLDER, SHORTEST, program_settings
+from vggtgeo.compilation import process_settings
+from vggtgeo.compilation.jax_environment import jax_environment
+from vggtgeo.compilation.process_settings import ENABLED, FOLDER, SHORTEST, program_settings
 
 
 @pytest.fixture
@@ -89,10 +91,19 @@ def test_matrix_products_take_one_thread(
 def test_a_process_that_was_forked_from_one_that_computed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     # Proves that a run in such a process is an error with what to do, where it waited for ever for threads that a fork
     # leaves behind. Oracle: a set that holds the number of another process, as a forked one finds it.
-    monkeypatch.setattr(process_settings, "_been_here", {os.getpid() + 1})
+    monkeypatch.setattr(process_settings, "_processes", {os.getpid() + 1})
     with raises("forked", "spawn"), program_settings():
         pass
-    monkeypatch.setattr(process_settings, "_been_here", set())
+    monkeypatch.setattr(process_settings, "_processes", set())
     for _ in range(2):
         with program_settings():
             pass
+
+
+@pytest.mark.parametrize(
+    ("version", "is_set"), [("0.8.0", True), ("0.10.2", True), ("0.11.0", False), ("1.0.0", False)]
+)
+def test_the_flag_is_set_for_versions_that_know_it(monkeypatch: pytest.MonkeyPatch, version: str, is_set: bool) -> None:
+    """Later versions of jaxlib end a process that sets the flag; oracle: the first version without it, 0.11."""
+    monkeypatch.setattr(metadata, "version", lambda name: version)
+    assert ("XLA_FLAGS" in jax_environment()) == is_set

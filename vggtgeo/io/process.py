@@ -1,13 +1,14 @@
-"""Ctrl-C, SIGTERM and SIGHUP as a request to stop that never leaves partial results.
+"""The own process: signals as a request to stop that never leaves partial results, and its peak memory.
 
 An exception of a signal handler may be raised anywhere: between two files of one result, or inside a callback of a
-compiled library, which drops it. Where something must be completed, the first signal is only recorded; the second
-raises KeyboardInterrupt.
+compiled library, which drops it. Where something must be completed, the first Ctrl-C, SIGTERM or SIGHUP is only
+recorded; the second raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -89,3 +90,19 @@ def interruption() -> Iterator[Interruption]:
 def _signals() -> list[signal.Signals]:
     """Return the signals that this system has."""
     return [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+
+
+def peak_memory_gb() -> float:
+    """Return the largest resident memory so far, GiB."""
+    if sys.platform == "win32":
+        import psutil  # of all systems, but slow to import
+
+        return float(psutil.Process().memory_info().peak_wset) / 2**30
+    import resource  # POSIX only
+
+    return rusage_gb(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
+def rusage_gb(maxrss: int) -> float:
+    """Convert `ru_maxrss`, which is bytes on macOS and KiB elsewhere, to GiB."""
+    return maxrss / 2**30 if sys.platform == "darwin" else maxrss / 2**20

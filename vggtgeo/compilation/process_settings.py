@@ -10,13 +10,13 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 from threadpoolctl import threadpool_limits
 
+from vggtgeo.compilation.jax_environment import SHORTEST_CACHED_COMPILATION, cache_folder
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.jax_environment import SHORTEST_CACHED_COMPILATION, cache_folder
 
 FOLDER = "jax_compilation_cache_dir"
 SHORTEST = "jax_persistent_cache_min_compile_time_secs"
 ENABLED = "jax_enable_compilation_cache"
-_been_here: set[int] = set()
+_processes: set[int] = set()
 """Ids of the processes that entered `program_settings`, parents of a fork included."""
 
 
@@ -27,40 +27,36 @@ def program_settings() -> Iterator[None]:
     settings are as before.
 
     Raises:
-        InputError: this process was forked from one that was in this block.
+        InputError: this process was forked from one that was in this block: it lacks JAX's threads, and would wait for
+            them forever.
 
     """
-    _check_not_forked()
-    with _code_kept(), threadpool_limits(None if "OPENBLAS_NUM_THREADS" in os.environ else 1, "blas"):
-        yield
-
-
-def _check_not_forked() -> None:
-    """Raise InputError in a forked process: it lacks JAX's threads, and would wait for them forever."""
-    _been_here.add(os.getpid())
-    if len(_been_here) > 1:
+    _processes.add(os.getpid())
+    if len(_processes) > 1:
         raise InputError(
             "this process was forked from one that uses JAX, and would wait forever for its threads; start new "
             'processes: `multiprocessing.get_context("spawn")`, or `mp_context` of a `ProcessPoolExecutor`'
         )
+    with _compilation_cache(), threadpool_limits(None if "OPENBLAS_NUM_THREADS" in os.environ else 1, "blas"):
+        yield
 
 
 @contextmanager
-def _code_kept() -> Iterator[None]:
+def _compilation_cache() -> Iterator[None]:
     folder = cache_folder()
-    decided = getattr(jax.config, FOLDER) is not None or not getattr(jax.config, ENABLED)
-    if decided or folder is None:
+    chosen = getattr(jax.config, FOLDER) is not None or not getattr(jax.config, ENABLED)
+    if chosen or folder is None:
         yield
         return
     before = getattr(jax.config, SHORTEST)
-    _keep_in(str(folder), SHORTEST_CACHED_COMPILATION)
+    _set_cache(str(folder), SHORTEST_CACHED_COMPILATION)
     try:
         yield
     finally:
-        _keep_in(None, before)
+        _set_cache(None, before)
 
 
-def _keep_in(folder: str | None, shortest: float) -> None:
+def _set_cache(folder: str | None, shortest: float) -> None:
     jax.config.update(FOLDER, folder)
     jax.config.update(SHORTEST, shortest)
     compilation_cache.reset_cache()  # JAX decides once whether there is a cache, and with which folder

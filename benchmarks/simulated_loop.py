@@ -48,7 +48,7 @@ def simulate_loop(
         drift: turn of the guess over the whole loop, radians.
 
     Example:
-        >>> from vggtgeo.simulation.loop import simulate_loop
+        >>> from simulated_loop import simulate_loop
         >>> window, surfaces = simulate_loop(30, points=10, reach=2)
         >>> problem, initial, _ = window.pack(terms=(surfaces,))
         >>> len(problem.edges.source), len(surfaces.first)
