@@ -38,26 +38,19 @@ _LINEAR_BELOW, _SLOPE, _OFFSET, _GAMMA = 0.04045, 12.92, 0.055, 2.4
 """Of the transfer function of sRGB."""
 
 
-class EmptyRunError(InputError):
-    """The run lacks the data that a format needs, for example points."""
-
-
 def cloud_of(source: Path) -> PointCloud:
-    """Load the cloud of the run in `source`; raise EmptyRunError if it has no points."""
-    file = source / "map.ply"
-    if not file.is_file():
-        raise InputError(f"`{file}` does not exist; give a folder that `vggtgeo run` wrote")
-    cloud = PointCloud.load_ply(file)
+    """Load the cloud of the run in `source`; raise InputError if it has no points."""
+    cloud = PointCloud.load_ply(source / "map.ply")
     if not len(cloud):
-        raise EmptyRunError(f"`{file}` has no points")
+        raise InputError(f"`{source / 'map.ply'}` has no points")
     return cloud
 
 
 def mesh_of(source: Path) -> Mesh:
-    """Load the mesh of the run in `source`; raise EmptyRunError if it has none."""
+    """Load the mesh of the run in `source`; raise InputError if it has none."""
     file = source / "mesh.ply"
     if not file.is_file():
-        raise EmptyRunError(
+        raise InputError(
             f"`{file}` does not exist, the run has no mesh; run again with `--dense auto` or `--dense mvs`, or export "
             "the points with `--to ply`"
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,10 @@ from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.given import check_kind, path_of
 from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.result import Result
-from vggtgeo.results.summary import warn_if_truncated
 
 
 def read(path: str | os.PathLike[str]) -> Result | Sequence:
@@ -72,14 +70,13 @@ def evaluate(
 
 
 def load_estimate(path: Path, truth: Trajectory) -> Trajectory:
-    """Load the trajectory of a file, or of a run's folder; warn if the run is unfinished, or the file truncated.
+    """Load the trajectory of a file, or of a run's folder; warn if the run is unfinished.
 
     truth: gives the times of poses without times.
     """
     if unfinished := unfinished_message(path):
-        warnings.warn(unfinished, InputWarning, stacklevel=2)
-    file = path / "trajectory.txt" if path.is_dir() else path
-    return warn_if_truncated(file, load_trajectory(file, truth))
+        warn(unfinished)
+    return load_trajectory(path / "trajectory.txt" if path.is_dir() else path, truth)
 
 
 def truth_of(sequence: Sequence) -> Trajectory:

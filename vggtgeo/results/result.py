@@ -29,7 +29,7 @@ from vggtgeo.results.files import read_uncertainty, write_depth, write_settings,
 from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
 from vggtgeo.results.scene import depth_of_frames, write_scene
-from vggtgeo.results.summary import add_writing_time, compare_with_truth, load_poses, read_summary, summarise
+from vggtgeo.results.summary import add_writing_time, compare_with_truth, read_summary, summarise
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import merge_pending_window
@@ -131,8 +131,8 @@ class Result:
         summary, verdict = read_summary(place)
         fx, fy, cx, cy = summary["intrinsics"].values()
         return cls(
-            load_poses(place, "trajectory.txt"),
-            load_poses(place, "keyframes.txt"),
+            Trajectory.load_tum(place / "trajectory.txt"),
+            Trajectory.load_tum(place / "keyframes.txt"),
             PointCloud.load_ply(place / "map.ply"),
             (fx, fy, cx, cy),
             verdict.metric,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +16,7 @@ from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.peak_memory import peak_memory_gb
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import submap_file
@@ -39,7 +38,7 @@ def compare_with_truth(slam: Slam, truth: Trajectory | None) -> TrajectoryReport
     try:
         return evaluate_trajectory(estimate, truth)
     except InputError as error:
-        warnings.warn(f"the ground truth is not evaluated: {error}", InputWarning, stacklevel=2)
+        warn(f"the ground truth is not evaluated: {error}")
         return None
 
 
@@ -69,7 +68,7 @@ def summarise(
     truth_in_metres: whether lengths of the ground truth are metres; written as `in_metres` beside the errors.
     """
     tracked = sum(record.tracked for record in slam.frames)
-    values = {
+    values: dict[str, Any] = {
         "verdict": verdict.to_dict(),
         "settings": dict(settings),
         "versions": versions(),
@@ -178,32 +177,3 @@ def describe_error(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"`{error.args[0]}` is missing"
     return "an entry has the wrong type" if isinstance(error, TypeError | AttributeError) else str(error)
-
-
-POSES = {"trajectory.txt": "poses", "keyframes.txt": "keyframes"}
-"""Pose files of a run's folder, and the summary's key for the number of poses in the largest submap."""
-
-
-def load_poses(folder: Path, name: str) -> Trajectory:
-    """Load one of the files of `POSES`; raise InputError if it is invalid, warn as `warn_if_truncated`."""
-    return warn_if_truncated(folder / name, Trajectory.load_tum(folder / name))
-
-
-def warn_if_truncated(file: Path, poses: Trajectory) -> Trajectory:
-    """Return `poses`; warn if the summary beside `file` states another number of them.
-
-    A file cut off at the end of a line is still valid: only the number of poses shows it.
-    """
-    try:
-        largest = json.loads(whole_text(file.with_name("summary.json"), errors="strict"))["submaps"][0]
-        count = largest[POSES[file.name]]
-    except (ValueError, LookupError, TypeError):  # not a run's, or without the number
-        return poses
-    if count != len(poses):
-        warnings.warn(
-            f"`{file}` has {len(poses)} poses, expected {count} from `summary.json`: it is truncated or was edited; "
-            "used as it is",
-            InputWarning,
-            stacklevel=3,
-        )
-    return poses

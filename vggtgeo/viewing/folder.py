@@ -11,11 +11,11 @@ import numpy as np
 from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.output_checks import check_can_be_shown
-from vggtgeo.results.summary import load_poses
 from vggtgeo.viewing.entities import Entities
 from vggtgeo.viewing.target import STAND_IN
 
@@ -44,10 +44,10 @@ def log_folder(stream: Any, folder: Path) -> None:
 
     """
     check_can_be_shown(folder)
-    entities, trajectory = Entities(stream), load_poses(folder, "trajectory.txt")
+    entities = Entities(stream)
     entities.axes()
     stream.set_time("frame", sequence=0)
-    entities.path(trajectory, load_poses(folder, "keyframes.txt"))
+    entities.path(*(Trajectory.load_tum(folder / name) for name in ("trajectory.txt", "keyframes.txt")))
     cloud = PointCloud.load_ply(folder / "map.ply")
     entities.cloud("world/map", cloud.points, cloud.colours)
     if (folder / "mesh.ply").is_file():
