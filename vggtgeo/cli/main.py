@@ -19,12 +19,11 @@ import typer
 from typer.core import TyperGroup
 
 from vggtgeo.cli.bench import bench
-from vggtgeo.cli.data import data
+from vggtgeo.cli.data import data, simulate
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.cli.models import models
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
-from vggtgeo.cli.run import demo, run
-from vggtgeo.cli.simulate import simulate, warm_up
+from vggtgeo.cli.run import demo, run, warm_up
 from vggtgeo.cli.solve import solve
 from vggtgeo.cli.view import export, view
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one_line

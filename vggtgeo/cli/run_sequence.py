@@ -24,7 +24,7 @@ from vggtgeo.io.network_files import as_input_errors
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
-from vggtgeo.results.output_checks import EXPORTS, SUMMARY
+from vggtgeo.results.output_checks import EXPORTS, SUMMARY, is_in_results
 from vggtgeo.results.reconstruction import reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
@@ -36,7 +36,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
-from vggtgeo.viewing.target import STAND_IN, open_target
+from vggtgeo.viewing.target import STAND_IN, check_target, open_target
 
 EARLY_SECONDS = 60.0
 """Between two writings of the poses so far, which take less than a second for 20,000 frames."""
@@ -160,8 +160,11 @@ def _rerun_callbacks(
     """
     if target is None:
         return (), None
-    if target not in ("spawn", "serve") and whole_path(Path(target).parent) == whole_path(folder.folder):
-        target = str(folder.stage / Path(target).name)
+    if check_target(target) not in ("spawn", "serve"):
+        if is_in_results(folder.folder, Path(target)):
+            raise InputError(f"`--rerun` is `{target}`, in a folder that the run replaces; give a file beside it")
+        if whole_path(Path(target).parent) == whole_path(folder.folder):
+            target = str(folder.stage / Path(target).name)
     opened = open_target(target, name, folder.stage / STAND_IN)
     if opened.url is not None:
         typer.echo(f"follow the run in a browser: {opened.url}", err=True)
