@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from vggtgeo.benchmark.suite import PROTOCOLS, SequenceTable, SettingTable, Suit
 from vggtgeo.benchmark.table import Row
 from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.datasets.opening import is_readable
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -65,9 +64,6 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
     for sequence in suite.sequence:
         places = sorted(find_sequences(sequence.path, roots) if sequence.path else [], key=unreadable)
         place = next(iter(places), None)
-        if len(places) > 1:
-            text = f"`{sequence.path}` exists {len(places)} times below `data`; `{place}` is taken"
-            warnings.warn(text, InputWarning, stacklevel=2)
         absent = _absent(sequence.path, roots) if place is None else ""
         digest = "" if place is None else input_hash(place)
         settings = [table for table in suite.setting if not table.sequences or sequence.name in table.sequences]

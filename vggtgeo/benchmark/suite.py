@@ -7,6 +7,7 @@ file is read.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 import tomllib
 from collections.abc import Mapping
@@ -46,28 +47,23 @@ class CheckedTable:
     @classmethod
     def read(cls, where: str, values: Any) -> Self:
         """Return the table of plain values; raise InputError with `where` for an unknown key or an invalid value."""
-        known = {entry.name: entry for entry in dataclasses.fields(cls)}
+        types = {entry.name: str(entry.type).removesuffix(" | None") for entry in dataclasses.fields(cls)}
         if not isinstance(values, Mapping):
             raise InputError(f"{where} is {values!r}; it must be a table")
+        try:
+            inspect.signature(cls).bind(**values)
+        except TypeError as error:
+            raise InputError(f"{where}: {error}; its keys are {', '.join(types)}") from None
         for key, value in values.items():
-            if key not in known:
-                raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
-            kinds, inner, words = _KINDS.get(str(known[key].type).removesuffix(" | None"), ((), (), ""))
+            kinds, inner, words = _KINDS.get(types[key], ((), (), ""))
             entries = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
             # The exact type: in Python, `isinstance(True, int)`.
             if kinds and not (type(value) in kinds and all(type(one) in inner for one in entries if inner)):
                 raise InputError(f"{where}: `{key}` is {value!r}; it must be {words}")
-        missing = [f"`{name}`" for name, entry in known.items() if name not in values and _is_required(entry)]
-        if missing:
-            raise InputError(f"{where}: {', '.join(missing)} missing")
         try:
             return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
-
-
-def _is_required(entry: dataclasses.Field[Any]) -> bool:
-    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
 
 
 @dataclass(frozen=True)
@@ -89,8 +85,6 @@ PROTOCOLS: dict[str, Protocol] = {
     "dpvo": Protocol(1, "all", "DPVO: every frame; its own tables print the median of the trials, these the mean"),
     "vggt-slam": Protocol(1, "keyframes", "VGGT-SLAM: keyframes by the flow of the image"),
 }
-
-
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
 
@@ -297,12 +291,9 @@ def load_suite(name: str | Path) -> Suite:
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         try:
-            text = whole_text(path, errors="strict")
-        except ValueError as error:
-            raise InputError(
-                f"`{path}` cannot be read: {error}; give a TOML file or one of {', '.join(shipped())}"
-            ) from None
-        return read_suite(text, path.stem, f"`{path}`")
+            return read_suite(whole_text(path, errors="strict"), path.stem, f"`{path}`")
+        except UnicodeDecodeError as error:
+            raise InputError(f"`{path}` is not a text file: {error}") from None
     if str(name) not in shipped():
         raise InputError(f"`{name}` is neither a TOML file nor a shipped suite: {', '.join(shipped())}")
     text = (files("vggtgeo.benchmark") / "suites" / f"{name}.toml").read_text("utf-8")
@@ -315,11 +306,8 @@ def read_suite(text: str, name: str, where: str) -> Suite:
         values = tomllib.loads(text)
     except ValueError as error:
         raise InputError(f"{where} is not valid TOML: {error}") from None
-    kinds: dict[str, type[CheckedTable]] = {
-        "sequence": SequenceTable,
-        "setting": SettingTable,
-        "external": ExternalTable,
-    }
+    kinds: dict[str, type[CheckedTable]]
+    kinds = {"sequence": SequenceTable, "setting": SettingTable, "external": ExternalTable}
     for key, kind in kinds.items():
         entries = values.get(key, [])
         if not isinstance(entries, list):
