@@ -241,19 +241,29 @@ def run_one(
 ) -> Row:
     """Run one job and return its row."""
     place = store.begin(job)
-    began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    log = place / LOG
-    ending = describe_ending(run_limited(command(place, scratch), log, limits, cores, stop), log.read_bytes())
-    return store.complete(job, **ending, started=began, cpus=len(cores))
+    return store.complete(job, **run_in(place, scratch, limits, cores, command, stop), cpus=len(cores))
 
 
-def describe_ending(ending: Ending, log: bytes) -> dict[str, Any]:
-    """Return the columns on how and where a process ended; their status is used if the run wrote no row."""
+def run_in(
+    place: Path,
+    scratch: Path,
+    limits: Limits,
+    cores: Sequence[int],
+    command: Command,
+    stop: threading.Event | None = None,
+) -> dict[str, Any]:
+    """Run the job in the folder `place`; return the columns on how and where it ended.
+
+    Their status is used if the run wrote no row.
+    """
+    began, log = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), place / LOG
+    ending = run_limited(command(place, scratch), log, limits, cores, stop)
     message, status = ending.message, "crash" if ending.status in ("ended", "killed") else ending.status
     if ending.status == "ended" and ending.code > 0:
-        lines = log[-_TAIL:].decode(errors="replace").split("\n")
+        lines = log.read_bytes()[-_TAIL:].decode(errors="replace").split("\n")
         message += f": {next((line.strip() for line in reversed(lines) if line.strip()), '')}"
     return {
+        "started": began,
         "status": status,
         "message": message,
         "seconds_wall": ending.seconds,

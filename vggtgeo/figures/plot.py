@@ -87,9 +87,7 @@ def check_truth(value: Trajectory, truth: Trajectory | None) -> None:
         associate(value, truth)
 
 
-@plot.register(TrajectoryReport)
-def _errors(value: TrajectoryReport) -> NotebookFigure:
-    return errors_figure(value)
+plot.register(TrajectoryReport, errors_figure)
 
 
 @plot.register(Solution)
@@ -103,6 +101,7 @@ def _energy(value: Solution) -> NotebookFigure:
 def _covariances(
     value: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, *, sigmas: float | None = None
 ) -> NotebookFigure:
+    """Draw the camera centres in the horizontal plane of the first camera, with ellipses, and the true centres."""
     check_single(value.poses, 3)
     check_kind("state", state, State, "a `State`, for example `solution.state`")
     keyframes = len(value.poses)
@@ -116,17 +115,8 @@ def _covariances(
         real_array("truth", truth, (keyframes, 3))
     if sigmas is not None:
         check_positive("sigmas", sigmas, "standard deviations")
-    return _covariance_figure(value, state, truth, sigmas)
-
-
-def _covariance_figure(
-    found: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, sigmas: float | None = None
-) -> NotebookFigure:
-    """Draw the camera centres of `state` in the horizontal plane of the first camera, with ellipses of `sigmas`
-    standard deviations (by default chosen to be visible), and the true centres (world frame) if given.
-    """
     poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
-    blocks = np.asarray(found.poses, np.float64)[:, :3, :3]
+    blocks = np.asarray(value.poses, np.float64)[:, :3, :3]
     turn = poses[0, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)  # from each camera to the first
     known = np.all(np.isfinite(blocks), axis=(1, 2))
     spread = (turn @ np.where(known[:, None, None], blocks, 0.0) @ turn.transpose(0, 2, 1))[:, [0, 2]][:, :, [0, 2]]

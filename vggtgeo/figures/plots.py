@@ -109,15 +109,8 @@ def trajectory_figure(
     if len(estimate) == 0:
         raise InputError("`estimate` has no pose; there is nothing to draw")
     drawn = _align(estimate, truth, keyframes, with_scale or not metres)
-    seen = drawn.truth or drawn.estimate
     in_metres = metres if drawn.error else not with_scale
-    figure = _draw(
-        drawn,
-        view_axes(seen, level_world=drawn.truth is not None),
-        "m" if in_metres else "unit of the truth" if drawn.error else "no unit",
-        width,
-        "seen from the side" + ("" if drawn.truth or _yaws(seen) else "; up is that of the images"),
-    )
+    figure = _draw(drawn, "m" if in_metres else "unit of the truth" if drawn.error else "no unit", width)
     if title is not None:
         figure.suptitle(_title(drawn, title, with_scale, metres), x=0.01, ha="left", fontsize=12, color=INK)
     return figure
@@ -171,8 +164,10 @@ def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
     return up if up @ mean_up >= 0 else -up
 
 
-def _draw(drawn: _Aligned, axes_of_view: np.ndarray, unit: str, width: float, side_title: str) -> NotebookFigure:
-    origin = (drawn.truth or drawn.estimate).positions[0]
+def _draw(drawn: _Aligned, unit: str, width: float) -> NotebookFigure:
+    seen = drawn.truth or drawn.estimate
+    axes_of_view, origin = view_axes(seen, level_world=drawn.truth is not None), seen.positions[0]
+    side_title = "seen from the side" + ("" if drawn.truth or _yaws(seen) else "; up is that of the images")
     everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
     points = (np.concatenate(everything) - origin) @ axes_of_view.T
     low, high = points.min(axis=0), points.max(axis=0)

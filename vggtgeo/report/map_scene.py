@@ -229,10 +229,6 @@ def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> 
     return np.einsum("kij,cj->kci", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
 
 
-_GROWTH = 1.2
-"""Of the cells' edge from one try to the next."""
-
-
 def decimated_cloud(cloud: PointCloud, max_points: int) -> PointCloud:
     """Return a random subset of at most `max_points` points in their old order; equal clouds give equal subsets."""
     if len(cloud) <= max_points:
@@ -252,7 +248,7 @@ def decimated_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     edge = float(np.median(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)))
     cell = max(edge, 1e-9) * np.sqrt(len(mesh.faces) / max_faces)
     while len((found := _clustered(mesh, cell)).faces) > max_faces:
-        cell *= _GROWTH
+        cell *= 1.2
     return found
 
 

@@ -142,7 +142,6 @@ def _view(
 
 
 def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the numbers at the top of the page, each with its name."""
     facts = [
         (f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
         (f"{summary['keyframes']}", "keyframes"),
@@ -213,7 +212,6 @@ def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
 
 
 def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: float) -> dict[str, str | None]:
-    """Return a name, and image, depth and confidence as data URIs."""
     image = figures.picture(keyframe.image, _SAMPLE_WIDTH)
     depth = confidence = None
     if depth_map is not None and np.isfinite(low):
@@ -231,7 +229,6 @@ def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | 
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the settings as text, by name or `group.name`."""
     rows: dict[str, Any] = {}
     for name, value in settings.items():
         rows |= {f"{name}.{key}": own for key, own in value.items()} if isinstance(value, Mapping) else {name: value}

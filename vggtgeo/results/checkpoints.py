@@ -25,7 +25,7 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.output_checks import EVERY, check_checkpoint_path
+from vggtgeo.results.output_checks import EVERY
 from vggtgeo.results.summary import versions
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -64,9 +64,9 @@ class Checkpoints:
 
     def __post_init__(self) -> None:
         path_of("path", self.path)
-        check_real("checkpoint-every", self.every, "seconds, at least 0")
+        check_real("every", self.every)
         if not 0 <= self.every < math.inf:
-            raise InputError(f"`checkpoint-every` must be seconds, at least 0, got {self.every:g}")
+            raise InputError(f"`every` is {self.every:g}; it must be seconds between checkpoints, at least 0")
 
 
 @dataclass(frozen=True)
@@ -143,11 +143,9 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
     """Return the run to resume; None if `asked` does not resume, or the file does not exist.
 
     Raises:
-        InputError: the file is damaged, its run has another identity, or the path is not a file.
+        InputError: the file is damaged, or its run has another identity.
 
     """
-    if asked is not None:
-        check_checkpoint_path(asked.path)
     if asked is None or not asked.resume or not asked.path.is_file():
         return None
     saved = _header(asked.path)["identity"]

@@ -1,10 +1,9 @@
-"""The result of a run: trajectory, map and verdict, from the last state or loaded from a folder."""
+"""The result of a run: trajectory, map and verdict, from the last state or from a folder; its figure and view."""
 
 from __future__ import annotations
 
 import os
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -20,11 +19,11 @@ from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import write_json
 from vggtgeo.io.given import check_kind, check_plain, path_of
 from vggtgeo.mapping.dense import dense_map
-from vggtgeo.report import RunRecord, write_page
+from vggtgeo.report import MapView, Pictured, RunRecord, check_viewer, map_scene, pictured, write_page
 from vggtgeo.results.files import read_uncertainty, write_depth, write_settings, write_trajectories, write_uncertainty
 from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
@@ -35,12 +34,15 @@ from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.pending_window import merge_pending_window
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
 
 DepthChoice = bool | Literal["every"]
 """Which depth images to save: none, those of the keyframes, or those of every frame."""
+NOTEBOOK_POINTS = 150_000
+"""Of a view in a notebook, which keeps it in its file, some 3 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ class Result:
         """Load the folder of `Result.save` or `vggtgeo run`; raise InputError if a file is missing or invalid."""
         place = path_of("folder", folder)
         if unfinished := unfinished_message(place):
-            warnings.warn(unfinished, InputWarning, stacklevel=2)
+            warn(unfinished)
         summary, verdict = read_summary(place)
         fx, fy, cx, cy = summary["intrinsics"].values()
         return cls(
@@ -282,3 +284,51 @@ class Result:
 def _plot(value: Result, truth: Trajectory | None = None) -> NotebookFigure:
     check_truth(value.trajectory, truth)
     return result_figure(value.trajectory, value.keyframes, value.cloud, value.metric, truth)
+
+
+def show(result: Result, truth: Trajectory | None = None, *, max_points: int = NOTEBOOK_POINTS) -> MapView:
+    """Return a 3D view of a result: a notebook displays it, and its `save(path)` writes a page.
+
+    The view has the coloured map, the mesh, the camera path with its uncertainty, and the keyframes; a click on a
+    keyframe shows its image. A result loaded from a folder has no images.
+
+    Args:
+        result: of `vggtgeo.reconstruct` or `vggtgeo.read`, with at least one pose.
+        truth: ground truth, camera -> world, aligned and shown beside the path; by default that of the run.
+        max_points: of the view; a larger map is decimated.
+
+    Raises:
+        InputError: an argument is invalid, no frame has a pose, or the package `k3d` is not installed.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> update = next(vg.run(vg.simulate("room", 3, size=(160, 120))))
+        >>> view = vg.show(vg.Result.of(update))  # in a notebook its last line shows it
+        >>> "Map in 3D" in view.html
+        True
+
+    """
+    check_kind("result", result, Result, "of `vggtgeo.reconstruct` or `vggtgeo.read`")
+    check_kind("truth", truth, Trajectory | None, "for example of `sequence.ground_truth()`")
+    check_viewer()
+    if not len(result.trajectory):
+        raise InputError("`result` has no pose: no frame was tracked, and there is no map to show")
+    record = result.record
+    if record is not None:
+        keyframes = pictured([record.slam.keyframes[number] for number in submaps_by_size(record.slam)[0]])
+    else:
+        poses = zip(result.keyframes.timestamps, result.keyframes.poses, strict=True)
+        keyframes = [Pictured(f"keyframe {row}", pose, time) for row, (time, pose) in enumerate(poses)]
+    scene = map_scene(
+        result.cloud,
+        result.trajectory,
+        keyframes,
+        result.intrinsics,
+        mesh=result.mesh,
+        truth=truth if truth is not None or record is None else record.truth,
+        uncertainty=result.uncertainty,
+        metric=result.metric,
+        truth_in_metres=result.summary.get("truth", {}).get("in_metres", True),
+        max_points=max_points,
+    )
+    return MapView.of(scene, "map")

@@ -14,13 +14,12 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import write_text
 from vggtgeo.io.interruption import interruption
 from vggtgeo.io.locks import locked_folder, not_written
@@ -88,11 +87,9 @@ def open_folder_for_result(folder: str | os.PathLike[str]) -> Iterator[RunFolder
     with open_run_folder(folder, resume=True) as place:
         keeps = checkpoint.is_file()
         if keeps:
-            warnings.warn(
+            warn(
                 f"`{folder}` contains the checkpoint of a killed run, which is kept; `vggtgeo run --resume` continues "
-                "that run and replaces the files of this result",
-                InputWarning,
-                stacklevel=4,
+                "that run and replaces the files of this result"
             )
         yield replace(place, keeps=keeps)
 
@@ -153,18 +150,10 @@ def _prepare(run: RunFolder, reserve: int, resume: bool) -> None:
         )
         if reserve and hasattr(os, "posix_fallocate"):
             with (run.stage / _RESERVED).open("wb") as file:
-                _allocate(file.fileno(), reserve)
+                os.posix_fallocate(file.fileno(), 0, reserve)
     except OSError as error:
-        raise not_written(run.folder, error, reserve) from None
-
-
-def _allocate(file: int, size: int) -> None:
-    """Allocate disk space, where the file system supports it."""
-    try:
-        os.posix_fallocate(file, 0, size)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):
-            raise
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # of a file system that reserves no space
+            raise not_written(run.folder, error, reserve) from None
 
 
 def _remove_stage_unless_needed(stage: Path) -> None:
