@@ -16,7 +16,7 @@ from conftest import ROOT
 from vggtgeo.benchmark import markdown
 from vggtgeo.benchmark.figures import paths
 from vggtgeo.benchmark.page import write_page
-from vggtgeo.benchmark.table import as_csv, columns, write_parquet
+from vggtgeo.benchmark.rows import as_csv, columns, write_parquet
 from vggtgeo.geometry.trajectory import Trajectory
 
 

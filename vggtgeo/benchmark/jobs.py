@@ -13,8 +13,8 @@ from typing import Any
 from vggtgeo.benchmark.inputs import find_sequences
 from vggtgeo.benchmark.measure import NOT_COMPARABLE
 from vggtgeo.benchmark.provenance import input_hash
+from vggtgeo.benchmark.rows import Row
 from vggtgeo.benchmark.suite import PROTOCOLS, SequenceTable, SettingTable, Suite
-from vggtgeo.benchmark.table import Row
 from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.datasets.opening import is_readable
 from vggtgeo.io.errors import InputError

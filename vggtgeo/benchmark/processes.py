@@ -25,7 +25,7 @@ import psutil
 from vggtgeo.benchmark.inputs import walk_name
 from vggtgeo.benchmark.jobs import Job, Store
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.table import Row
+from vggtgeo.benchmark.rows import Row
 from vggtgeo.benchmark.worker import LOG
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.jax_environment import jax_environment

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.benchmark import markdown
-from vggtgeo.benchmark.cells import COMPARED, finished, is_covered
 from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
 from vggtgeo.benchmark.figures import ablation_figure
 from vggtgeo.benchmark.inputs import data_folders
@@ -22,8 +21,9 @@ from vggtgeo.benchmark.measure import trajectory_errors
 from vggtgeo.benchmark.page import write_page
 from vggtgeo.benchmark.processes import Limits, run_jobs
 from vggtgeo.benchmark.provenance import input_hash, source_digest
+from vggtgeo.benchmark.rows import LESS_BASELINE, Row, as_csv, run_name, write_parquet
 from vggtgeo.benchmark.suite import ExternalTable, Suite, load_suite, restrict
-from vggtgeo.benchmark.table import LESS_BASELINE, Row, as_csv, run_name, write_parquet
+from vggtgeo.benchmark.tables import COMPARED, finished, is_covered
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.image_files import is_there
 from vggtgeo.datasets.pose_files import load_trajectory

@@ -13,10 +13,10 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Self
 
-from vggtgeo.benchmark.published import check_published
 from vggtgeo.datasets.opening import KINDS
 from vggtgeo.evaluation.alignment import AXES
 from vggtgeo.io.errors import InputError
@@ -257,7 +257,7 @@ class Suite(CheckedTable):
             if not getattr(self, name) > 0:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
         for name in self.published:
-            check_published(name)
+            _one_of("published", name, tuple(packaged("published")))
         for key in ("sequence", "setting"):
             if not getattr(self, key):
                 raise InputError(f"`[[{key}]]` is missing; give at least one")
@@ -279,11 +279,15 @@ class Suite(CheckedTable):
         return next((table.title for table in (*self.setting, *self.external) if table.name == setting), "") or setting
 
 
+def packaged(folder: str) -> dict[str, Traversable]:
+    """Return the TOML files of a folder of this package by their names: `suites`, `published`."""
+    found = {entry.name.removesuffix(".toml"): entry for entry in (files("vggtgeo.benchmark") / folder).iterdir()}
+    return dict(sorted(found.items()))
+
+
 def shipped() -> dict[str, str]:
     """Return names and titles of the suites in the package."""
-    folder = files("vggtgeo.benchmark") / "suites"
-    found = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith(".toml"))
-    return {name[:-5]: tomllib.loads((folder / name).read_text("utf-8"))["title"] for name in found}
+    return {name: tomllib.loads(file.read_text("utf-8"))["title"] for name, file in packaged("suites").items()}
 
 
 def load_suite(name: str | Path) -> Suite:
@@ -296,8 +300,7 @@ def load_suite(name: str | Path) -> Suite:
             raise InputError(f"`{path}` is not a text file: {error}") from None
     if str(name) not in shipped():
         raise InputError(f"`{name}` is neither a TOML file nor a shipped suite: {', '.join(shipped())}")
-    text = (files("vggtgeo.benchmark") / "suites" / f"{name}.toml").read_text("utf-8")
-    return read_suite(text, str(name), f"suite `{name}`")
+    return read_suite(packaged("suites")[str(name)].read_text("utf-8"), str(name), f"suite `{name}`")
 
 
 def read_suite(text: str, name: str, where: str) -> Suite:
