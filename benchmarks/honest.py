@@ -41,7 +41,7 @@ from short_runs import Piece
 import vggtgeo as vg
 from vggtgeo.benchmark.inputs import RenderedWalk
 from vggtgeo.datasets import Sequence, open_sequence, without_depth
-from vggtgeo.evaluation.consistency import pose_consistency
+from vggtgeo.evaluation import pose_consistency
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, with_depths
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA

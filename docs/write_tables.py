@@ -11,7 +11,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.benchmark import figures, markdown, tables
+from vggtgeo.benchmark import figures, report, tables
 from vggtgeo.benchmark.suite import load_suite
 from vggtgeo.io.files import atomic_path, write_text
 
@@ -48,7 +48,7 @@ def main() -> None:
     suite, rows = load_suite(name), load_rows(folder / "runs.csv")
     if arguments.clips:
         good = [row for row in rows if row["status"] == "ok"]
-        text = "\n\n".join(markdown.section(table, 3) for table in tables.details(suite, good))
+        text = "\n\n".join(report.section(table, 3) for table in tables.details(suite, good))
         page = DOCS / "results" / "clips.md"
     else:
         page, text = DOCS / "results" / "paper.md", accuracy((folder / "tables.md").read_text())

@@ -8,7 +8,7 @@ import tiny_suites as tiny
 from bench_rows import EXTERNAL, ROWS, row
 from scipy.stats import ttest_rel
 
-from vggtgeo.benchmark import markdown, tables
+from vggtgeo.benchmark import report, tables
 from vggtgeo.benchmark.rows import Summary, paired
 
 
@@ -60,8 +60,8 @@ def test_medians_stand_beside_means() -> None:
     ((_, *line),) = tables.accuracy(suite, rows, tables.SE3).lines
     assert [one.text for one in line] == ["4.00 ± 4.36", "3.00 ± 0.00", "17.00 ± 19.92", "8.00", "4.00"]
     assert [one.median for one in line] == ["2.00", "3.00", "6.00", "3.67", ""]
-    assert "standard deviation over seeds / median." in markdown.page(suite, rows)
-    assert "/" not in markdown.grid(tables.accuracy(suite, [one for one in rows if one["seed"] < 2], tables.SE3))
+    assert "standard deviation over seeds / median." in report.markdown(suite, rows)
+    assert "/" not in report.grid(tables.accuracy(suite, [one for one in rows if one["seed"] < 2], tables.SE3))
 
 
 def test_a_mean_is_over_the_sequences_that_all_have() -> None:
@@ -78,7 +78,7 @@ def test_a_free_scale_has_no_error_at_true_scale() -> None:
     # Proves that runs without a scale are called free after SE(3), in the table and in the differences, and are
     # compared after Sim(3). Oracle: by hand.
     rows = [*ROWS[:3], *({**one, "metric": False} for one in ROWS[3:6])]
-    text = markdown.page(tiny.suite(), rows)
+    text = report.markdown(tiny.suite(), rows)
     assert "| without \\| lines | free |" in text
     assert "| without \\| lines | walk | 3 |  | **+2.00 ± 1.24** |" in text
     assert "| walk | without \\| lines | 3 | 27/30 | free | 3.50 ± 1.00 / 3.50 |" in text
@@ -123,7 +123,7 @@ def test_what_cannot_be_compared_is_neither_ranked_nor_averaged() -> None:
     # Proves that the status of a row keeps it out of the numbers, and stands in their place with the reasons below.
     # Oracle: by hand.
     rows = [*ROWS[:3], *({**one, "status": "not comparable", "message": "world to camera"} for one in ROWS[3:6])]
-    text = markdown.page(tiny.suite(), rows)
+    text = report.markdown(tiny.suite(), rows)
     assert "| without \\| lines | 3 not comparable |" in text
     assert "| walk | bare | 0 | not comparable | world to camera |" in text
     assert "## Against" not in text

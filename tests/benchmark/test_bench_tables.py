@@ -13,16 +13,16 @@ from bench_rows import EXTERNAL, ROWS, row
 from checked_page import CheckedPage
 from conftest import ROOT
 
-from vggtgeo.benchmark import markdown
+from vggtgeo.benchmark import report
 from vggtgeo.benchmark.figures import paths
-from vggtgeo.benchmark.page import write_page
+from vggtgeo.benchmark.report import write_page
 from vggtgeo.benchmark.rows import as_csv, columns, write_parquet
 from vggtgeo.geometry.trajectory import Trajectory
 
 
 def test_tables_mark_the_best_and_the_second() -> None:
     # Proves the numbers of the tables and their marks, and that a bar in a title does not break a row. Oracle: by hand.
-    text = markdown.page(tiny.suite(), ROWS)
+    text = report.markdown(tiny.suite(), ROWS)
     assert "| full system | **3.00 ± 1.00** / 3.00 | <u>8.50 ± 0.50</u> / 8.50 | **5.75** / 5.75 |" in text
     assert "| without \\| lines | <u>7.00 ± 2.00</u> / 7.00 | **7.50 ± 0.50** / 7.50 | <u>7.25</u> / 7.25 |" in text
     assert "| without \\| lines | walk | 3 | **+4.00 ± 2.48** | **+2.00 ± 1.24** |" in text
@@ -48,12 +48,12 @@ def test_what_was_measured_is_in_the_tables(tmp_path: Path) -> None:
     rows = [row("walk", "full", 0, 2.0, **EVERYTHING), row("hall", "full", 0, 3.0, coverage=1.0)]
     for suite_rows, there in ((rows, True), (rows[1:], False)):
         write_page(tmp_path / "report.html", tiny.suite(), suite_rows, tmp_path)
-        text, page = markdown.page(tiny.suite(), suite_rows), (tmp_path / "report.html").read_text()
+        text, page = report.markdown(tiny.suite(), suite_rows), (tmp_path / "report.html").read_text()
         for group in ("Depth", "Map, scores within 5 cm", "Cost"):
             assert (f"### {group}" in text) == (f"<h3>{group}</h3>" in page) == there, group
         for number in shown:
             assert (f" {number} |" in text) == (f">{number}</span>" in page) == there, number
-    lines = markdown.page(tiny.suite(), rows).partition("### Map")[2].partition("###")[0]
+    lines = report.markdown(tiny.suite(), rows).partition("### Map")[2].partition("###")[0]
     assert "| walk |" in lines
     assert "| hall |" not in lines, "a sequence without a true surface has an empty line"
 
@@ -97,11 +97,11 @@ def test_the_tables_say_what_makes_a_row_doubtful() -> None:
     good = row("walk", "full", 0, 0.01, warnings="the scale is 7")
     gone = row("hall", "full", 0, None, status="absent")
     other = row("walk", "other", 0, 0.02, external="a.txt")
-    text = markdown.page(tiny.suite(), [good, gone, other])
+    text = report.markdown(tiny.suite(), [good, gone, other])
     assert "## Warnings" in text
     assert "| walk | full | 0 | the scale is 7 |" in text
     assert "1 run, 1 more without their recording, 1 of other systems." in text
-    assert "## Warnings" not in markdown.page(tiny.suite(), ROWS)
+    assert "## Warnings" not in report.markdown(tiny.suite(), ROWS)
 
 
 def test_the_path_that_is_drawn_is_one_that_can_be(tmp_path: Path) -> None:

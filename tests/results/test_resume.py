@@ -23,10 +23,9 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, Notice, RunSoFar, frames_kept
 from vggtgeo.results.output_checks import unfinished_message
-from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import open_run_folder
-from vggtgeo.results.run_options import RunOptions
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate

@@ -17,7 +17,7 @@ from rrd_files import components_of, entities_of
 from typer.testing import CliRunner
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
-from vggtgeo.benchmark.page import write_page
+from vggtgeo.benchmark.report import write_page
 from vggtgeo.benchmark.worker import recording as recorded
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid

@@ -10,7 +10,7 @@
 | `provenance` | versions, machine, digests of inputs |
 | `rows` | the rows of all runs: CSV and Parquet; means, intervals, paired differences |
 | `tables`, `figures` | what the report shows; figures published by others in tables of their own |
-| `markdown`, `page` | the report as Markdown and as HTML |
+| `report` | the report as Markdown and as HTML |
 | `runner` | all of it, with trajectories of other systems: `vggtgeo.bench` |
 
 The package is not called `bench`, as `vggtgeo.bench` is the function.

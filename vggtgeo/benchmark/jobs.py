@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from vggtgeo.slam.settings.table import changed, updated
 @dataclass(frozen=True)
 class Job:
     """One run. spec: everything it depends on, plain values; its `path` is None if the recording is missing. absent:
-    message with the folders that were searched.
+    message for that case.
     """
 
     sequence: str
@@ -64,7 +64,7 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
     for sequence in suite.sequence:
         places = sorted(find_sequences(sequence.path, roots) if sequence.path else [], key=unreadable)
         place = next(iter(places), None)
-        absent = _absent(sequence.path, roots) if place is None else ""
+        absent = f"`{sequence.path}` not found, nor in subfolders two levels deep; give its folder with `--data FOLDER`"
         digest = "" if place is None else input_hash(place)
         settings = [table for table in suite.setting if not table.sequences or sequence.name in table.sequences]
         specs = {setting.name: _spec(suite, sequence, setting, place) for setting in settings}
@@ -74,12 +74,6 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
                 if seed - suite.first_seed < (setting.seeds or suite.seeds):
                     found.append(Job(sequence.name, setting.name, seed, specs[setting.name], digest, absent))
     return found
-
-
-def _absent(path: str, roots: Sequence[Path]) -> str:
-    if roots and not Path(path).expanduser().is_absolute():
-        return f"`{path}` not found in {', '.join(f'`{root}`' for root in roots)}, nor in subfolders two levels deep"
-    return f"`{path}` does not exist; give the folder of recordings with `--data FOLDER`"
 
 
 def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: Path | None) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def run(
     with collected_warnings() as warned:
         sequence = open_input(path, given)
     from vggtgeo.cli.run_sequence import run_and_write
-    from vggtgeo.results.run_options import RunOptions
+    from vggtgeo.results.reconstruction import RunOptions
     from vggtgeo.slam.run import default_roles
 
     slam_settings = pipeline_settings(settings, options.assignments or (), tables_of_switches(switches, options))
@@ -93,7 +93,7 @@ def demo(
 ) -> None:
     """Run in a synthetic office with exact truth, rendered on the spot."""
     from vggtgeo.cli.run_sequence import run_and_write
-    from vggtgeo.results.run_options import RunOptions
+    from vggtgeo.results.reconstruction import RunOptions
     from vggtgeo.simulation import simulate
     from vggtgeo.slam.settings.slam_settings import Roles
     from vggtgeo.slam.window.sliding_window import warm_up as compile_window

@@ -25,10 +25,9 @@ from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
 from vggtgeo.results.output_checks import EXPORTS, SUMMARY, is_in_results
-from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
-from vggtgeo.results.run_options import RunOptions
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.known_map import load_map
 from vggtgeo.slam.settings.presets import Perception

@@ -7,8 +7,6 @@ from vggtgeo.evaluation.alignment import umeyama as umeyama
 from vggtgeo.evaluation.association import associate as associate
 from vggtgeo.evaluation.association import nearest_in_time as nearest_in_time
 from vggtgeo.evaluation.comparability import comparability as comparability
-from vggtgeo.evaluation.consistency import consistency as consistency
-from vggtgeo.evaluation.consistency import pose_consistency as pose_consistency
 from vggtgeo.evaluation.maps import CloudError as CloudError
 from vggtgeo.evaluation.maps import cloud_error as cloud_error
 from vggtgeo.evaluation.maps import depth_error as depth_error
@@ -19,6 +17,8 @@ from vggtgeo.evaluation.offsets import shifted as shifted
 from vggtgeo.evaluation.pose_errors import AbsoluteError as AbsoluteError
 from vggtgeo.evaluation.pose_errors import ErrorStatistics as ErrorStatistics
 from vggtgeo.evaluation.pose_errors import absolute_error as absolute_error
+from vggtgeo.evaluation.pose_errors import consistency as consistency
+from vggtgeo.evaluation.pose_errors import pose_consistency as pose_consistency
 from vggtgeo.evaluation.pose_errors import relative_error as relative_error
 from vggtgeo.evaluation.pose_errors import rotation_angle as rotation_angle
 from vggtgeo.evaluation.report import TrajectoryReport as TrajectoryReport

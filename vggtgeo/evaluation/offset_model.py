@@ -391,7 +391,7 @@ class OffsetModel:
         return first, second
 
     def _scaled(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return both Jacobians J and Z, whitened, in units of the prior, and a basis of the determined directions.
+        """Return both Jacobians J and Z, whitened, in units of the prior, along a basis of the determined directions.
 
         A direction is determined if `Z^T J` has four times the prior's information (half its standard deviation), and
         more than two independent noises would have by chance.
@@ -401,7 +401,8 @@ class OffsetModel:
         values, vectors = np.linalg.eigh(0.5 * (other.T @ own + own.T @ other))
         lengths = np.sqrt(((own @ vectors) ** 2).sum(axis=0) * ((other @ vectors) ** 2).sum(axis=0))
         chance = norm.ppf(1 - LEVEL / 2) / np.sqrt(0.5 * len(own))
-        return own, other, vectors[:, (values > _MIN_GAIN) & (values > chance * lengths)]
+        basis = vectors[:, (values > _MIN_GAIN) & (values > chance * lengths)]
+        return own @ basis, other @ basis, basis
 
     def _balanced(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:
         """Return the solution of `Z^T r = 0` (instrumental variables, see `_covariance`), starting from that of `J^T r
@@ -413,7 +414,6 @@ class OffsetModel:
         size = np.inf
         for _ in range(_STEPS):
             own, other, basis = self._scaled(unknowns, free, noise)
-            own, other = own @ basis, other @ basis
             residuals = self._whitened(self._residuals(unknowns), noise)
             step = -basis @ np.linalg.lstsq(other.T @ own, other.T @ residuals, rcond=None)[0]
             moved = unknowns.moved(step * self._prior, self._middle)
@@ -428,7 +428,6 @@ class OffsetModel:
         directions the covariance of the prior.
         """
         own, other, basis = self._scaled(unknowns, free, noise)
-        own, other = own @ basis, other @ basis
         gain = basis @ np.linalg.pinv(other.T @ own, rcond=1e-18)
         covariance = gain @ (other.T @ other) @ gain.T + np.eye(UNKNOWNS) - basis @ basis.T
         return covariance * np.outer(self._prior, self._prior), free & (np.diag(covariance) < 1.0 / _MIN_GAIN)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from vggtgeo.evaluation import align, associate
+from vggtgeo.evaluation import align, associate, nearest_in_time
 from vggtgeo.figures.plots import view_axes
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud, cell_numbers
@@ -213,12 +213,12 @@ def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> T
 
 def _sigma_at(uncertainty: PoseUncertainty | None, keyframes: Sequence[Pictured]) -> np.ndarray:
     """Return the standard deviation of each keyframe's position; NaN = unknown."""
-    if uncertainty is None or not len(uncertainty.timestamps):
-        return np.full(len(keyframes), np.nan)
-    times = np.array([keyframe.timestamp for keyframe in keyframes])
-    rows = np.abs(times[:, None] - uncertainty.timestamps).argmin(axis=1)
-    apart = np.abs(times - uncertainty.timestamps[rows]) > 1e-4
-    return np.where(apart, np.nan, uncertainty.translation[rows])
+    sigma = np.full(len(keyframes), np.nan)
+    if uncertainty is not None:
+        times = np.array([keyframe.timestamp for keyframe in keyframes])
+        rows, nearest = nearest_in_time(times, uncertainty.timestamps, 1e-4)
+        sigma[rows] = uncertainty.translation[nearest]
+    return sigma
 
 
 def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> Float[np.ndarray, "k 5 3"]:
