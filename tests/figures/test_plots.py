@@ -108,10 +108,9 @@ def test_truth_without_common_times_is_left_out(tmp_path: Path) -> None:
 def test_the_title_tells_the_error() -> None:
     # Proves that the title has the ATE of the alignment it names. Oracle: a truth moved rigidly, and one scaled.
     walk = _walk()
-    drawn = plots._align(walk, _turned(walk, 1), None, with_scale=False)
-    assert plots._title(drawn, "clip", False, metres=True) == "clip:  ATE 0.00 cm after SE(3) (40 poses)"
-    drawn = plots._align(walk, _turned(walk, 1), None, with_scale=True)
-    assert "after Sim(3)" in plots._title(drawn, "", True, metres=True)
+    for with_scale, name in ((False, "SE(3)"), (True, "Sim(3)")):
+        figure = plots.trajectory_figure(walk, _turned(walk, 1), with_scale=with_scale, title="clip")
+        assert figure.get_suptitle() == f"clip:  ATE 0.00 cm after {name} (40 poses)"
 
 
 def _has(image: np.ndarray, colour: str) -> bool:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from vggtgeo.cli.options import EXIT_FAILED, JsonOption
-from vggtgeo.io.errors import InputWarning, collected_warnings
+from vggtgeo.io.errors import InputError, collected_warnings, warn
 from vggtgeo.io.text_files import whole_text
 
 if TYPE_CHECKING:
@@ -63,10 +62,9 @@ def evaluate(
         metric = metres is not False and scale is not None and scale.startswith("metric")
         verdict = comparability(found, true, max_dt, metric)
         offsets = estimate_offsets(found, true, max_dt)
-        for text in (*verdict.reasons, *verdict.doubts):
-            warnings.warn(text, InputWarning, stacklevel=2)
-        if offsets is not None and offsets.explains:
-            warnings.warn(offsets.message, InputWarning, stacklevel=2)
+        explained = [offsets.message] if offsets is not None and offsets.explains else []
+        for text in (*verdict.reasons, *verdict.doubts, *explained):
+            warn(text)
         rest, left = None, verdict
         if estimate_offset and offsets is not None:
             true = offsets.removed(found, true)
@@ -90,20 +88,14 @@ def evaluate(
 
 
 def load_scale(path: Path) -> str | None:
-    """Return the scale in a run's summary, for its folder or a pose file in it; None for other files, and, with a
-    warning, if the summary is invalid.
-    """
-    from vggtgeo.results.summary import describe_error
-
+    """Return the scale in a run's summary, for its folder or a pose file in it; None for other files."""
     file = (path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path) / "summary.json"
     if not file.is_file():
         return None
     try:
         return str(json.loads(whole_text(file, errors="strict"))["scale"])
     except (ValueError, KeyError, TypeError) as error:
-        text = f"`{file}` is invalid ({describe_error(error)}): scale and verdict of the run are unknown"
-        warnings.warn(InputWarning(text), stacklevel=2)
-        return None
+        raise InputError(f"`{file}` is invalid ({error}); give a folder that `vggtgeo run` wrote") from None
 
 
 def load_truth(path: Path) -> tuple[Trajectory, bool | None]:

@@ -30,7 +30,7 @@ from vggtgeo.cli.options import (
     with_option_groups,
 )
 from vggtgeo.cli.settings_file import SettingsOption, pipeline_settings
-from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning, collected_warnings
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, UnusableDepthWarning, collected_warnings, warn
 
 if TYPE_CHECKING:
     from vggtgeo.datasets import Sequence
@@ -203,7 +203,7 @@ def make_perception(chosen: PerceptionOptions, classical: Roles, switches: Switc
         *(chosen.preset, classical, chosen.models, chosen.cache, chosen.provider, chosen.memory_limit_gb, mixed)
     )
     if chosen.provider == "cuda" and not perceived.networks:
-        warnings.warn("`--provider cuda` has no effect: no role is a network", InputWarning, stacklevel=2)
+        warn("`--provider cuda` has no effect: no role is a network")
     if perceived.random:
-        warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
+        warn(perceived.warning())
     return perceived

@@ -65,11 +65,12 @@ def run_and_write(
     silent = wanted.quiet or wanted.as_json
     title = (options.title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
     console = Console(stderr=False, quiet=silent)
+    note = lambda text: console.print(f"note: {one_line(text)}", markup=False, highlight=False, soft_wrap=True)
     # From the first frame to the last file, a signal ends the run early; the results so far are written completely.
     with interruption() as stop, open_run_folder(output, source, RESERVE, wanted.resume) as folder:
         replaces = (output / SUMMARY).is_file()
         if replaces:
-            _print_note(console, f"the result in `{output}` is replaced at the end of this run")
+            note(f"the result in `{output}` is replaced at the end of this run")
         checkpoints = Checkpoints(folder.checkpoint, bool(wanted.resume), wanted.checkpoint_every)
         if wanted.resume and not folder.checkpoint.is_file():
             typer.echo(f"nothing to resume in `{output}`: the run begins at its first frame", err=True)
@@ -93,7 +94,7 @@ def run_and_write(
             typer.echo("interrupted after the last frame: all results are complete and written", err=True)
     if replaces and (output / EXPORTS).is_dir():
         # Exports are not written by a run, and may hold a user's files: they stay.
-        _print_note(console, f"`{output / EXPORTS}` is of an earlier result; `vggtgeo export` renews it")
+        note(f"`{output / EXPORTS}` is of an earlier result; `vggtgeo export` renews it")
     print_result(console, result, summary, output)
     if wanted.as_json:
         typer.echo(json.dumps(summary))
@@ -107,10 +108,6 @@ def run_and_write(
         raise typer.Exit(EXIT_INTERRUPTED)
     if result.verdict.level == "failed":
         raise typer.Exit(EXIT_FAILED)
-
-
-def _print_note(console: Console, text: str) -> None:
-    console.print(f"note: {one_line(text)}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _save_map(result: Result, file: Path | None) -> str:

@@ -57,8 +57,6 @@ def solve(
     """Solve the bundle-adjustment problem in PROBLEM."""
     from vggtgeo.results.output_checks import check_can_be_written
 
-    if output.is_dir():
-        raise InputError(f"`{output}` is a folder; give the name of a file for the solution with `-o`")
     if output.exists() and problem.exists() and output.samefile(problem):
         raise InputError(f"`{output}` is the problem itself; give another name for the solution with `-o`")
     check_can_be_written(output.parent)

@@ -148,7 +148,7 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
     """
     if asked is None or not asked.resume or not asked.path.is_file():
         return None
-    saved = _header(asked.path)["identity"]
+    saved = CHECKPOINT.facts(asked.path)["identity"]
     differing = [name for name in {**saved, **identity} if saved.get(name) != identity.get(name)]
     if differing:  # report the shortest: a seed, for example, also appears in every role that samples
         name = min(differing, key=lambda one: len(saved.get(one, "")) + len(identity.get(one, "")))
@@ -157,21 +157,11 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
             f"`{name}` is {now}, but the run in `{asked.path}` had {before}: use the same, or start again with "
             "`--no-resume`"
         )
-    try:
-        found, _ = CHECKPOINT.read(asked.path)
-        if not isinstance(found, RunSoFar) or not found.slam.frames:
-            raise InputError(f"`{asked.path}` contains no run")
-        checked_state(asked.path, found.slam)
-    except InputError as error:
-        raise InputError(f"{error}; start again with `--no-resume`") from None
+    found, _ = CHECKPOINT.read(asked.path)
+    if not isinstance(found, RunSoFar) or not found.slam.frames:
+        raise InputError(f"`{asked.path}` contains no run; start again with `--no-resume`")
+    checked_state(asked.path, found.slam)
     return found
-
-
-def _header(path: Path) -> dict[str, Any]:
-    try:
-        return CHECKPOINT.facts(path)
-    except InputError as error:
-        raise InputError(f"{error}; start again with `--no-resume`") from None
 
 
 def _excerpt(value: str | None) -> str:
@@ -180,13 +170,13 @@ def _excerpt(value: str | None) -> str:
 
 def frames_kept(path: Path) -> str:
     """Return the number of frames in a checkpoint, as text."""
-    count = _header(path)["frames"]
+    count = CHECKPOINT.facts(path)["frames"]
     return f"{count} frame{'s' * (count != 1)}"
 
 
 def check_same_frame(asked: Checkpoints, frame: Frame | None) -> None:
     """Raise InputError unless `frame` is the last one of the checkpoint."""
-    saved = _header(asked.path)
+    saved = CHECKPOINT.facts(asked.path)
     if frame is None or saved["digest"] != digest_of(frame):
         raise InputError(
             f"frame {saved['last']} differs from the one of the run in `{asked.path}`: use the same input, or start "

@@ -13,7 +13,7 @@ from typing import Any
 from vggtgeo.datasets import Sequence
 from vggtgeo.datasets.frame import check_range
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError, InputWarning, collected_warnings
+from vggtgeo.io.errors import InputError, InputWarning, collected_warnings, warn
 from vggtgeo.io.given import check_kind, check_plain, check_whole
 from vggtgeo.io.interruption import Interruption, interruption
 from vggtgeo.io.process_settings import program_settings
@@ -48,11 +48,6 @@ from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import check_input, check_refusals, judge_or_report
 from vggtgeo.slam.window_recorder import WindowRecorder
-
-FREE_MAP = (
-    "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not used; start "
-    "a new map for a metric one"
-)
 
 
 @dataclass(frozen=True)
@@ -273,7 +268,10 @@ def _first_state(known: Slam | None, source: Source, settings: SlamSettings, rol
     """
     if known is not None:
         if source.has_depth and not known.metric:
-            warnings.warn(FREE_MAP, InputWarning, stacklevel=4)
+            warn(
+                "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not "
+                "used; start a new map for a metric one"
+            )
         return entered(known, source.camera, roles.points)
     if settings.keyframes.localise_only:
         raise InputError("`keyframes.localise_only` needs a map: pass `known_map` (`--map FILE`)")

@@ -22,7 +22,7 @@ from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.datasets.views import FrameStream, frame_stream, reduced
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning, warn
 from vggtgeo.io.given import check_kind
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.summary import lens_parameters
@@ -152,10 +152,10 @@ def _truth(sequence: Sequence) -> Trajectory | None:
         truth = sequence.ground_truth()
         if truth is not None and not getattr(sequence, "truth_in_metres", True):
             text = "has a free scale: errors are in its own unit, after Sim(3) alignment"
-            warnings.warn(f"the ground truth of `{sequence.name}` {text}", NoteWarning, stacklevel=4)
+            warn(f"the ground truth of `{sequence.name}` {text}", NoteWarning)
         return truth
     except InputError as error:
-        warnings.warn(f"the ground truth is invalid and is left out: {error}", InputWarning, stacklevel=4)
+        warn(f"the ground truth is invalid and is left out: {error}")
         return None
 
 
@@ -219,11 +219,9 @@ class StaticOverlaySearch(Callback):
         if self._overlay is None or not self._overlay.separable:
             return
         self.found = self._overlay
-        warnings.warn(
+        warn(
             f"{100 * self.found.share:.1f} % of the image is a static overlay (bars, a watermark, something on the "
-            "lens?); features and depth there are ignored",
-            InputWarning,
-            stacklevel=4,
+            "lens?); features and depth there are ignored"
         )
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
