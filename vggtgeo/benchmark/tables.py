@@ -126,6 +126,7 @@ def accuracy(suite: Suite, rows: Sequence[Row], column: Column) -> Table:
             heads.append(f"median{of}")
             numbers = [one.median for one in pooled]
             by_column.append(_placed(numbers, column, list(map(text, numbers)), [""] * len(pooled)))
+    lines: list[list[str | Cell]]
     lines = [[suite.title_of(setting), *(cells[row] for cells in by_column)] for row, setting in enumerate(settings)]
     note = (
         f"ATE RMSE after {'SE(3)' if column is SE3 else 'Sim(3)'} alignment, cm, at the share of the truth's duration "
@@ -174,7 +175,7 @@ def details(suite: Suite, rows: Sequence[Row]) -> list[Table]:
         poses, of_runs = title == "Poses", ("runs", "tracked") if title == "Poses" else ("runs",)
         known = (*columns, *_references(rows)) if poses else columns
         shown = [column for column in known if any(summary_of(own, column).count for *_, own in runs)]
-        lines = [
+        lines: list[list[str | Cell]] = [
             [
                 *(sequence, suite.title_of(setting), _runs(own)),
                 *([_tracked(own)] if poses else []),
