@@ -20,8 +20,6 @@ from vggtgeo.figures.plots import (
     INK,
     ORANGE,
     NotebookFigure,
-    energy_figure,
-    errors_figure,
     line_colour,
     style,
     trajectory_figure,
@@ -87,14 +85,35 @@ def check_truth(value: Trajectory, truth: Trajectory | None) -> None:
         associate(value, truth)
 
 
-plot.register(TrajectoryReport, errors_figure)
+@plot.register(TrajectoryReport)
+def _errors(report: TrajectoryReport) -> NotebookFigure:
+    """Draw histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
+    figure = NotebookFigure(figsize=(6.0, 3.2), layout="constrained")
+    axes = figure.subplots()
+    found = (("SE(3)", report.se3, BLUE), ("Sim(3)", report.sim3, ORANGE))
+    edges = np.linspace(0, 100 * max(float(error.errors.max()) for _, error, _ in found) + 1e-9, 31)
+    for name, error, colour in found:
+        label = f"after {name}: RMSE {100 * error.statistics.rmse:.2f} cm"
+        axes.hist(100 * error.errors, edges.tolist(), histtype="stepfilled", color=colour, alpha=0.45, label=label)
+    axes.set_xlabel("error of a camera centre [cm]")
+    axes.set_ylabel("poses")
+    axes.legend(frameon=False)
+    return figure
 
 
 @plot.register(Solution)
 def _energy(value: Solution) -> NotebookFigure:
+    """Draw the energy before the first and after each iteration, logarithmic."""
     history = np.asarray(value.history)
     check_single(history, 1)
-    return energy_figure(history[np.isfinite(history)], value.result)
+    figure = NotebookFigure(figsize=(5.0, 3.0), layout="constrained")
+    axes = figure.subplots()
+    axes.semilogy(history[np.isfinite(history)], ".-", color=BLUE)
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("energy")
+    axes.set_title(value.result, loc="left", fontsize=10, color=INK)
+    style(axes)
+    return figure
 
 
 @plot.register(Covariances)

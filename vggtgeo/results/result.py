@@ -15,12 +15,12 @@ import numpy as np
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.figures.map_view import result_figure
 from vggtgeo.figures.plot import check_truth, plot
-from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
+from vggtgeo.figures.plots import NotebookFigure, trajectory_figure
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.files import write_json
+from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.io.given import check_kind, check_plain, path_of
 from vggtgeo.mapping.dense import dense_map
 from vggtgeo.report import MapView, Pictured, RunRecord, check_viewer, map_scene, pictured, write_page
@@ -245,8 +245,7 @@ class Result:
     def _draw(self, place: Path, name: str, summary: Mapping[str, Any], mesh: Callable[[], Mesh | None]) -> None:
         record = self.record
         if len(self.trajectory):
-            plot_trajectory(
-                place / "trajectory.png",
+            figure = trajectory_figure(
                 self.trajectory,
                 record.truth if record else None,
                 self.keyframes,
@@ -254,6 +253,8 @@ class Result:
                 title=record.title if record else name,
                 metres=record is None or summary.get("truth", {}).get("in_metres", True),
             )
+            with atomic_path(place / "trajectory.png") as temporary:
+                figure.savefig(temporary, dpi=130, format="png", facecolor="white")
         if record is not None:
             page = place / "report.html"
             write_page(page, record, summary, self.verdict, self.uncertainty, mesh)

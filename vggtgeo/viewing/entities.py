@@ -101,8 +101,9 @@ class Entities:
         ]
         drawn = [ellipsoid(pose, covariance) for pose, covariance in known]
         centres, half_sizes, quaternions = ([part[i] for part in drawn] for i in range(3))
-        sizes = {"half_sizes": half_sizes, "quaternions": quaternions, "colors": [(*_ORANGE, 120)] * len(drawn)}
-        self._stream.log("world/covariance", self._rr.Ellipsoids3D(centers=centres, **sizes))
+        colours = [(*_ORANGE, 120)] * len(drawn)
+        shapes = self._rr.Ellipsoids3D(centers=centres, half_sizes=half_sizes, quaternions=quaternions, colors=colours)
+        self._stream.log("world/covariance", shapes)
 
     def window(self, keyframes: list[Keyframe], pairs: list[Pair]) -> None:
         """Log the window's keyframes and matched pairs, as a graph and as lines in the world."""
