@@ -208,9 +208,10 @@ def run_jobs(
         def work(job: Job) -> None:
             cores = free.get()
             try:
-                row = run_one(job, store, limits, cores, command, scratch, stop)
+                ending = run_in(store.begin(job), scratch, limits, cores, command, stop)
             finally:
                 free.put(cores)
+            row = store.complete(job, **ending, cpus=len(cores))
             with lock:
                 if job.spec["simulate"]:
                     name = walk_name(job.spec["simulate"], job.seed)
@@ -228,20 +229,6 @@ def run_jobs(
                 stop.set()
                 pool.shutdown(cancel_futures=True)
                 raise
-
-
-def run_one(
-    job: Job,
-    store: Store,
-    limits: Limits,
-    cores: Sequence[int],
-    command: Command,
-    scratch: Path,
-    stop: threading.Event | None = None,
-) -> Row:
-    """Run one job and return its row."""
-    place = store.begin(job)
-    return store.complete(job, **run_in(place, scratch, limits, cores, command, stop), cpus=len(cores))
 
 
 def run_in(

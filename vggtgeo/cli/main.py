@@ -180,7 +180,7 @@ def _is_short_of_memory(error: BaseException) -> bool:
 
 def _usage_message(error: Any, command: str) -> str:
     """Return the error in the command line or in a settings file, and a hint to the help of the command."""
-    message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
+    message = error.format_message().rstrip(".")
     context, parameter = error.ctx, getattr(error, "param", None)
     if context is not None:
         command = context.command_path

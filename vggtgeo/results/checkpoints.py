@@ -69,21 +69,13 @@ class Checkpoints:
             raise InputError(f"`every` is {self.every:g}; it must be seconds between checkpoints, at least 0")
 
 
-@dataclass(frozen=True)
-class Notice:
-    """A warning about the input. frames: number of frames left out; None for other warnings."""
+Notice = tuple[str, int | None]
+"""A warning about the input: its text, and the number of frames left out; None for other warnings."""
 
-    text: str
-    frames: int | None = None
 
-    @classmethod
-    def of(cls, warning: Warning | str) -> Notice:
-        """Return the notice of a warning."""
-        return cls(str(warning), warning.frames if isinstance(warning, LeftOutWarning) else None)
-
-    def warning(self) -> Warning:
-        """Return the warning of a notice."""
-        return InputWarning(self.text) if self.frames is None else LeftOutWarning(self.text, self.frames)
+def notice_of(warning: Warning | str) -> Notice:
+    """Return the notice of a warning."""
+    return str(warning), warning.frames if isinstance(warning, LeftOutWarning) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +99,14 @@ class RunSoFar:
         known = Counter(self.notices)
         fresh: list[Warning | str] = []
         for warning in collected:
-            if known[Notice.of(warning)] > 0:
-                known[Notice.of(warning)] -= 1
+            if known[notice_of(warning)] > 0:
+                known[notice_of(warning)] -= 1
             else:
                 fresh.append(warning)
-        return [*(notice.warning() for notice in self.notices), *fresh]
+        before = (
+            InputWarning(text) if frames is None else LeftOutWarning(text, frames) for text, frames in self.notices
+        )
+        return [*before, *fresh]
 
     def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
         """Add the checkpoint's counts to `refusals`."""
@@ -119,7 +114,7 @@ class RunSoFar:
             vars(refusals[role]).update(vars(Refusals(*counts)))
 
 
-KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, FrameEvidence, WindowRecord)
+KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, FrameEvidence, WindowRecord)
 CHECKPOINT = Format("checkpoint", VERSION, by_name(KEPT_CLASSES))
 
 
