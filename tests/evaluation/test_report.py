@@ -173,6 +173,8 @@ def test_the_page_without_depth_and_without_windows(run: RecordedRun, tmp_path: 
     slam = replace(run.slam, map=replace(run.slam.map, keyframes=tuple(blank), metric=False))
     empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     text = _page(run, tmp_path, slam, cloud=empty, windows=(), truth=None)
+    told = summarise(slam, Verdict("good"), settings={}, seconds={}, recorded=True)["scale"]
+    assert told == "free (no metric depth): lengths are in the unit of the recorded poses"
     for words in ("No window was adjusted", "The sequence has no depth", "too few points", "lengths have no unit"):
         assert words in text, words
 

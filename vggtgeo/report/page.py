@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.figures import map_view
+from vggtgeo.figures.plots import trajectory_figure
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
@@ -79,8 +80,12 @@ def write_page(
     trajectory = frame_trajectory(slam)
     chosen = [(slam.keyframes[row], record.dense.depth_maps[row]) for row in spread(len(slam.keyframes), SAMPLES)]
     low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
-    in_metres, keyframes = summary.get("truth", {}).get("in_metres", True), keyframe_trajectory(slam)
-    drawn = figures.trajectory_svg(trajectory, truth, keyframes, not slam.metric, in_metres) if len(trajectory) else ""
+    drawn = ""
+    if len(trajectory):
+        in_metres = summary.get("truth", {}).get("in_metres", True)
+        drawn = figures.svg(
+            trajectory_figure(trajectory, truth, keyframe_trajectory(slam), not slam.metric, None, 5.0, in_metres)
+        )
     text = template("vggtgeo.report", "page.html.j2").render(
         style=style(),
         title=record.title,

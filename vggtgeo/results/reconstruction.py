@@ -249,6 +249,7 @@ def _conclude(
             seconds={**clock.seconds, "all": time.perf_counter() - began},
             report=report,
             truth_in_metres=source.truth_in_metres,
+            recorded=facts.get("pose_prior", {}).get("used", False),
             map_points=len(built.cloud),
             dense=options.dense,
         ),

@@ -129,7 +129,8 @@ def open_run_folder(
                 _prepare(run, reserve, bool(resume))
                 yield run
             finally:
-                _remove_stage_unless_needed(run.stage)
+                needed = any((run.stage / name).is_file() for name in ("trajectory.txt", CHECKPOINT))
+                _remove(run.stage / _RESERVED if needed else run.stage)
     finally:
         for path in created:
             if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
@@ -154,14 +155,6 @@ def _prepare(run: RunFolder, reserve: int, resume: bool) -> None:
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # of a file system that reserves no space
             raise not_written(run.folder, error, reserve) from None
-
-
-def _remove_stage_unless_needed(stage: Path) -> None:
-    """Remove the stage; if it has a checkpoint or unpublished poses, keep it without the reserved space."""
-    if (stage / "trajectory.txt").is_file() or (stage / CHECKPOINT).is_file():
-        (stage / _RESERVED).unlink(missing_ok=True)
-    else:
-        _remove(stage)
 
 
 def _remove(path: Path) -> None:

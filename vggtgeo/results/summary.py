@@ -61,11 +61,13 @@ def summarise(
     seconds: Mapping[str, float],
     report: TrajectoryReport | None = None,
     truth_in_metres: bool = True,
+    recorded: bool = False,
     **counts: Any,
 ) -> dict[str, Any]:
     """Return verdict, settings, versions, counts, time by stage, final intrinsics, and errors against the ground truth.
 
-    truth_in_metres: whether lengths of the ground truth are metres; written as `in_metres` beside the errors.
+    truth_in_metres: whether lengths of the ground truth are metres; written as `in_metres` beside the errors. recorded:
+    whether recorded poses were used as a prior, which then give a map without depth its unit.
     """
     tracked = sum(record.tracked for record in slam.frames)
     values: dict[str, Any] = {
@@ -78,7 +80,7 @@ def summarise(
         "pairs": len(slam.map.pairs),
         "submaps": list_submaps(slam),
         "peak_memory_gb": round(peak_memory_gb(), 3),
-        "scale": scale_name(slam, verdict, recorded=counts.get("pose_prior", {}).get("used", False)),
+        "scale": scale_name(slam, verdict, recorded),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
         **_pose_sigma(slam),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
@@ -138,10 +140,8 @@ def lens_parameters(lens: Camera) -> dict[str, float]:
 SCALE_BASIS = "depth only: a constant factor on the depth cannot be observed in the images"
 
 
-def scale_name(slam: Slam, verdict: Verdict, *, recorded: bool = False) -> str:
-    """Return the kind of scale; "metric" only if no check of the verdict doubts it. recorded: whether recorded poses
-    were used as a prior, which then give a map without depth its unit.
-    """
+def scale_name(slam: Slam, verdict: Verdict, recorded: bool) -> str:
+    """Return the kind of scale; "metric" only if no check of the verdict doubts it."""
     if not slam.metric:
         unit = "lengths are in the unit of the recorded poses" if recorded else "lengths have no unit"
         return f"free (no metric depth): {unit}"
@@ -167,13 +167,5 @@ def read_summary(folder: Path) -> tuple[dict[str, Any], Verdict]:
         summary["intrinsics"] = {name: float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy")}
         return summary, Verdict.from_dict(summary["verdict"], summary["scale"] == "metric")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"`summary.json` in `{folder}` is invalid ({describe_error(error)}); give a folder that `vggtgeo run` wrote"
-        ) from None
-
-
-def describe_error(error: Exception) -> str:
-    """Describe why a JSON file is invalid: the messages of Python's own exceptions do not name its entries."""
-    if isinstance(error, KeyError):
-        return f"`{error.args[0]}` is missing"
-    return "an entry has the wrong type" if isinstance(error, TypeError | AttributeError) else str(error)
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"`{folder / 'summary.json'}` is invalid ({reason}); give a folder of `vggtgeo run`") from None
