@@ -11,20 +11,17 @@ import numpy as np
 
 from vggtgeo.figures import map_view
 from vggtgeo.figures.plots import trajectory_figure
-from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
 from vggtgeo.mapping.dense import DenseMap
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
-from vggtgeo.report.map_scene import map_scene, pictured, spread
-from vggtgeo.report.viewer import INSTALL, has_viewer, style, template, view_html
-from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
+from vggtgeo.report.map_scene import spread
+from vggtgeo.report.viewer import INSTALL, style, template
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.window_recorder import WindowRecord
 
@@ -62,8 +59,7 @@ def write_page(
     record: RunRecord,
     summary: Mapping[str, Any],
     verdict: Verdict,
-    uncertainty: PoseUncertainty | None = None,
-    mesh: Callable[[], Mesh | None] = lambda: None,
+    view: Callable[[], str | None] = lambda: None,
 ) -> None:
     """Write the report of a run, a self-contained HTML file, atomically.
 
@@ -72,8 +68,7 @@ def write_page(
         record: of the run, with at least one frame.
         summary: content of `summary.json`.
         verdict: how far the result can be trusted; the first part of the page.
-        uncertainty: of the poses, for the 3D view.
-        mesh: returns the mesh of the map for the 3D view, which is made last.
+        view: returns the 3D view, which is made last, since it waits for the mesh; None: not available.
 
     """
     slam, cloud, truth = record.slam, record.dense.cloud, record.truth
@@ -116,34 +111,9 @@ def write_page(
         scale=summary["scale"],
         scale_basis=summary.get("scale_basis"),
         install=INSTALL,
-        view=_view(record, trajectory, summary, uncertainty, mesh),
+        view=view(),
     )
     write_text(path, text)
-
-
-def _view(
-    record: RunRecord,
-    trajectory: Trajectory,
-    summary: Mapping[str, Any],
-    uncertainty: PoseUncertainty | None,
-    mesh: Callable[[], Mesh | None],
-) -> str | None:
-    """Return the 3D view; None if no frame has a pose, or K3D is not installed."""
-    if not len(trajectory) or not has_viewer():
-        return None
-    slam = record.slam
-    scene = map_scene(
-        record.dense.cloud,
-        trajectory,
-        pictured([slam.keyframes[number] for number in submaps_by_size(slam)[0]]),
-        [float(value) for value in slam.intrinsics],
-        mesh=mesh(),
-        truth=record.truth,
-        uncertainty=uncertainty,
-        metric=slam.metric,
-        truth_in_metres=summary.get("truth", {}).get("in_metres", True),
-    )
-    return view_html(scene)
 
 
 def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[tuple[str, str]]:

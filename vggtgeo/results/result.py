@@ -23,7 +23,19 @@ from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.io.given import check_kind, check_plain, path_of
 from vggtgeo.mapping.dense import dense_map
-from vggtgeo.report import MapView, Pictured, RunRecord, check_viewer, map_scene, pictured, write_page
+from vggtgeo.report import (
+    MAX_POINTS,
+    MapScene,
+    MapView,
+    Pictured,
+    RunRecord,
+    check_viewer,
+    has_viewer,
+    map_scene,
+    pictured,
+    view_html,
+    write_page,
+)
 from vggtgeo.results.files import read_uncertainty, write_depth, write_settings, write_trajectories, write_uncertainty
 from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
@@ -256,8 +268,29 @@ class Result:
             with atomic_path(place / "trajectory.png") as temporary:
                 figure.savefig(temporary, dpi=130, format="png", facecolor="white")
         if record is not None:
-            page = place / "report.html"
-            write_page(page, record, summary, self.verdict, self.uncertainty, mesh)
+            shown = has_viewer() and len(self.trajectory) > 0
+            view = lambda: view_html(self._scene(mesh(), record.truth)) if shown else None
+            write_page(place / "report.html", record, summary, self.verdict, view)
+
+    def _scene(self, mesh: Mesh | None, truth: Trajectory | None, max_points: int = MAX_POINTS) -> MapScene:
+        record = self.record
+        if record is not None:
+            keyframes = pictured([record.slam.keyframes[number] for number in submaps_by_size(record.slam)[0]])
+        else:
+            poses = zip(self.keyframes.timestamps, self.keyframes.poses, strict=True)
+            keyframes = [Pictured(f"keyframe {row}", pose, time) for row, (time, pose) in enumerate(poses)]
+        return map_scene(
+            self.cloud,
+            self.trajectory,
+            keyframes,
+            self.intrinsics,
+            mesh=mesh,
+            truth=truth,
+            uncertainty=self.uncertainty,
+            metric=record.slam.metric if record else self.metric,
+            truth_in_metres=self.summary.get("truth", {}).get("in_metres", True),
+            max_points=max_points,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return counts, path length, intrinsics and summary as plain values."""
@@ -315,21 +348,5 @@ def show(result: Result, truth: Trajectory | None = None, *, max_points: int = N
     if not len(result.trajectory):
         raise InputError("`result` has no pose: no frame was tracked, and there is no map to show")
     record = result.record
-    if record is not None:
-        keyframes = pictured([record.slam.keyframes[number] for number in submaps_by_size(record.slam)[0]])
-    else:
-        poses = zip(result.keyframes.timestamps, result.keyframes.poses, strict=True)
-        keyframes = [Pictured(f"keyframe {row}", pose, time) for row, (time, pose) in enumerate(poses)]
-    scene = map_scene(
-        result.cloud,
-        result.trajectory,
-        keyframes,
-        result.intrinsics,
-        mesh=result.mesh,
-        truth=truth if truth is not None or record is None else record.truth,
-        uncertainty=result.uncertainty,
-        metric=result.metric,
-        truth_in_metres=result.summary.get("truth", {}).get("in_metres", True),
-        max_points=max_points,
-    )
-    return MapView.of(scene, "map")
+    own = truth if truth is not None or record is None else record.truth
+    return MapView.of(result._scene(result.mesh, own, max_points), "map")
