@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.datasets.image_files import image_header
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
@@ -24,7 +23,7 @@ PINHOLE = 1
 
 def copy_pictures(scene: Scene, source: Path, target: Path) -> bytes | None:
     """Copy `images/` of the run in `source` below `target`; return the PNG mask of valid pixels, white, None if all are
-    valid. Raise InputError for missing images or a wrong size.
+    valid. Raise InputError for a missing image.
     """
     (target / "images").mkdir(parents=True, exist_ok=True)
     for view in range(len(scene.frames)):
@@ -32,24 +31,9 @@ def copy_pictures(scene: Scene, source: Path, target: Path) -> bytes | None:
         if not file.is_file():
             raise InputError(f"`{file}` does not exist; run again, with `-o {source}`")
         with atomic_open(target / "images" / file.name, "wb") as handle:
-            handle.write(_image(file, scene, source))
+            handle.write(file.read_bytes())
     mask = source / MASK
-    return _image(mask, scene, source) if mask.is_file() else None
-
-
-def _image(file: Path, scene: Scene, source: Path) -> bytes:
-    """Return the content of an image file; raise InputError for a damaged image or another size than the scene's."""
-    content = file.read_bytes()
-    try:
-        header = image_header(content, file)
-    except InputError as error:
-        raise InputError(f"{error}; run again, with `-o {source}`") from None
-    if (header.width, header.height) != scene.size:
-        raise InputError(
-            f"`{file}` must be an image of {scene.size[0]} x {scene.size[1]} pixels, got {header.width} x "
-            f"{header.height}; run again, with `-o {source}`"
-        )
-    return content
+    return mask.read_bytes() if mask.is_file() else None
 
 
 def write_colmap(source: Path, target: Path) -> dict[str, float]:

@@ -47,7 +47,9 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
         frame |= {} if mask is None else {"mask_path": "mask.png"}
         depth = source / "depth" / f"{scene.frames[view]:06d}.depth.png"
         if depth.is_file():
-            frame["depth_file_path"] = _depth(depth, scene.size, target, f"depth/{scene.frames[view]:06d}.png")
+            frame["depth_file_path"] = f"depth/{scene.frames[view]:06d}.png"
+            millimetres = np.rint(read_codes(depth) * (MILLI / DEPTH_UNIT)).astype(np.uint16)
+            write_picture(target / frame["depth_file_path"], millimetres)
             deep += 1
         frames.append(frame)
     if not deep:
@@ -58,18 +60,6 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     size = {"w": scene.size[0], "h": scene.size[1]}
     write_json(target / "transforms.json", {**camera, **size, "ply_file_path": "points.ply", "frames": frames})
     return {"images": len(frames), "depth_images": deep}
-
-
-def _depth(file: Path, size: tuple[int, int], target: Path, name: str) -> str:
-    """Write the depth of one image of `size` (width, height) in nerfstudio's units; return its name."""
-    counts = read_codes(file)
-    if counts.shape != size[::-1] or counts.dtype != np.uint16:
-        raise InputError(
-            f"`{file}` must be depth of {size[0]} x {size[1]} pixels in 16 bits, as of `vggtgeo run --save-depth`, got "
-            f"{counts.dtype} of shape {counts.shape}"
-        )
-    write_picture(target / name, np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16))
-    return name
 
 
 def write_tum(source: Path, target: Path) -> dict[str, float]:

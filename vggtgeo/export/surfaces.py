@@ -32,7 +32,6 @@ Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 LAS_UNIT = 1e-3
 _CUSTOM_ATTRIBUTE = "_color"
 """Names of custom attributes of glTF begin with an underscore."""
-_LAS_COUNTS = 2**31 - 1
 FULL_SCALE = 65535
 _LINEAR_BELOW, _SLOPE, _OFFSET, _GAMMA = 0.04045, 12.92, 0.055, 2.4
 """Of the transfer function of sRGB."""
@@ -95,11 +94,6 @@ def write_las(source: Path, target: Path) -> dict[str, float]:
     laspy = _package("laspy")
     cloud = cloud_of(source)
     points = cloud.points.astype(np.float64) @ Z_UP.T
-    if np.ptp(points, axis=0).max() >= LAS_UNIT * _LAS_COUNTS:
-        raise InputError(
-            f"`{source / 'map.ply'}` is {np.ptp(points, axis=0).max():.3g} m across; LAS in millimetres is limited to "
-            f"{LAS_UNIT * _LAS_COUNTS:.0f} m: export it with `--to ply`"
-        )
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.generating_software = "vggtgeo"
     header.scales = np.full(3, LAS_UNIT)

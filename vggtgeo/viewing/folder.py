@@ -6,13 +6,10 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.output_checks import check_can_be_shown
@@ -55,15 +52,7 @@ def log_folder(stream: Any, folder: Path) -> None:
     for file in sorted(folder.glob("depth/*.depth.png")):
         if (number := file.name.split(".")[0]).isdecimal():
             stream.set_time("frame", sequence=int(number))
-            entities.depth(_pixels(file, np.uint16), DEPTH_UNIT)
+            entities.depth(read_codes(file), DEPTH_UNIT)
             confidence = file.with_name(f"{number}.confidence.png")
             if confidence.is_file():
-                entities.confidence(_pixels(confidence, np.uint8))
-
-
-def _pixels(file: Path, kind: type) -> np.ndarray:
-    pixels = read_codes(file)
-    if pixels.ndim != 2 or pixels.dtype != kind:
-        found = f"{pixels.dtype} {pixels.shape}"
-        raise InputError(f"`{file}` is {found}; expected {np.dtype(kind)} [H, W]: run again with `--save-depth`")
-    return pixels
+                entities.confidence(read_codes(confidence))
