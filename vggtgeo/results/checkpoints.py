@@ -152,9 +152,7 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
             f"`{name}` is {now}, but the run in `{asked.path}` had {before}: use the same, or start again with "
             "`--no-resume`"
         )
-    found, _ = CHECKPOINT.read(asked.path)
-    if not isinstance(found, RunSoFar) or not found.slam.frames:
-        raise InputError(f"`{asked.path}` contains no run; start again with `--no-resume`")
+    found: RunSoFar = CHECKPOINT.read(asked.path)[0]
     checked_state(asked.path, found.slam)
     return found
 

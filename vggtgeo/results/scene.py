@@ -104,10 +104,7 @@ class Scene:
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Scene:
         """Load `scene.npz` of a run's folder; raise InputError if it is missing, invalid or of another version."""
-        path = Path(folder) / "scene.npz"
-        scene, _ = SCENE.read(path)
-        if not isinstance(scene, Scene):
-            raise InputError(f"`{path}` holds no scene; give a folder that `vggtgeo run` wrote")
+        scene: Scene = SCENE.read(Path(folder) / "scene.npz")[0]
         return scene
 
 
