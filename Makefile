@@ -15,7 +15,7 @@ PYTHONS ?= $(PYTHON)
 # Compiled modules are kept, also where the environment says otherwise: the tests start hundreds of processes, and each
 # begins in a third of the time with them.
 export PYTHONDONTWRITEBYTECODE :=
-CORE    := tests/bundle/test_packing.py tests/bundle/test_solve.py tests/bundle/test_properties.py tests/evaluation/test_report.py tests/geometry/test_point_cloud.py \
+CORE    := tests/bundle/test_packing.py tests/bundle/test_solve.py tests/bundle/test_properties.py tests/report/test_page.py tests/geometry/test_point_cloud.py \
 	tests/figures/test_plots.py tests/cli/test_settings_file.py
 
 .PHONY: help venv demo test test-long test-slow test-lowest test-newest test-more fuzz docs audit sbom release lint types format lock clean

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import vggtgeo as vg
-from vggtgeo.benchmark.inputs import DegradedWalk
+from vggtgeo.benchmark.inputs import RenderedWalk
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation.degradations import Degradation, Recording
@@ -32,7 +32,7 @@ def degraded_clips(
     frames = list(clip.frames(0, min(count, len(clip))))
     for name, change in changes.items():
         changed = change(Recording(frames, clip.camera, truth), np.random.default_rng(0))
-        walk = DegradedWalk(clip.name, changed)
+        walk = RenderedWalk(clip.name, changed)
         inputs = (True,) if depth_alone else (True, False) if clip.has_depth else (False,)
         for has_depth in inputs:
             yield name, SequenceView(walk, clip.camera, has_depth)

@@ -39,9 +39,9 @@ from scipy.stats import chi2 as chi_square
 from short_runs import Piece
 
 import vggtgeo as vg
-from vggtgeo.benchmark.inputs import DegradedWalk
+from vggtgeo.benchmark.inputs import RenderedWalk
 from vggtgeo.datasets import Sequence, open_sequence, without_depth
-from vggtgeo.evaluation.consistency import pose_consistency
+from vggtgeo.evaluation import pose_consistency
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, with_depths
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
@@ -160,7 +160,7 @@ def _drawn_row(name: str, source: Sequence, runs: int) -> str:
     recording, squares, within = Recording(list(source.frames()), source.camera, truth), [], []
     for seed in range(runs):
         result = vg.reconstruct(
-            DegradedWalk(name, _with_unseen_errors(recording, seed)), options=vg.RunOptions(dense="none")
+            RenderedWalk(name, _with_unseen_errors(recording, seed)), options=vg.RunOptions(dense="none")
         )
         assert result.record is not None
         stated, true = result.uncertainty, result.record.truth

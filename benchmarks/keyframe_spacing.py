@@ -23,7 +23,7 @@ from verdict_bank import RenderedWalks, cases, record
 from verdict_faults import HEALTHY
 
 import vggtgeo as vg
-from vggtgeo.benchmark.inputs import DegradedWalk
+from vggtgeo.benchmark.inputs import RenderedWalk
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.simulation.degradations import Recording
@@ -59,7 +59,7 @@ def main() -> None:
 def _run(name: str, recording: Recording) -> tuple[float, float, float, float]:
     """Return keyframes, seconds, share of frames with a pose, and ATE in % of the path."""
     began = time.perf_counter()
-    sequence = SequenceView(DegradedWalk(name, recording), recording.camera, has_depth=False)
+    sequence = SequenceView(RenderedWalk(name, recording), recording.camera, has_depth=False)
     result = vg.reconstruct(sequence, options=vg.RunOptions(dense="none"))
     seconds = time.perf_counter() - began
     frames = len(result.trajectory) / len(recording.frames)

@@ -28,8 +28,7 @@ from vggtgeo.models.roles import LineDetector, Segments
 from vggtgeo.datasets import open_sequence
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.results.reconstruction import reconstruct
-from vggtgeo.results.run_options import RunOptions
+from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.slam.settings.groups import LineSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 

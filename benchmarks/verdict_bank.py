@@ -38,7 +38,7 @@ from stress import judge as outcome_of
 from verdict_faults import FAULTS, HEALTHY, OF_DEPTH, OF_STREAM, WITHOUT_DEPTH, CameraErrors, Given, Walk, rendered
 
 import vggtgeo as vg
-from vggtgeo.benchmark.inputs import DegradedWalk
+from vggtgeo.benchmark.inputs import RenderedWalk
 from vggtgeo.compilation.process_settings import program_settings
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation.alignment import umeyama
@@ -196,7 +196,7 @@ def run(case: Case, render: Callable[[Walk], Recording], out: Path) -> str:
     part = out / f".{case.name}.{os.getpid()}"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    sequence = SequenceView(DegradedWalk(case.name, recording), recording.camera, not case.rgb_only)
+    sequence = SequenceView(RenderedWalk(case.name, recording), recording.camera, not case.rgb_only)
     judged_by: list[tuple[Any, ...]] = []
     judge = reconstruction.judge_or_report
 

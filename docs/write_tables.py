@@ -11,7 +11,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from vggtgeo.benchmark import figures, markdown
+from vggtgeo.benchmark import figures, report, tables
 from vggtgeo.benchmark.suite import load_suite
 from vggtgeo.io.files import atomic_path, write_text
 
@@ -48,12 +48,13 @@ def main() -> None:
     suite, rows = load_suite(name), load_rows(folder / "runs.csv")
     if arguments.clips:
         good = [row for row in rows if row["status"] == "ok"]
-        page, tables = DOCS / "results" / "clips.md", "\n\n".join(markdown.details(suite, good))
+        text = "\n\n".join(report.section(table, 3) for table in tables.details(suite, good))
+        page = DOCS / "results" / "clips.md"
     else:
-        page, tables = DOCS / "results" / "paper.md", accuracy((folder / "tables.md").read_text())
+        page, text = DOCS / "results" / "paper.md", accuracy((folder / "tables.md").read_text())
         with atomic_path(DOCS / "paper-tables.png") as temporary:
             figures.ablation_figure(suite, rows).savefig(temporary, dpi=130, format="png", facecolor="white")
-    write_text(page, with_tables(page.read_text(), tables))
+    write_text(page, with_tables(page.read_text(), text))
 
 
 def _value(text: str) -> Any:

@@ -37,10 +37,10 @@ from .geometry.trajectory import Trajectory as Trajectory
 from .io.errors import InputError as InputError
 from .results.reading import evaluate as evaluate
 from .results.reading import read as read
+from .results.reconstruction import RunOptions as RunOptions
 from .results.reconstruction import reconstruct as reconstruct
 from .results.result import Result as Result
-from .results.run_options import RunOptions as RunOptions
-from .results.show import show as show
+from .results.result import show as show
 from .simulation import simulate as simulate
 from .simulation import simulate_window as simulate_window
 from .slam.callback import Callback as Callback

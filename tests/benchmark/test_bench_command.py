@@ -17,10 +17,8 @@ from vggtgeo.io.files import locked
     [
         (("nosuch",), "`nosuch`"),
         (("quick", "--sequences", "attic"), "`sequences` must be of office"),
-        (("quick", "--settings", ","), "`settings`"),
         (("quick", "--data", "/no/such/place"), "`data` is `/no/such/place`, which is not a folder"),
         (("quick", "--timeout-minutes", "0"), "`timeout_minutes` is 0.0; it must be positive"),
-        (("quick", "--memory-gb", "-1"), "`memory_gb` is -1.0; it must be positive"),
         (("quick", "-o", "/proc/nowhere"), "`/proc/nowhere` cannot be written"),
     ],
 )

@@ -9,12 +9,12 @@ from bench_rows import EXTERNAL, ROWS, row
 from reported import raises
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.benchmark import markdown
+from vggtgeo.benchmark import report
 from vggtgeo.benchmark.measure import trajectory_errors
-from vggtgeo.benchmark.published import published
+from vggtgeo.benchmark.rows import Row, paired
 from vggtgeo.benchmark.runner import external_rows, subtract_baseline
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row, paired
+from vggtgeo.benchmark.tables import published
 from vggtgeo.geometry.trajectory import Trajectory
 
 
@@ -82,11 +82,7 @@ def test_differences_are_over_the_time_that_both_cover(tmp_path: Path) -> None:
 
 def test_published_figures_have_source_and_protocol_and_stand_apart() -> None:
     # Proves that figures of others are never in a table of own ones. Oracle: the section they are in.
-    table = published("tum-freiburg1")
-    assert table.source
-    assert table.protocol
-    assert table.rows["ORB-SLAM3"][0] == "lost"
-    text = markdown.page(tiny.suite(tiny.TEXT.replace("seeds = 3", 'seeds = 3\npublished = ["tum-freiburg1"]')), ROWS)
+    text = report.markdown(tiny.suite(tiny.TEXT.replace("seeds = 3", 'seeds = 3\npublished = ["tum-freiburg1"]')), ROWS)
     before, _, after = text.partition("## Published by others")
     assert "DROID-SLAM" not in before
     assert "| DROID-SLAM (uncalibrated)* | 0.202 |" in after
@@ -96,8 +92,8 @@ def test_published_figures_have_source_and_protocol_and_stand_apart() -> None:
     )
     assert lost in after
     assert "`-`" not in after
-    other = markdown.published_table(published("averages"))
+    other = report.section(published("averages"))
     assert "| SLAM3R* | - | - | 0.066 | - | - | Y. Liu et al., SLAM3R" in other
     assert "`-`: not published." in other
-    with raises("`published`", "`x`"):
-        published("x")
+    with raises("`published`", "'x'"):
+        tiny.suite(tiny.TEXT.replace("seeds = 3", 'seeds = 3\npublished = ["x"]'))

@@ -8,8 +8,8 @@ import tiny_suites as tiny
 from bench_rows import EXTERNAL, ROWS, row
 from scipy.stats import ttest_rel
 
-from vggtgeo.benchmark import cells, markdown
-from vggtgeo.benchmark.table import Summary, paired
+from vggtgeo.benchmark import report, tables
+from vggtgeo.benchmark.rows import Summary, paired
 
 
 def test_summaries_are_those_of_the_textbook() -> None:
@@ -46,9 +46,8 @@ def test_seeds_of_a_recording_are_no_recordings() -> None:
     rows += [row("hall", "bare", seed, 1.2) for seed in range(5)]
     suite = tiny.suite()
     recorded = replace(suite, sequence=tuple(replace(one, simulate={}, path=one.name) for one in suite.sequence))
-    found = {one.sequence: one for one in cells.differences(recorded, rows)}
-    assert {name: one.pairs for name, one in found.items()} == {"walk": 5, "hall": 5, "all": 2}
-    assert {name: one.cells[0].place for name, one in found.items()} == {"walk": 2, "hall": 0, "all": 0}
+    found = {name: (pairs, se3.mark) for _, name, pairs, se3, *_ in tables.differences(recorded, rows).lines}
+    assert found == {"walk": ("5", "worse"), "hall": ("5", ""), "all": ("2", "")}
 
 
 def test_medians_stand_beside_means() -> None:
@@ -57,12 +56,12 @@ def test_medians_stand_beside_means() -> None:
     suite = tiny.suite(tiny.TEXT.replace("[[setting]]", '[[sequence]]\nname = "extra"\npath = "x"\n\n[[setting]]', 1))
     errors = {"walk": (1.0, 2.0, 9.0), "hall": (3.0, 3.0, 3.0), "extra": (5.0, 6.0, 40.0)}
     rows = [row(name, "full", seed, cm) for name, own in errors.items() for seed, cm in enumerate(own)]
-    assert cells.matrix(suite, rows, cells.SE3)[0] == ["walk", "hall", "extra", "mean", "median"]
-    _, ((_, line),) = cells.matrix(suite, rows, cells.SE3)
+    assert tables.accuracy(suite, rows, tables.SE3).heads == ("walk", "hall", "extra", "mean", "median")
+    ((_, *line),) = tables.accuracy(suite, rows, tables.SE3).lines
     assert [one.text for one in line] == ["4.00 ± 4.36", "3.00 ± 0.00", "17.00 ± 19.92", "8.00", "4.00"]
     assert [one.median for one in line] == ["2.00", "3.00", "6.00", "3.67", ""]
-    assert "standard deviation over seeds / median." in markdown.page(suite, rows)
-    assert "/" not in markdown.accuracy(suite, [one for one in rows if one["seed"] < 2], cells.SE3)
+    assert "standard deviation over seeds / median." in report.markdown(suite, rows)
+    assert "/" not in report.grid(tables.accuracy(suite, [one for one in rows if one["seed"] < 2], tables.SE3))
 
 
 def test_a_mean_is_over_the_sequences_that_all_have() -> None:
@@ -70,8 +69,8 @@ def test_a_mean_is_over_the_sequences_that_all_have() -> None:
     rows = [one for one in ROWS if (one["sequence"], one["setting"]) != ("hall", "bare")]
     rows += [row("extra", "full", 0, 1.0), row("extra", "bare", 0, 3.0)]
     suite = tiny.suite(tiny.TEXT.replace("[[setting]]", '[[sequence]]\nname = "extra"\npath = "x"\n\n[[setting]]', 1))
-    assert cells.matrix(suite, rows, cells.SE3)[0] == ["walk", "hall", "extra", "mean of 2"]
-    lines = dict(cells.matrix(suite, rows, cells.SE3)[1])
+    assert tables.accuracy(suite, rows, tables.SE3).heads == ("walk", "hall", "extra", "mean of 2")
+    lines = {name: cells for name, *cells in tables.accuracy(suite, rows, tables.SE3).lines}
     assert [one.text for one in lines["without | lines"]] == ["7.00 ± 2.00", "", "3.00", "5.00"]
 
 
@@ -79,7 +78,7 @@ def test_a_free_scale_has_no_error_at_true_scale() -> None:
     # Proves that runs without a scale are called free after SE(3), in the table and in the differences, and are
     # compared after Sim(3). Oracle: by hand.
     rows = [*ROWS[:3], *({**one, "metric": False} for one in ROWS[3:6])]
-    text = markdown.page(tiny.suite(), rows)
+    text = report.markdown(tiny.suite(), rows)
     assert "| without \\| lines | free |" in text
     assert "| without \\| lines | walk | 3 |  | **+2.00 ± 1.24** |" in text
     assert "| walk | without \\| lines | 3 | 27/30 | free | 3.50 ± 1.00 / 3.50 |" in text
@@ -96,11 +95,11 @@ def test_a_setting_that_loses_runs_is_not_the_best_by_that() -> None:
         row("hall", "bare", 1, None, status="crash", verdict=None),
     ]
     suite = tiny.suite(tiny.TEXT + EXTERNAL)
-    lines = dict(cells.matrix(suite, rows, cells.SE3)[1])
-    assert lines["without | lines"] == [cells.Cell("2.00 (1 of 3)"), cells.Cell("1 failed, 1 crash")]
-    assert lines["full system"][0] == cells.Cell("3.00 ± 1.00", 1, "3.00")
-    assert lines["Other-SLAM"][0] == cells.Cell("5.00", 2)
-    assert cells.matrix(suite, rows, cells.SE3)[0] == ["walk", "hall"]
+    lines = {name: cells for name, *cells in tables.accuracy(suite, rows, tables.SE3).lines}
+    assert lines["without | lines"] == [tables.Cell("2.00 (1 of 3)"), tables.Cell("1 failed, 1 crash")]
+    assert lines["full system"][0] == tables.Cell("3.00 ± 1.00", "best", "3.00")
+    assert lines["Other-SLAM"][0] == tables.Cell("5.00", "second")
+    assert tables.accuracy(suite, rows, tables.SE3).heads == ("walk", "hall")
 
 
 def test_accuracy_is_ranked_at_equal_coverage_only() -> None:
@@ -113,18 +112,18 @@ def test_accuracy_is_ranked_at_equal_coverage_only() -> None:
     ]
     rows[-1] |= {"external": "a.txt"}
     suite = tiny.suite(tiny.TEXT + EXTERNAL)
-    lines = dict(cells.matrix(suite, rows, cells.SE3)[1])
-    assert cells.matrix(suite, rows, cells.SE3)[0] == ["walk", "hall", "mean"]
-    assert lines["full system"] == [cells.Cell("3.00 at 100 %", 1)] * 2 + [cells.Cell("3.00", 1)]
-    assert lines["without | lines"] == [cells.Cell("5.00 at 95 %", 2)] * 2 + [cells.Cell("5.00", 2)]
-    assert lines["Other-SLAM"] == [cells.Cell("1.00 at 20 %")] * 2 + [cells.Cell("")]
+    lines = {name: cells for name, *cells in tables.accuracy(suite, rows, tables.SE3).lines}
+    assert tables.accuracy(suite, rows, tables.SE3).heads == ("walk", "hall", "mean")
+    assert lines["full system"] == [tables.Cell("3.00 at 100 %", "best")] * 2 + [tables.Cell("3.00", "best")]
+    assert lines["without | lines"] == [tables.Cell("5.00 at 95 %", "second")] * 2 + [tables.Cell("5.00", "second")]
+    assert lines["Other-SLAM"] == [tables.Cell("1.00 at 20 %")] * 2 + [tables.Cell("")]
 
 
 def test_what_cannot_be_compared_is_neither_ranked_nor_averaged() -> None:
     # Proves that the status of a row keeps it out of the numbers, and stands in their place with the reasons below.
     # Oracle: by hand.
     rows = [*ROWS[:3], *({**one, "status": "not comparable", "message": "world to camera"} for one in ROWS[3:6])]
-    text = markdown.page(tiny.suite(), rows)
+    text = report.markdown(tiny.suite(), rows)
     assert "| without \\| lines | 3 not comparable |" in text
     assert "| walk | bare | 0 | not comparable | world to camera |" in text
     assert "## Against" not in text

@@ -82,8 +82,15 @@ def test_the_table_has_every_metric(tmp_path: Path) -> None:
 
 def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None:
     # Proves that errors are called cm where the truth is known to be in metres, and bare numbers of the truth's unit
-    # where it is a run's of free scale, or a file that says nothing. Oracle: the summary of the run, the file's name.
+    # where it is a run's of free scale, or a file that says nothing; and that an estimate of free scale has no errors
+    # after SE(3). Oracle: the summary of the run, the file's name.
     estimate, truth = _files(tmp_path)
+    for scale in ("free (no metric depth): lengths have no unit", "metric"):
+        (tmp_path / "summary.json").write_text(json.dumps({"scale": scale}))
+        printed = CliRunner().invoke(app, [str(tmp_path), str(truth)]).output
+        assert f"scale of the estimate: {scale}" in printed
+        assert [name in printed for name in ("ATE, SE(3)", "ATE, Sim(3)")] == [scale == "metric", True]
+    (tmp_path / "summary.json").unlink()
     value = evaluate_trajectory(*_load((estimate, truth))).sim3.statistics.rmse
     (tmp_path / "run").mkdir()
     of_run = truth.rename(tmp_path / "run" / "trajectory.txt")
@@ -154,16 +161,3 @@ def test_the_truth_of_another_sequence_is_no_success(tmp_path: Path, truth: Traj
     assert "ate_se3_m" in written
     assert not written["comparable"]
     assert any(said in text for text in written["warnings"])
-
-
-def test_a_run_of_free_scale_has_no_errors_in_metres(tmp_path: Path) -> None:
-    # Proves that SE(3) errors are left out where the run says that its scale is free, and that a metric run is
-    # labelled. Oracle: the summaries.
-    files = _files(tmp_path)
-    for scale in ("free (no metric depth): lengths have no unit", "metric"):
-        (tmp_path / "summary.json").write_text(json.dumps({"scale": scale}))
-        result = CliRunner().invoke(app, [str(tmp_path), str(files[1])])
-        assert result.exit_code == 0, result.output
-        assert f"scale of the estimate: {scale}" in result.output
-        assert ("ATE, SE(3)" in result.output) == (scale == "metric")
-        assert "ATE, Sim(3)" in result.output

@@ -19,7 +19,7 @@ from vggtgeo.slam.verdict.finding import Level, Segment, Verdict
 def test_a_pipe_gets_whole_lines_at_once(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The stage and the frames stand there before the run is over, and a terminal keeps its bar. Oracle: the text."""
     run, file = recorded_run(), io.StringIO()
-    monkeypatch.setattr(progress, "MAX_PAUSE", 0.0)
+    monkeypatch.setattr(progress, "LOG_INTERVAL", 0.0)
     with ProgressBar(Console(file=file, force_terminal=terminal, width=100)) as bar:
         bar.on_begin("clip", len(run.states))
         bar.on_stage("compiling")

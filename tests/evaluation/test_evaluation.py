@@ -84,7 +84,8 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("scale", [1.0, 3.7])
 def test_ate_agrees_with_evo(tmp_path: Path, case: str, scale: float) -> None:
-    # Proves that ATE (rmse, mean, median, max) after SE(3) and Sim(3) is evo's on the same files, to 1e-9.
+    # Proves that ATE (rmse, mean, median, max) after SE(3) and Sim(3), and RPE after Sim(3), are evo's on the same
+    # files, to 1e-9.
     full = _truth()
     estimate, truth = _estimate(full, scale).select(CASES[case][0]), full.select(CASES[case][1])
     reference, evo_estimate = _evo_pair(tmp_path, estimate, truth)
@@ -102,6 +103,8 @@ def test_ate_agrees_with_evo(tmp_path: Path, case: str, scale: float) -> None:
             abs(found.maximum - expected["max"]),
         ]
         assert max(errors) < TOLERANCE, f"differs from evo by {errors} (scale: {with_scale})"
+    expected = _evo_statistics(metrics.RPE(), reference, aligned)["rmse"]  # aligned with its scale
+    assert abs(report.relative_sim3.translation_statistics.rmse - expected) < TOLERANCE
 
 
 @pytest.mark.parametrize("all_pairs", [False, True])
@@ -194,16 +197,6 @@ def test_coverage_is_the_share_of_time_that_is_followed() -> None:
     assert coverage(longer, truth) == pytest.approx(1.0)
     slow = Trajectory(3.0 * np.arange(21), _truth(21).poses)  # longer gaps are those of the truth itself
     assert (coverage(slow, slow), coverage(slow.select(slice(11)), slow)) == (1.0, 0.5)
-
-
-def test_rpe_after_sim3_agrees_with_evo(tmp_path: Path) -> None:
-    # Proves that the RPE of an estimate without scale, after its Sim(3) alignment, is evo's, to 1e-9.
-    truth = _truth()
-    reference, evo_estimate = _evo_pair(tmp_path, _estimate(truth, scale=0.2), truth)
-    evo_estimate.align(reference, correct_scale=True)
-    expected = _evo_statistics(metrics.RPE(), reference, evo_estimate)["rmse"]
-    found = evaluate_trajectory(*_both_loaded(tmp_path)).relative_sim3.translation_statistics.rmse
-    assert abs(found - expected) < TOLERANCE, f"{found} against evo's {expected}"
 
 
 @pytest.mark.parametrize("max_dt", [0.0, 0.002, 0.01, 0.05])

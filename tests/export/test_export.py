@@ -305,8 +305,8 @@ def test_submaps_that_nothing_ties_to_the_map_are_left_out(tmp_path: Path) -> No
 
 
 def test_a_run_without_points_or_surfaces_is_refused(folder: Path, tmp_path: Path) -> None:
-    # Proves that a format is not written of nothing, and that the error has the verdict's reason; where the format
-    # needs neither points nor surfaces, a failed verdict is told and the files are written. Oracle: sentences, files.
+    # Proves that a format is not written of nothing, and that a warning has the verdict's reasons, also where the
+    # format needs neither points nor surfaces. Oracle: the files.
     copy = _changed(folder, tmp_path)
     summary = json.loads((copy / "summary.json").read_text())
     verdict = {"level": "failed", "reasons": ["only 3 % of the frames were tracked"], "segments": []}
@@ -317,13 +317,13 @@ def test_a_run_without_points_or_surfaces_is_refused(folder: Path, tmp_path: Pat
     none = Tracks(*(getattr(scene.tracks, field.name)[:0] for field in fields(Tracks)))
     SCENE.write(copy / "scene.npz", replace(scene, tracks=none))
     for name, sentence in (
-        ("colmap", r"scene.npz` .*\(the verdict of the run is failed: only 3 %"),
-        ("nerfstudio", r"map.ply` has no points \(the verdict of the run is failed: only 3 %"),
-        ("ply", "has no points"),
-        ("las", "has no points"),
-        ("glb", "`--dense mvs`"),
+        ("colmap", "scene.npz"),
+        ("nerfstudio", "map.ply"),
+        ("ply", "map.ply"),
+        ("las", "map.ply"),
+        ("glb", "mesh.ply"),
     ):
-        with pytest.raises(vg.InputError, match=sentence):
+        with warns("3 %"), pytest.raises(vg.InputError, match=sentence):
             export(copy, name)
         assert not (copy / "export" / name).exists()
     with warns("3 %"):

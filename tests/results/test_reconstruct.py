@@ -19,6 +19,7 @@ import vggtgeo as vg
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.results.output_checks import EXPORTS
+from vggtgeo.results.source import Source, open_source, with_pose_prior
 from vggtgeo.results.summary import RESERVED_KEYS
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.settings.table import changed
@@ -215,3 +216,45 @@ def test_the_stop_button_keeps_what_there_is(monkeypatch: pytest.MonkeyPatch, st
     assert result.summary["frames"] == len(result.trajectory) == (2 if stop_at == "frame 1" else 4)
     assert any(call.startswith("interrupted: keeping") for call in log.calls)
     assert log.calls[-1] == "finish"
+
+
+@pytest.fixture(scope="module")
+def source() -> Source:
+    return open_source(vg.simulate("room", 3, size=(160, 120)), None, SETTINGS)
+
+
+def test_recorded_poses_are_prior_or_truth(source: Source) -> None:
+    """Those that the reader knows become the prior, and the run has no truth; without a prior they stay the truth."""
+    same, nothing = with_pose_prior(source, None)
+    assert same is source
+    assert nothing is None
+    hidden, recorded = with_pose_prior(source, "recorded")
+    assert hidden.truth is None
+    assert recorded is not None
+    assert source.truth is not None
+    np.testing.assert_array_equal(recorded.trajectory.poses, source.truth.poses)
+
+
+def test_poses_of_a_file_leave_the_truth(source: Source, tmp_path: Path) -> None:
+    """A file of poses is read as a trajectory is, and the truth of the sequence stays."""
+    assert source.truth is not None
+    file = tmp_path / "odometry.txt"
+    source.truth.save_tum(file)
+    same, recorded = with_pose_prior(source, file)
+    assert same.truth is source.truth
+    assert recorded is not None
+    np.testing.assert_allclose(recorded.trajectory.poses, source.truth.poses, atol=1e-6)
+
+
+def test_a_run_says_what_became_of_the_prior() -> None:
+    """Two frames compare no motion: the prior is not used, and the summary and a note say so; there is no truth."""
+    sequence = vg.simulate("room", 2, size=(160, 120))
+    summary = vg.reconstruct(
+        sequence, settings=SETTINGS, pose_prior="recorded", options=vg.RunOptions(dense="none")
+    ).summary
+    assert summary["pose_prior"] == {"used": False, "unit": None, "compared": 0, "evidence": 0.0}
+    assert "truth" not in summary
+    other = vg.Trajectory(np.array([100.0, 101.0]), np.tile(np.eye(4), (2, 1, 1)))
+    summary = vg.reconstruct(sequence, settings=SETTINGS, pose_prior=other, options=vg.RunOptions(dense="none")).summary
+    assert not summary["pose_prior"]["used"]
+    assert "truth" in summary or summary["frames"] < 3

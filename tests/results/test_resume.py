@@ -21,12 +21,11 @@ import vggtgeo.results.reconstruction as reconstruction
 from vggtgeo.cli.main import make_app
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
-from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, Notice, RunSoFar, frames_kept
+from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, RunSoFar, frames_kept, notice_of
 from vggtgeo.results.output_checks import unfinished_message
-from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.results.result import Result
 from vggtgeo.results.run_folder import open_run_folder
-from vggtgeo.results.run_options import RunOptions
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
@@ -169,7 +168,7 @@ def test_warnings_are_counted_once() -> None:
     """What was warned of before the kill and is read again counts once, what is new counts; oracle: the list."""
     slam = Slam(map=Map(metric=True), camera=CameraEstimate(intrinsics=np.ones(4), given=np.ones(4), sigma=np.ones(4)))
     said = [InputWarning("a guess"), LeftOutWarning("frame 3", 2), "words"]
-    before = RunSoFar(slam, {}, tuple(map(Notice.of, said)), {"depth": (4, 1, 9, 2)}, {}, 0.0, 0.0)
+    before = RunSoFar(slam, {}, tuple(map(notice_of, said)), {"depth": (4, 1, 9, 2)}, {}, 0.0, 0.0)
     now = [LeftOutWarning("frame 3", 2), LeftOutWarning("frame 4"), LeftOutWarning("frame 4"), InputWarning("a guess")]
     found = before.merge_warnings(now)
     assert [str(warning) for warning in found] == ["a guess", "frame 3", "words", "frame 4", "frame 4"]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from reported import raises
 
-from vggtgeo.cli.simulate import parse_size
-from vggtgeo.cli.simulate import simulate as simulate_command
+from vggtgeo.cli.data import simulate as simulate_command
+from vggtgeo.cli.options import parse_size
 from vggtgeo.datasets import open_sequence
 from vggtgeo.simulation import IDEAL, WORLDS, Sensor, SyntheticSequence, simulate
 from vggtgeo.simulation.decals import paint_texture

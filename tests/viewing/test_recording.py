@@ -17,7 +17,7 @@ from rrd_files import components_of, entities_of
 from typer.testing import CliRunner
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
-from vggtgeo.benchmark.page import write_page
+from vggtgeo.benchmark.report import write_page
 from vggtgeo.benchmark.worker import recording as recorded
 from vggtgeo.cli.main import make_app
 from vggtgeo.geometry import rigid
@@ -97,17 +97,18 @@ def test_the_recording_holds_every_entity(recording: Path) -> None:
 
 def logged(states: Sequence[Slam], path: Path) -> Path:
     """A recording of what `RerunCallback` shows of the map in these states, state n at frame n."""
-    from vggtgeo.viewing import entities
     from vggtgeo.viewing.callback import LiveMap
+    from vggtgeo.viewing.entities import Entities
     from vggtgeo.viewing.target import open_target
 
     stream = open_target(str(path), "test", path).stream
-    live = LiveMap(stream)
+    entities = Entities(stream)
+    live = LiveMap(entities)
     for number, slam in enumerate(states):
         stream.set_time("frame", sequence=number)
         live.update(slam)
-        entities.log_loops(stream, slam, apart=2)
-        entities.log_lost(stream, slam)
+        entities.loops(slam, apart=2)
+        entities.lost(slam)
     stream.disconnect()
     return path
 

@@ -22,7 +22,6 @@ from typer.testing import CliRunner
 from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.files import write_settings
-from vggtgeo.viewing.target import has_screen
 
 
 def test_a_machine_without_a_screen_gets_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,16 +40,6 @@ def test_a_machine_without_a_screen_gets_the_file(tmp_path: Path, monkeypatch: p
     flush(opened.stream)
     opened.stream.disconnect()
     assert "/notes" in entities_of(path)
-
-
-@pytest.mark.parametrize(("name", "expected"), [("DISPLAY", True), ("WAYLAND_DISPLAY", True), ("SHELL", False)])
-def test_a_screen_is_known_by_the_environment(name: str, expected: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """X11 and Wayland are seen, another variable is no screen."""
-    monkeypatch.setattr(sys, "platform", "linux")
-    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
-        monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setenv(name, ":0")
-    assert has_screen() is expected
 
 
 def test_view_names_the_recording_where_there_is_no_screen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

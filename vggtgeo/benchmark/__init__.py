@@ -8,9 +8,9 @@
 | `processes` | many runs, serial or parallel, each in a process with limits |
 | `cluster` | the same on a Ray cluster |
 | `provenance` | versions, machine, digests of inputs |
-| `table`, `cells` | CSV and Parquet; means, intervals, paired differences; ranks |
-| `published` | figures published by others, shown separately |
-| `markdown`, `figures`, `page` | tables, figures, the HTML report |
+| `rows` | the rows of all runs: CSV and Parquet; means, intervals, paired differences |
+| `tables`, `figures` | what the report shows; figures published by others in tables of their own |
+| `report` | the report as Markdown and as HTML |
 | `runner` | all of it, with trajectories of other systems: `vggtgeo.bench` |
 
 The package is not called `bench`, as `vggtgeo.bench` is the function.

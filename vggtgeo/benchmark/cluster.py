@@ -11,24 +11,15 @@ import json
 import math
 import socket
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vggtgeo.benchmark.jobs import Job, Store
-from vggtgeo.benchmark.processes import (
-    Command,
-    Finished,
-    Limits,
-    claim_cores,
-    describe_ending,
-    run_limited,
-    worker_command,
-)
+from vggtgeo.benchmark.processes import Command, Finished, Limits, claim_cores, run_in, worker_command
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.worker import JOB, LOG, ROW
+from vggtgeo.benchmark.worker import JOB, ROW
 from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path
 
@@ -86,12 +77,11 @@ def run_remotely(job: str, limits: Limits, command: Command, cpus: float) -> tup
         place.mkdir()
         scratch.mkdir()
         (place / JOB).write_text(job, encoding="utf-8")
-        began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         with claim_cores(math.ceil(cpus)) as cores:  # Ray counts processors, but does not assign them
-            ending = run_limited(command(place, scratch), place / LOG, limits, cores)
+            ending = run_in(place, scratch, limits, cores, command)
         files = [path for path in sorted(place.iterdir()) if path.is_file() and path.stat().st_size <= MAX_FILE_SIZE]
         contents = {path.name: path.read_bytes() for path in files if not path.name.startswith(".")}
-    return {**describe_ending(ending, contents.get(LOG, b"")), "started": began, "cpus": cpus}, contents
+    return {**ending, "cpus": cpus}, contents
 
 
 def _store_result(ray: Any, reference: Any, job: Job, store: Store) -> Mapping[str, Any]:

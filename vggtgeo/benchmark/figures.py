@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from vggtgeo.benchmark import cells
+from vggtgeo.benchmark import tables
+from vggtgeo.benchmark.rows import Row, Summary, run_name, select, values
 from vggtgeo.benchmark.suite import Suite
-from vggtgeo.benchmark.table import Row, Summary, run_name, select, values
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import absolute_error, associate
 from vggtgeo.figures.plots import BLUE, INK, ORANGE, RULE, NotebookFigure, line_colour, style, view_axes
@@ -41,11 +41,11 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
     good = [row for row in rows if row["status"] == "ok"]
     column = headline(good)
     panels = {
-        name: [key for key in cells.settings_of(suite, good) if np.isfinite(_errors(good, name, key, column)).any()]
-        for name in cells.sequences_of(suite, good)
+        name: [key for key in tables.settings_of(suite, good) if np.isfinite(_errors(good, name, key, column)).any()]
+        for name in tables.sequences_of(suite, good)
     }
     panels = {name: keys for name, keys in panels.items() if keys}
-    coverage = lambda own: "" if cells.is_covered(own) else cells.at_coverage(own)  # if too small for a comparison
+    coverage = lambda own: "" if tables.is_covered(own) else tables.at_coverage(own)  # if too small for a comparison
     label = lambda name, key: f"{suite.title_of(key)}{coverage(select(good, name, key))}"
     rows_of = {name: [_wrapped(label(name, key), _LABEL) for key in keys] for name, keys in panels.items()}
     heights = [_height(labels) + _MARGIN for labels in rows_of.values()]
@@ -71,14 +71,14 @@ def _height(labels: Sequence[str]) -> float:
     return (_ROW + _LINE * max((label.count("\n") for label in labels), default=0)) * len(labels)
 
 
-def headline(rows: Sequence[Row]) -> cells.Column:
+def headline(rows: Sequence[Row]) -> tables.Column:
     """Return the error to draw: after SE(3) if every run is metric, else after Sim(3)."""
     metric = all(row.get("metric") is not False and not row.get("external") for row in rows)
-    return cells.SE3 if metric else cells.SIM3
+    return tables.SE3 if metric else tables.SIM3
 
 
-def _errors(rows: Sequence[Row], sequence: str, setting: str, column: cells.Column) -> np.ndarray:
-    found = column.factor * values(cells.comparable(select(rows, sequence, setting), column), column.name)
+def _errors(rows: Sequence[Row], sequence: str, setting: str, column: tables.Column) -> np.ndarray:
+    found = column.factor * values(tables.comparable(select(rows, sequence, setting), column), column.name)
     return np.asarray(found[np.isfinite(found) & (found > 0)])
 
 
@@ -117,7 +117,7 @@ class Path3:
 def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[Path3]:
     """Return the first run of each setting on a sequence with a trajectory that can be aligned with the truth."""
     found: list[Path3] = []
-    for setting in cells.settings_of(suite, rows):
+    for setting in tables.settings_of(suite, rows):
         drawn = (_path(suite, row, folder) for row in select(rows, sequence, setting))
         found += islice((one for one in drawn if one is not None), 1)
     return found[:_MAX_LINES]
@@ -169,8 +169,8 @@ def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> Notebo
     """Draw the seconds of each stage, and the peak memory, means over runs; a row a sequence and setting."""
     groups = [
         (_wrapped(f"{sequence}, {suite.title_of(setting)}", _LABEL), own)
-        for sequence in cells.sequences_of(suite, rows)
-        for setting in cells.settings_of(suite, rows)
+        for sequence in tables.sequences_of(suite, rows)
+        for setting in tables.settings_of(suite, rows)
         if (own := [row for row in select(rows, sequence, setting) if not row.get("external")])
     ]
     names = {name for row in rows for name in row if name.startswith("seconds_")} - _STAGES_LEFT_OUT

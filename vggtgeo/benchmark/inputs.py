@@ -37,33 +37,28 @@ from vggtgeo.slam.settings.presets import Perception, perception
 from vggtgeo.slam.settings.slam_settings import Roles
 
 DATA_VARIABLE = "VGGTGEO_DATA"
-_LEVELS = ("", "*", "*/*")
-"""Subfolders between a data folder and a sequence: that of the benchmark, and that of the scene."""
 
 
 def data_folders(given: Iterable[str | os.PathLike[str]] | None) -> tuple[Path, ...]:
     """Return the folders of recordings: those given, else those of `$VGGTGEO_DATA` (separated by `:`), else `data`."""
     if given is not None:
         folders = tuple(Path(path).expanduser() for path in given)
-        for folder in folders:
-            if not folder.is_dir():
-                raise InputError(f"`data` is `{folder}`, which is not a folder")
+        if files := [folder for folder in folders if not folder.is_dir()]:
+            raise InputError(f"`data` is `{files[0]}`, which is not a folder")
         return folders
     named = os.environ.get(DATA_VARIABLE, "data").split(os.pathsep)
     return tuple(Path(name).expanduser() for name in named if name and Path(name).expanduser().is_dir())
 
 
 def find_sequences(path: str, folders: Iterable[Path]) -> list[Path]:
-    """Return all existing `folder / path`, also with up to two folders in between, the preferred one first."""
+    """Return all existing `folder / path`, the preferred one first.
+
+    Up to two folders may be in between: that of the benchmark, and that of the scene.
+    """
     wanted = Path(path).expanduser()
     if wanted.is_absolute():
         return [wanted.resolve()] if is_there(wanted) else []
-    parents = (
-        parent
-        for folder in folders
-        for level in _LEVELS
-        for parent in ([folder] if not level else sorted(folder.glob(level)))
-    )
+    parents = [one for folder in folders for one in (folder, *sorted(folder.glob("*")), *sorted(folder.glob("*/*")))]
     return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if is_there(parent / wanted)))
 
 
@@ -105,18 +100,16 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
             scan.scanned_points()
         references = {name: Trajectory.load_tum(Path(spec["path"]) / file) for name, file in spec["references"].items()}
         return Input(sequence, _perceived(spec, sequence.has_depth), exact, scan, references=references)
-    rendered, is_plain = _rendered(spec["simulate"], seed, scratch), spec["degrade"] == "base"
+    (rendered, oracle), is_plain = _rendered(spec["simulate"], seed, scratch), spec["degrade"] == "base"
     if spec["perception"] == "simulated":
         if not is_plain:
             raise InputError(
                 f"`degrade` is {spec['degrade']!r}, but simulated roles use the undegraded images; leave it out, or "
                 "use other roles"
             )
-        roles = Perception(simulated_roles(rendered.oracle, spec, seed), {})
-        return Input(rendered, roles, rendered.oracle, simulated=True)
+        return Input(rendered, Perception(simulated_roles(oracle, spec, seed), {}), oracle, simulated=True)
     sequence = _without(rendered if is_plain else degraded(rendered, spec["degrade"], seed), spec)
-    perceived = _perceived(spec, sequence.has_depth)
-    return Input(sequence, perceived, rendered.oracle if is_plain else None, simulated=True)
+    return Input(sequence, _perceived(spec, sequence.has_depth), oracle if is_plain else None, simulated=True)
 
 
 def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
@@ -124,7 +117,7 @@ def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
     return hashlib.sha256(json.dumps([dict(simulate), seed], sort_keys=True).encode()).hexdigest()[:16] + ".walk"
 
 
-def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> RenderedWalk:
+def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> tuple[RenderedWalk, SimulatedOracle]:
     """Return the walk of a suite's table `simulate`, from the scratch folder or rendered (0.25 s a frame)."""
     if scratch is None:
         return _render(table, seed)
@@ -134,23 +127,24 @@ def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> Rend
             with atomic_open(kept, "wb") as stream:
                 pickle.dump(_render(table, seed), stream, pickle.HIGHEST_PROTOCOL)
     with kept.open("rb") as stream:
-        walk: RenderedWalk = pickle.load(stream)  # safe: written above, in a folder private to this user
+        walk: tuple[RenderedWalk, SimulatedOracle] = pickle.load(stream)  # safe: written above, in a private folder
     return walk
 
 
-def _render(table: Mapping[str, Any], seed: int) -> RenderedWalk:
+def _render(table: Mapping[str, Any], seed: int) -> tuple[RenderedWalk, SimulatedOracle]:
     asked = WalkTable(**table)
     size = asked.size[0], asked.size[1]
     rendered = simulate(asked.scene, asked.frames, seed, size, rate=asked.rate, speed=asked.speed)
     oracle = SimulatedOracle(rendered, kept=asked.frames)
     recording = Recording(list(oracle.frames()), oracle.camera, oracle.ground_truth())
-    return RenderedWalk(oracle.name, recording, oracle)
+    return RenderedWalk(oracle.name, recording), oracle
 
 
 @dataclass(frozen=True, eq=False)
-class DegradedWalk:
-    """A rendered walk in memory, so that a run's time excludes rendering: 3 MB per frame of 320 x 240. Its camera is
-    the one that a user would assume.
+class RenderedWalk:
+    """A rendered walk in memory, so that a run's time excludes rendering: 3 MB per frame of 320 x 240.
+
+    If it is degraded, its camera is the one that a user would assume.
     """
 
     name: str
@@ -176,17 +170,10 @@ class DegradedWalk:
         return self.recording.truth
 
 
-@dataclass(frozen=True, eq=False)
-class RenderedWalk(DegradedWalk):
-    """A walk without any degradation, and what is true of it."""
-
-    oracle: SimulatedOracle
-
-
-def degraded(walk: RenderedWalk, name: str, seed: int) -> DegradedWalk:
+def degraded(walk: RenderedWalk, name: str, seed: int) -> RenderedWalk:
     """Return the walk after the degradation `name`, with noise from the seed."""
     changed = DEGRADATIONS[name](walk.recording, np.random.default_rng([seed, 23]))
-    return DegradedWalk(f"{walk.name}, {name}", changed)
+    return RenderedWalk(f"{walk.name}, {name}", changed)
 
 
 def simulated_roles(oracle: SimulatedOracle, spec: Mapping[str, Any], seed: int) -> Roles:
@@ -231,7 +218,7 @@ _DELAY = 0.005
 
 @dataclass(frozen=True, eq=False)
 class RecordedFrames:
-    """Exact frames of a recording whose depth files are exact."""
+    """Exact frames of a recording whose depth files are exact; `SimulatedOracle` has the same methods."""
 
     sequence: Sequence
     truth: Trajectory
@@ -250,7 +237,6 @@ class RecordedFrames:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the recording."""
         return self.sequence.camera
 
     def __len__(self) -> int:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,11 @@ from typing import Any
 from vggtgeo.benchmark.inputs import find_sequences
 from vggtgeo.benchmark.measure import NOT_COMPARABLE
 from vggtgeo.benchmark.provenance import input_hash
+from vggtgeo.benchmark.rows import Row
 from vggtgeo.benchmark.suite import PROTOCOLS, SequenceTable, SettingTable, Suite
-from vggtgeo.benchmark.table import Row
 from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.datasets.opening import is_readable
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_json
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -28,7 +27,7 @@ from vggtgeo.slam.settings.table import changed, updated
 @dataclass(frozen=True)
 class Job:
     """One run. spec: everything it depends on, plain values; its `path` is None if the recording is missing. absent:
-    message with the folders that were searched.
+    message for that case.
     """
 
     sequence: str
@@ -65,10 +64,7 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
     for sequence in suite.sequence:
         places = sorted(find_sequences(sequence.path, roots) if sequence.path else [], key=unreadable)
         place = next(iter(places), None)
-        if len(places) > 1:
-            text = f"`{sequence.path}` exists {len(places)} times below `data`; `{place}` is taken"
-            warnings.warn(text, InputWarning, stacklevel=2)
-        absent = _absent(sequence.path, roots) if place is None else ""
+        absent = f"`{sequence.path}` not found, nor in subfolders two levels deep; give its folder with `--data FOLDER`"
         digest = "" if place is None else input_hash(place)
         settings = [table for table in suite.setting if not table.sequences or sequence.name in table.sequences]
         specs = {setting.name: _spec(suite, sequence, setting, place) for setting in settings}
@@ -78,12 +74,6 @@ def jobs_of(suite: Suite, data: Iterable[Path]) -> list[Job]:
                 if seed - suite.first_seed < (setting.seeds or suite.seeds):
                     found.append(Job(sequence.name, setting.name, seed, specs[setting.name], digest, absent))
     return found
-
-
-def _absent(path: str, roots: Sequence[Path]) -> str:
-    if roots and not Path(path).expanduser().is_absolute():
-        return f"`{path}` not found in {', '.join(f'`{root}`' for root in roots)}, nor in subfolders two levels deep"
-    return f"`{path}` does not exist; give the folder of recordings with `--data FOLDER`"
 
 
 def _spec(suite: Suite, sequence: SequenceTable, setting: SettingTable, place: Path | None) -> dict[str, Any]:

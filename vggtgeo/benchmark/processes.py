@@ -25,7 +25,7 @@ import psutil
 from vggtgeo.benchmark.inputs import walk_name
 from vggtgeo.benchmark.jobs import Job, Store
 from vggtgeo.benchmark.provenance import provenance
-from vggtgeo.benchmark.table import Row
+from vggtgeo.benchmark.rows import Row
 from vggtgeo.benchmark.worker import LOG
 from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.io.errors import InputError
@@ -208,9 +208,10 @@ def run_jobs(
         def work(job: Job) -> None:
             cores = free.get()
             try:
-                row = run_one(job, store, limits, cores, command, scratch, stop)
+                ending = run_in(store.begin(job), scratch, limits, cores, command, stop)
             finally:
                 free.put(cores)
+            row = store.complete(job, **ending, cpus=len(cores))
             with lock:
                 if job.spec["simulate"]:
                     name = walk_name(job.spec["simulate"], job.seed)
@@ -230,30 +231,26 @@ def run_jobs(
                 raise
 
 
-def run_one(
-    job: Job,
-    store: Store,
+def run_in(
+    place: Path,
+    scratch: Path,
     limits: Limits,
     cores: Sequence[int],
     command: Command,
-    scratch: Path,
     stop: threading.Event | None = None,
-) -> Row:
-    """Run one job and return its row."""
-    place = store.begin(job)
-    began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    log = place / LOG
-    ending = describe_ending(run_limited(command(place, scratch), log, limits, cores, stop), log.read_bytes())
-    return store.complete(job, **ending, started=began, cpus=len(cores))
+) -> dict[str, Any]:
+    """Run the job in the folder `place`; return the columns on how and where it ended.
 
-
-def describe_ending(ending: Ending, log: bytes) -> dict[str, Any]:
-    """Return the columns on how and where a process ended; their status is used if the run wrote no row."""
+    Their status is used if the run wrote no row.
+    """
+    began, log = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), place / LOG
+    ending = run_limited(command(place, scratch), log, limits, cores, stop)
     message, status = ending.message, "crash" if ending.status in ("ended", "killed") else ending.status
     if ending.status == "ended" and ending.code > 0:
-        lines = log[-_TAIL:].decode(errors="replace").split("\n")
+        lines = log.read_bytes()[-_TAIL:].decode(errors="replace").split("\n")
         message += f": {next((line.strip() for line in reversed(lines) if line.strip()), '')}"
     return {
+        "started": began,
         "status": status,
         "message": message,
         "seconds_wall": ending.seconds,

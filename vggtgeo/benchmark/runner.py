@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -12,18 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.benchmark import markdown
-from vggtgeo.benchmark.cells import COMPARED, finished, is_covered
 from vggtgeo.benchmark.cluster import Cluster, run_jobs_on_cluster
 from vggtgeo.benchmark.figures import ablation_figure
 from vggtgeo.benchmark.inputs import data_folders
 from vggtgeo.benchmark.jobs import Job, Store, jobs_of
 from vggtgeo.benchmark.measure import trajectory_errors
-from vggtgeo.benchmark.page import write_page
 from vggtgeo.benchmark.processes import Limits, run_jobs
 from vggtgeo.benchmark.provenance import input_hash, source_digest
+from vggtgeo.benchmark.report import markdown, write_page
+from vggtgeo.benchmark.rows import LESS_BASELINE, Row, as_csv, run_name, write_parquet
 from vggtgeo.benchmark.suite import ExternalTable, Suite, load_suite, restrict
-from vggtgeo.benchmark.table import LESS_BASELINE, Row, as_csv, run_name, write_parquet
+from vggtgeo.benchmark.tables import COMPARED, finished, is_covered
 from vggtgeo.datasets import open_sequence
 from vggtgeo.datasets.image_files import is_there
 from vggtgeo.datasets.pose_files import load_trajectory
@@ -31,7 +29,7 @@ from vggtgeo.evaluation import evaluate_trajectory, followed
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import locked_folder, write_text
 from vggtgeo.io.given import path_of
 
@@ -59,7 +57,7 @@ class BenchReport:
 
     def markdown(self) -> str:
         """Return the tables: means and standard deviations, differences to the baseline, failures, provenance."""
-        return markdown.page(self.suite, self.rows)
+        return markdown(self.suite, self.rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the name of the suite and all rows as plain values."""
@@ -145,7 +143,6 @@ def bench(
         raise InputError(f"`workers` must be at least 1, got {workers}")
     jobs = jobs_of(chosen, data_folders(data))
     base = Path(suite).parent if not isinstance(suite, Suite) else Path()
-    warn_of_missing(chosen, jobs, base)
     with locked_folder(folder, _LOCK, "batch"):  # two batches would delete each other's runs
         store = Store(folder, chosen.name, source_digest())
         limits = Limits(60 * chosen.timeout_minutes, chosen.memory_gb)
@@ -159,8 +156,6 @@ def bench(
 
 def _check_output(folder: Path) -> None:
     """Raise InputError if the batch would replace files of something else, for example of a single run."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"`output` is `{folder}`, which is a file; give a folder")
     there = [name for name in OUTPUTS if (folder / name).exists()]
     if there and not (folder / "runs").is_dir() and not {"tables.md", "runs.csv"} <= set(there):
         raise InputError(
@@ -204,32 +199,19 @@ def all_rows(
 def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> list[Row]:
     """Return a row for each existing file of `[[external]]`; `files` is relative to the folder `base`.
 
-    The ground truth is that of a run on the same sequence and seed (in `runs`), or of the recording.
+    The ground truth is that of a run on the same sequence and seed (in `runs`), or of the recording. Warn of a system
+    without any file.
     """
-    return [
-        _external_row(suite, table, job, file, runs)
-        for table in suite.external
-        for file, job in _external_files(table, jobs, base).items()
-        if is_there(file)
-    ]
-
-
-def warn_of_missing(suite: Suite, jobs: Sequence[Job], base: Path) -> None:
-    """Warn of each `[[external]]` without any file, before the runs begin."""
+    rows = []
     for table in suite.external:
-        files = list(_external_files(table, jobs, base))
-        if files and not any(map(is_there, files)):
-            more = f", nor any other of {len(files)} files" if len(files) > 1 else ""
-            text = f"external `{table.name}` has no trajectory: `{files[0]}` does not exist{more}"
-            warnings.warn(text, InputWarning, stacklevel=2)
-
-
-def _external_files(table: ExternalTable, jobs: Sequence[Job], base: Path) -> dict[Path, Job]:
-    """Return the files of the trajectories, each with its first job."""
-    files: dict[Path, Job] = {}
-    for job in jobs:
-        files.setdefault(base / table.file(job.sequence, job.seed), job)
-    return files
+        files: dict[Path, Job] = {}
+        for job in jobs:
+            files.setdefault(base / table.file(job.sequence, job.seed), job)
+        there = {file: job for file, job in files.items() if is_there(file)}
+        if files and not there:
+            warn(f"external `{table.name}` has no trajectory: `{next(iter(files))}` does not exist")
+        rows += [_external_row(suite, table, job, file, runs) for file, job in there.items()]
+    return rows
 
 
 def _external_row(suite: Suite, table: ExternalTable, job: Job, file: Path, runs: Path) -> Row:

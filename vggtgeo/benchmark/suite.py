@@ -7,15 +7,16 @@ file is read.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Self
 
-from vggtgeo.benchmark.published import check_published
 from vggtgeo.datasets.opening import KINDS
 from vggtgeo.evaluation.alignment import AXES
 from vggtgeo.io.errors import InputError
@@ -46,28 +47,23 @@ class CheckedTable:
     @classmethod
     def read(cls, where: str, values: Any) -> Self:
         """Return the table of plain values; raise InputError with `where` for an unknown key or an invalid value."""
-        known = {entry.name: entry for entry in dataclasses.fields(cls)}
+        types = {entry.name: str(entry.type).removesuffix(" | None") for entry in dataclasses.fields(cls)}
         if not isinstance(values, Mapping):
             raise InputError(f"{where} is {values!r}; it must be a table")
+        try:
+            inspect.signature(cls).bind(**values)
+        except TypeError as error:
+            raise InputError(f"{where}: {error}; its keys are {', '.join(types)}") from None
         for key, value in values.items():
-            if key not in known:
-                raise InputError(f"{where} has the key `{key}`; it may have {', '.join(known)}")
-            kinds, inner, words = _KINDS.get(str(known[key].type).removesuffix(" | None"), ((), (), ""))
+            kinds, inner, words = _KINDS.get(types[key], ((), (), ""))
             entries = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
             # The exact type: in Python, `isinstance(True, int)`.
             if kinds and not (type(value) in kinds and all(type(one) in inner for one in entries if inner)):
                 raise InputError(f"{where}: `{key}` is {value!r}; it must be {words}")
-        missing = [f"`{name}`" for name, entry in known.items() if name not in values and _is_required(entry)]
-        if missing:
-            raise InputError(f"{where}: {', '.join(missing)} missing")
         try:
             return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
-
-
-def _is_required(entry: dataclasses.Field[Any]) -> bool:
-    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
 
 
 @dataclass(frozen=True)
@@ -89,8 +85,6 @@ PROTOCOLS: dict[str, Protocol] = {
     "dpvo": Protocol(1, "all", "DPVO: every frame; its own tables print the median of the trials, these the mean"),
     "vggt-slam": Protocol(1, "keyframes", "VGGT-SLAM: keyframes by the flow of the image"),
 }
-
-
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
 
@@ -263,7 +257,7 @@ class Suite(CheckedTable):
             if not getattr(self, name) > 0:
                 raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
         for name in self.published:
-            check_published(name)
+            _one_of("published", name, tuple(packaged("published")))
         for key in ("sequence", "setting"):
             if not getattr(self, key):
                 raise InputError(f"`[[{key}]]` is missing; give at least one")
@@ -285,11 +279,15 @@ class Suite(CheckedTable):
         return next((table.title for table in (*self.setting, *self.external) if table.name == setting), "") or setting
 
 
+def packaged(folder: str) -> dict[str, Traversable]:
+    """Return the TOML files of a folder of this package by their names: `suites`, `published`."""
+    found = {entry.name.removesuffix(".toml"): entry for entry in (files("vggtgeo.benchmark") / folder).iterdir()}
+    return dict(sorted(found.items()))
+
+
 def shipped() -> dict[str, str]:
     """Return names and titles of the suites in the package."""
-    folder = files("vggtgeo.benchmark") / "suites"
-    found = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith(".toml"))
-    return {name[:-5]: tomllib.loads((folder / name).read_text("utf-8"))["title"] for name in found}
+    return {name: tomllib.loads(file.read_text("utf-8"))["title"] for name, file in packaged("suites").items()}
 
 
 def load_suite(name: str | Path) -> Suite:
@@ -297,16 +295,12 @@ def load_suite(name: str | Path) -> Suite:
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         try:
-            text = whole_text(path, errors="strict")
-        except ValueError as error:
-            raise InputError(
-                f"`{path}` cannot be read: {error}; give a TOML file or one of {', '.join(shipped())}"
-            ) from None
-        return read_suite(text, path.stem, f"`{path}`")
+            return read_suite(whole_text(path, errors="strict"), path.stem, f"`{path}`")
+        except UnicodeDecodeError as error:
+            raise InputError(f"`{path}` is not a text file: {error}") from None
     if str(name) not in shipped():
         raise InputError(f"`{name}` is neither a TOML file nor a shipped suite: {', '.join(shipped())}")
-    text = (files("vggtgeo.benchmark") / "suites" / f"{name}.toml").read_text("utf-8")
-    return read_suite(text, str(name), f"suite `{name}`")
+    return read_suite(packaged("suites")[str(name)].read_text("utf-8"), str(name), f"suite `{name}`")
 
 
 def read_suite(text: str, name: str, where: str) -> Suite:
@@ -315,11 +309,8 @@ def read_suite(text: str, name: str, where: str) -> Suite:
         values = tomllib.loads(text)
     except ValueError as error:
         raise InputError(f"{where} is not valid TOML: {error}") from None
-    kinds: dict[str, type[CheckedTable]] = {
-        "sequence": SequenceTable,
-        "setting": SettingTable,
-        "external": ExternalTable,
-    }
+    kinds: dict[str, type[CheckedTable]]
+    kinds = {"sequence": SequenceTable, "setting": SettingTable, "external": ExternalTable}
     for key, kind in kinds.items():
         entries = values.get(key, [])
         if not isinstance(entries, list):

@@ -21,8 +21,7 @@ from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.io.errors import InputError, collected_warnings
 from vggtgeo.io.files import write_json
 from vggtgeo.io.process import peak_memory_gb
-from vggtgeo.results.reconstruction import reconstruct
-from vggtgeo.results.run_options import RunOptions
+from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import updated

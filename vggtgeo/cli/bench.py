@@ -11,7 +11,7 @@ import typer
 from vggtgeo.cli.options import JsonOption
 
 if TYPE_CHECKING:
-    from vggtgeo.benchmark.table import Row
+    from vggtgeo.benchmark.rows import Row
 
 
 def bench(

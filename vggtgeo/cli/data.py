@@ -1,4 +1,4 @@
-"""`vggtgeo data`: list known datasets (`datasets/catalogue.toml`), and check a recording."""
+"""`vggtgeo data`: list known datasets (`catalogue.toml`), check a recording; `vggtgeo simulate`: render one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from vggtgeo.cli.options import EXIT_INPUT, JsonOption
+from vggtgeo.cli.options import EXIT_INPUT, JsonOption, QuietOption, parse_size
 
 data = typer.Typer(
     help="Where to get recordings, and what is wrong with one.", no_args_is_help=True, add_completion=False
@@ -62,3 +62,37 @@ def catalogue() -> list[dict[str, str]]:
     text = (files("vggtgeo.datasets") / "catalogue.toml").read_text("utf-8")
     entries: list[dict[str, str]] = tomllib.loads(text)["entry"]
     return entries
+
+
+def simulate(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="room, office, hall, corridor, staircase or building.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder for the sequence.")],
+    frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of frames.")] = 300,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Decides everything that is random.")] = 0,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Image size, pixels.")] = "640x480",
+    rate: Annotated[float, typer.Option(help="Frames a second.")] = 30.0,
+    speed: Annotated[float | None, typer.Option(help="Metres a second; the scene's own if left out.")] = None,
+    blur: Annotated[float, typer.Option(help="Motion blur: seconds the shutter is open.")] = 0.0,
+    readout: Annotated[float, typer.Option(help="Rolling exposure: seconds from first to last row.")] = 0.0,
+    exposure_swing: Annotated[float, typer.Option(help="Relative change of exposure over time.")] = 0.0,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Render a hand-held walk through SCENE as a TUM RGB-D folder with exact truth."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from vggtgeo import simulation
+    from vggtgeo.simulation.sequence import check_new, write_tum_folder
+
+    check_new(output)  # before a world is built
+    sensor = simulation.Sensor(exposure_time=blur, readout_time=readout, exposure_swing=exposure_swing)
+    console = Console(quiet=quiet or as_json)
+    sequence = simulation.simulate(scene, frames, seed, parse_size(size), rate=rate, speed=speed, sensor=sensor)
+    for _ in track(write_tum_folder(sequence, output), description=f"rendering {scene}", total=frames, console=console):
+        pass
+    length = sequence.ground_truth().length
+    console.print(f"{frames} frames over {length:.1f} m of path, simulated with seed {seed}: {output}", soft_wrap=True)
+    if as_json:
+        facts = {"scene": scene, "frames": frames, "seed": seed, "rate": rate, "path_length_m": length}
+        typer.echo(json.dumps({**facts, "folder": str(output), "simulated": True}))

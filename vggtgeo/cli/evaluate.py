@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import json
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from vggtgeo.cli.options import EXIT_FAILED, JsonOption
-from vggtgeo.io.errors import InputWarning, collected_warnings
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.errors import collected_warnings, warn
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from vggtgeo.evaluation import TrajectoryReport
-    from vggtgeo.geometry.trajectory import Trajectory
 
 MAX_TIME_DIFFERENCE = 0.01
 """Seconds; that of `vggtgeo.evaluation.association`, repeated so that `--help` does not import it."""
-
-_WRITTEN_BY_RUNS = ("trajectory.txt", "keyframes.txt")
-_BENCHMARKS = ("groundtruth.txt", "groundtruth.csv", "data.csv", ".gt.freiburg")
-"""Endings of ground-truth files in metres: TUM RGB-D (and datasets of its layout), EuRoC, ICL-NUIM."""
 
 
 def evaluate(
@@ -51,7 +44,7 @@ def evaluate(
     """
     from vggtgeo.evaluation import comparability, estimate_offsets, evaluate_trajectory, shifted
     from vggtgeo.evaluation.alignment import AXES
-    from vggtgeo.results.reading import load_estimate
+    from vggtgeo.results.reading import load_estimate, load_scale, load_truth
 
     with collected_warnings() as warned:
         true, metres = load_truth(truth)
@@ -63,10 +56,9 @@ def evaluate(
         metric = metres is not False and scale is not None and scale.startswith("metric")
         verdict = comparability(found, true, max_dt, metric)
         offsets = estimate_offsets(found, true, max_dt)
-        for text in (*verdict.reasons, *verdict.doubts):
-            warnings.warn(text, InputWarning, stacklevel=2)
-        if offsets is not None and offsets.explains:
-            warnings.warn(offsets.message, InputWarning, stacklevel=2)
+        explained = [offsets.message] if offsets is not None and offsets.explains else []
+        for text in (*verdict.reasons, *verdict.doubts, *explained):
+            warn(text)
         rest, left = None, verdict
         if estimate_offset and offsets is not None:
             true = offsets.removed(found, true)
@@ -87,39 +79,6 @@ def evaluate(
     if left.reasons:
         typer.echo("NOT COMPARABLE: these errors are meaningless, see the warnings", err=True)
         raise typer.Exit(EXIT_FAILED)
-
-
-def load_scale(path: Path) -> str | None:
-    """Return the scale in a run's summary, for its folder or a pose file in it; None for other files, and, with a
-    warning, if the summary is invalid.
-    """
-    from vggtgeo.results.summary import describe_error
-
-    file = (path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path) / "summary.json"
-    if not file.is_file():
-        return None
-    try:
-        return str(json.loads(whole_text(file, errors="strict"))["scale"])
-    except (ValueError, KeyError, TypeError) as error:
-        text = f"`{file}` is invalid ({describe_error(error)}): scale and verdict of the run are unknown"
-        warnings.warn(InputWarning(text), stacklevel=2)
-        return None
-
-
-def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
-    """Load the trajectory of a file, or the ground truth of a dataset folder; return it, and whether its lengths are
-    metres: by a run's summary, or by a benchmark's file name; None if unknown.
-    """
-    from vggtgeo.datasets import open_sequence
-    from vggtgeo.datasets.pose_files import load_trajectory
-    from vggtgeo.results.reading import truth_of
-
-    if path.is_dir():
-        sequence = open_sequence(path)
-        return truth_of(sequence), getattr(sequence, "truth_in_metres", True)
-    scale = load_scale(path)
-    known = True if path.name.endswith(_BENCHMARKS) else None
-    return load_trajectory(path), known if scale is None else scale.startswith("metric")
 
 
 def print_report(report: TrajectoryReport, scale: str | None = None, metres: bool | None = True) -> None:

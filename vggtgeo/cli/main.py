@@ -19,12 +19,11 @@ import typer
 from typer.core import TyperGroup
 
 from vggtgeo.cli.bench import bench
-from vggtgeo.cli.data import data
+from vggtgeo.cli.data import data, simulate
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.cli.models import models
 from vggtgeo.cli.options import EXIT_FAILED, EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
-from vggtgeo.cli.run import demo, run
-from vggtgeo.cli.simulate import simulate, warm_up
+from vggtgeo.cli.run import demo, run, warm_up
 from vggtgeo.cli.solve import solve
 from vggtgeo.cli.view import export, view
 from vggtgeo.compilation.jax_environment import jax_environment
@@ -181,7 +180,7 @@ def _is_short_of_memory(error: BaseException) -> bool:
 
 def _usage_message(error: Any, command: str) -> str:
     """Return the error in the command line or in a settings file, and a hint to the help of the command."""
-    message = error.format_message().rstrip(".").replace("Value error, ", "").replace("Input should", "it should")
+    message = error.format_message().rstrip(".")
     context, parameter = error.ctx, getattr(error, "param", None)
     if context is not None:
         command = context.command_path

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from vggtgeo.io.errors import InputError
 from vggtgeo.results.output_checks import EVERY
 
 EXIT_INTERNAL = 1
@@ -231,31 +232,30 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """
     hints = typing.get_type_hints(command, include_extras=True)
     groups = {name: kind for name, kind in hints.items() if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
-    options = []
+    options: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
-        if name not in groups:
-            options.append(_option(name, hints[name], parameter.default))
-            continue
-        types = typing.get_type_hints(groups[name], include_extras=True)
-        for entry in dataclasses.fields(groups[name]):
-            options.append(_option(entry.name, types[entry.name], entry.default))
-    signature = inspect.Signature(options)
+        source = groups.get(name)
+        types = hints if source is None else typing.get_type_hints(source, include_extras=True)
+        own = [parameter] if source is None else inspect.signature(source).parameters.values()
+        options += [one.replace(annotation=types[one.name]) for one in own]
 
     @functools.wraps(command)
-    def with_groups(*args: Any, **kwargs: Any) -> None:
-        bound = signature.bind(*args, **kwargs)
-        bound.apply_defaults()
-        values = bound.arguments
-        made = {
-            name: kind(**{entry.name: values.pop(entry.name) for entry in dataclasses.fields(kind)})
-            for name, kind in groups.items()
-        }
-        command(**values, **made)
+    def with_groups(**values: Any) -> None:
+        for name, kind in groups.items():
+            values[name] = kind(**{entry.name: values.pop(entry.name) for entry in dataclasses.fields(kind)})
+        command(**values)
 
-    with_groups.__signature__ = signature  # type: ignore[attr-defined]
+    with_groups.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     with_groups.__annotations__ = {option.name: option.annotation for option in options}
     return with_groups
 
 
-def _option(name: str, kind: Any, default: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=kind)
+def parse_size(text: str) -> tuple[int, int]:
+    """Return (width, height) of a text like 640x480; raise InputError for anything else."""
+    try:
+        width, height = (int(part) for part in text.lower().split("x"))
+    except ValueError:
+        raise InputError(f"`--size` must be two integers, as in 640x480, got {text!r}") from None
+    if min(width, height) < 16 or max(width, height) > 8192:
+        raise InputError(f"`--size` must have sides of 16 to 8192 pixels, got {text!r}")
+    return width, height

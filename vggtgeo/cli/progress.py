@@ -23,10 +23,8 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Verdict
 
-MIN_PAUSE, MAX_PAUSE = 5.0, 60.0
-"""Seconds between two log lines: few lines for short runs, a sign of life for long ones."""
-PARTS = 10
-"""Of a run: a log line for each, at least `MIN_PAUSE` apart."""
+LOG_INTERVAL = 20.0
+"""Seconds between two log lines."""
 NAME_WIDTH, BAR_WIDTH = 40, 16
 """Characters: beside both, a count of five digits and a clock fit into 80 columns."""
 MAX_NAMED = 3
@@ -70,7 +68,6 @@ class ProgressBar(Callback):
         self._notes = self._resumed = 0
         self._began = self._last_line = 0.0
         self._total: int | None = None
-        self._part = 0
         self._stage: TaskID | None = None
 
     def __enter__(self) -> Self:
@@ -93,7 +90,8 @@ class ProgressBar(Callback):
         state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {doing}"
         self._progress.state = state
         self._progress.update(self._task, advance=1)
-        if self._lines and self._is_due(len(slam.frames)):
+        if self._lines and time.perf_counter() >= self._last_line + LOG_INTERVAL:
+            self._last_line = time.perf_counter()
             self._print(f"{len(slam.frames)}{f' of {self._total}' if self._total else ''} frames: {state}")
         self._print_new_notes(slam)
 
@@ -117,15 +115,6 @@ class ProgressBar(Callback):
 
     def on_finish(self, slam: Slam, cloud: PointCloud) -> None:
         self._print_new_notes(slam)
-
-    def _is_due(self, done: int) -> bool:
-        """Return whether it is time for a log line."""
-        now, part = time.perf_counter(), PARTS * done // self._total if self._total else self._part
-        pause = now - self._last_line
-        due = pause >= MAX_PAUSE or (pause >= MIN_PAUSE and part > self._part)
-        if due:
-            self._last_line, self._part = now, part
-        return due
 
     def _end_stage(self) -> None:
         if self._stage is not None:

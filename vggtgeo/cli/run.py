@@ -1,4 +1,4 @@
-"""`vggtgeo run`: estimate trajectory and map of a sequence; `vggtgeo demo`: of a synthetic office.
+"""`vggtgeo run`: estimate trajectory and map of a sequence; `vggtgeo demo`: of a synthetic office; `vggtgeo warm-up`.
 
 Heavy modules are imported inside functions, so that `vggtgeo run --help` is fast.
 """
@@ -26,10 +26,11 @@ from vggtgeo.cli.options import (
     ResumeOption,
     SequenceArgument,
     SwitchOptions,
+    parse_size,
     with_option_groups,
 )
 from vggtgeo.cli.settings_file import SettingsOption, pipeline_settings
-from vggtgeo.io.errors import GuessedCameraWarning, InputError, InputWarning, UnusableDepthWarning, collected_warnings
+from vggtgeo.io.errors import GuessedCameraWarning, InputError, UnusableDepthWarning, collected_warnings, warn
 
 if TYPE_CHECKING:
     from vggtgeo.datasets import Sequence
@@ -42,8 +43,6 @@ REFINE = {None: "auto", True: "always", False: "never"}
 """The setting behind `--refine-intrinsics`, `--fix-intrinsics`, or neither."""
 DEMO_SIZE = (480, 360)
 """Pixels: large enough for a dense map, small enough to render during the run."""
-MAX_FPS = 1e5
-"""Above that of any camera; at higher rates the times of frames would be equal after rounding."""
 
 
 @with_option_groups
@@ -58,39 +57,12 @@ def run(
     options: ResultOptions,
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
-    from vggtgeo.datasets.frame import check_selection
-    from vggtgeo.datasets.opening import check_there
-    from vggtgeo.results.output_checks import check_can_be_written, check_output, is_in_results
-    from vggtgeo.viewing.target import check_target
-
-    rerun = options.rerun and check_target(options.rerun)
-    if perception.memory_limit_gb is not None and not 0 < perception.memory_limit_gb < float("inf"):
-        raise InputError(f"`--memory-limit-gb` must be positive, got {perception.memory_limit_gb:g}")
-    if given.fps is not None and not 0 < given.fps <= MAX_FPS:
-        raise InputError(f"`--fps` must be positive, at most {MAX_FPS:g} frames per second, got {given.fps:g}")
-    if given.kind != "camera":
-        check_there(path)
     if options.save_map is not None:
         check_map_place(options.save_map, output)
-    if rerun and rerun not in ("spawn", "serve") and is_in_results(output, Path(rerun)):
-        raise InputError(
-            f"`--rerun` is `{rerun}`, in a folder that the run replaces; give another, for example `{output}/run.rrd`"
-        )
-    check_output(output, Path(path))
-    check_can_be_written(output)
     with collected_warnings() as warned:
         sequence = open_input(path, given)
-    if len(sequence):  # zero for a live camera
-        check_selection(sequence.name, len(sequence), given.start, given.end, given.stride)
-    if perception.provider == "cuda":
-        from vggtgeo.models.onnx.session import choose_provider
-
-        choose_provider("cuda")  # is there a GPU?
-    if options.save_depth and options.dense == "none":
-        text = "`--save-depth` has no effect with `--dense none`: no keyframe has dense depth"
-        warnings.warn(text, InputWarning, stacklevel=2)
     from vggtgeo.cli.run_sequence import run_and_write
-    from vggtgeo.results.run_options import RunOptions
+    from vggtgeo.results.reconstruction import RunOptions
     from vggtgeo.slam.run import default_roles
 
     slam_settings = pipeline_settings(settings, options.assignments or (), tables_of_switches(switches, options))
@@ -121,18 +93,15 @@ def demo(
 ) -> None:
     """Run in a synthetic office with exact truth, rendered on the spot."""
     from vggtgeo.cli.run_sequence import run_and_write
-    from vggtgeo.results.run_options import RunOptions
+    from vggtgeo.results.reconstruction import RunOptions
     from vggtgeo.simulation import simulate
     from vggtgeo.slam.settings.slam_settings import Roles
-    from vggtgeo.slam.window.sliding_window import warm_up
-    from vggtgeo.viewing.target import check_target
+    from vggtgeo.slam.window.sliding_window import warm_up as compile_window
 
-    if rerun:
-        check_target(rerun)
     slam_settings = pipeline_settings(settings, assignments or (), {})
     # While the light of the scene is computed, what every window needs is compiled.
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
-        compiled = pool.submit(warm_up, slam_settings)
+        compiled = pool.submit(compile_window, slam_settings)
         sequence = simulate(scene, frames, seed, rate=10.0, size=DEMO_SIZE)
         compiled.result()
     if not (quiet or as_json):
@@ -146,6 +115,18 @@ def demo(
         RunOptions(title=f"simulated {scene}", facts={"simulated": True}),
         flags=settings.values() if settings else {},
     )
+
+
+def warm_up(
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the images with depth, pixels.")] = "640x480",
+) -> None:
+    """Compile what runs with default settings need, into the cache; takes some minutes once."""
+    width, height = parse_size(size)
+
+    from vggtgeo.slam.global_map.compile_ahead import compile_before_runs
+    from vggtgeo.slam.settings.slam_settings import SlamSettings
+
+    compile_before_runs(SlamSettings(), width, height)
 
 
 def tables_of_switches(switches: SwitchOptions, options: ResultOptions) -> dict[str, Tables]:
@@ -170,11 +151,9 @@ def check_map_place(file: Path, output: Path) -> None:
     from vggtgeo.io.files import whole_path
     from vggtgeo.results.output_checks import check_can_be_written, is_result
 
-    if file.is_dir():
-        raise InputError(f"`--save-map` is `{file}`, which is a folder; give the name of a file")
-    if is_result(output, file) or whole_path(file) == whole_path(output):
+    if file.is_dir() or is_result(output, file) or whole_path(file) == whole_path(output):
         raise InputError(
-            f"`--save-map` is `{file}`, the name of a result of the run itself, or its folder; give another, such as "
+            f"`--save-map` is `{file}`, a folder or a result of the run itself; give another file, such as "
             f"`{output}.map`"
         )
     check_can_be_written(file.parent, "--save-map")
@@ -224,7 +203,7 @@ def make_perception(chosen: PerceptionOptions, classical: Roles, switches: Switc
         *(chosen.preset, classical, chosen.models, chosen.cache, chosen.provider, chosen.memory_limit_gb, mixed)
     )
     if chosen.provider == "cuda" and not perceived.networks:
-        warnings.warn("`--provider cuda` has no effect: no role is a network", InputWarning, stacklevel=2)
+        warn("`--provider cuda` has no effect: no role is a network")
     if perceived.random:
-        warnings.warn(perceived.warning(), InputWarning, stacklevel=2)
+        warn(perceived.warning())
     return perceived

@@ -23,11 +23,10 @@ from vggtgeo.io.process import interruption
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
-from vggtgeo.results.output_checks import EXPORTS, SUMMARY
-from vggtgeo.results.reconstruction import reconstruct
+from vggtgeo.results.output_checks import EXPORTS, SUMMARY, is_in_results
+from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
-from vggtgeo.results.run_options import RunOptions
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.known_map import load_map
 from vggtgeo.slam.settings.presets import Perception
@@ -35,7 +34,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
-from vggtgeo.viewing.target import STAND_IN, open_target
+from vggtgeo.viewing.target import STAND_IN, check_target, open_target
 
 EARLY_SECONDS = 60.0
 """Between two writings of the poses so far, which take less than a second for 20,000 frames."""
@@ -65,11 +64,12 @@ def run_and_write(
     silent = wanted.quiet or wanted.as_json
     title = (options.title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
     console = Console(stderr=False, quiet=silent)
+    note = lambda text: console.print(f"note: {one_line(text)}", markup=False, highlight=False, soft_wrap=True)
     # From the first frame to the last file, a signal ends the run early; the results so far are written completely.
     with interruption() as stop, open_run_folder(output, source, RESERVE, wanted.resume) as folder:
         replaces = (output / SUMMARY).is_file()
         if replaces:
-            _print_note(console, f"the result in `{output}` is replaced at the end of this run")
+            note(f"the result in `{output}` is replaced at the end of this run")
         checkpoints = Checkpoints(folder.checkpoint, bool(wanted.resume), wanted.checkpoint_every)
         if wanted.resume and not folder.checkpoint.is_file():
             typer.echo(f"nothing to resume in `{output}`: the run begins at its first frame", err=True)
@@ -93,7 +93,7 @@ def run_and_write(
             typer.echo("interrupted after the last frame: all results are complete and written", err=True)
     if replaces and (output / EXPORTS).is_dir():
         # Exports are not written by a run, and may hold a user's files: they stay.
-        _print_note(console, f"`{output / EXPORTS}` is of an earlier result; `vggtgeo export` renews it")
+        note(f"`{output / EXPORTS}` is of an earlier result; `vggtgeo export` renews it")
     print_result(console, result, summary, output)
     if wanted.as_json:
         typer.echo(json.dumps(summary))
@@ -107,10 +107,6 @@ def run_and_write(
         raise typer.Exit(EXIT_INTERRUPTED)
     if result.verdict.level == "failed":
         raise typer.Exit(EXIT_FAILED)
-
-
-def _print_note(console: Console, text: str) -> None:
-    console.print(f"note: {one_line(text)}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _save_map(result: Result, file: Path | None) -> str:
@@ -159,8 +155,11 @@ def _rerun_callbacks(
     """
     if target is None:
         return (), None
-    if target not in ("spawn", "serve") and whole_path(Path(target).parent) == whole_path(folder.folder):
-        target = str(folder.stage / Path(target).name)
+    if check_target(target) not in ("spawn", "serve"):
+        if is_in_results(folder.folder, Path(target)):
+            raise InputError(f"`--rerun` is `{target}`, in a folder that the run replaces; give a file beside it")
+        if whole_path(Path(target).parent) == whole_path(folder.folder):
+            target = str(folder.stage / Path(target).name)
     opened = open_target(target, name, folder.stage / STAND_IN)
     if opened.url is not None:
         typer.echo(f"follow the run in a browser: {opened.url}", err=True)

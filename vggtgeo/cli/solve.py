@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -16,31 +16,6 @@ from vggtgeo.io.errors import InputError
 if TYPE_CHECKING:
     from vggtgeo.bundle.problem import Problem, State
     from vggtgeo.bundle.solution import Solution
-
-
-@dataclass(frozen=True)
-class Report:
-    """The output of `--json`. Energies are `1/2 sum rho`, always computed in float64."""
-
-    iterations: int
-    energy_initial: float
-    energy_final: float
-    compile_s: float
-    """Seconds of tracing and compilation (little if the code was in the JIT cache)."""
-    ms_per_iteration: float | None
-    """Median time of the compiled solve over the repetitions, per iteration; None without iterations."""
-    dtype: str
-    result: str
-    """Name of the termination code."""
-
-    @property
-    def sentence(self) -> str:
-        """The report as text."""
-        pace = "" if self.ms_per_iteration is None else f", {self.ms_per_iteration:.3g} ms each"
-        return (
-            f"{self.result}: energy {self.energy_initial:.6e} -> {self.energy_final:.6e} in {self.iterations} "
-            f"iterations{pace} ({self.dtype}, compiled in {self.compile_s:.1f} s)"
-        )
 
 
 def solve(
@@ -57,20 +32,27 @@ def solve(
     """Solve the bundle-adjustment problem in PROBLEM."""
     from vggtgeo.results.output_checks import check_can_be_written
 
-    if output.is_dir():
-        raise InputError(f"`{output}` is a folder; give the name of a file for the solution with `-o`")
     if output.exists() and problem.exists() and output.samefile(problem):
         raise InputError(f"`{output}` is the problem itself; give another name for the solution with `-o`")
     check_can_be_written(output.parent)
     report = solve_file(problem, output, max_steps, dtype, repeat)
-    if as_json or not quiet:
-        typer.echo(json.dumps(asdict(report), allow_nan=False) if as_json else report.sentence)
-    if report.result == "nonfinite_step":
+    if as_json:
+        typer.echo(json.dumps(report, allow_nan=False))
+    elif not quiet:
+        pace = "" if report["ms_per_iteration"] is None else f", {report['ms_per_iteration']:.3g} ms each"
+        typer.echo(
+            f"{report['result']}: energy {report['energy_initial']:.6e} -> {report['energy_final']:.6e} in "
+            f"{report['iterations']} iterations{pace} ({dtype}, compiled in {report['compile_s']:.1f} s)"
+        )
+    if report["result"] == "nonfinite_step":
         raise typer.Exit(EXIT_FAILED)
 
 
-def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: int) -> Report:
+def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: int) -> dict[str, Any]:
     """Solve the problem in the file `problem` in precision `dtype` and write the solution to `output`.
+
+    Returns the object of `--json`: energies are `1/2 sum rho`, always computed in float64; `compile_s` is little if the
+    code was in the JIT cache; `ms_per_iteration` is the median over the repetitions, None without iterations.
 
     Raises:
         InputError: the file is invalid, or its initial energy is not finite (then nothing is written).
@@ -94,15 +76,15 @@ def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: 
     wide: State = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), solution.state)
     state, iterations = replace(wide, poses=wide.poses.normalize()), int(solution.iterations)
     save_solution(output, state, index)
-    return Report(
-        iterations=iterations,
-        energy_initial=initial,
-        energy_final=float(energy_of(exact, state)),
-        compile_s=compile_s,
-        ms_per_iteration=1e3 * run_s / iterations if iterations else None,
-        dtype=dtype,
-        result=solution.result,
-    )
+    return {
+        "iterations": iterations,
+        "energy_initial": initial,
+        "energy_final": float(energy_of(exact, state)),
+        "compile_s": compile_s,
+        "ms_per_iteration": 1e3 * run_s / iterations if iterations else None,
+        "dtype": dtype,
+        "result": solution.result,
+    }
 
 
 def timed_solve(problem: Problem, start: State, max_steps: int, repeat: int) -> tuple[Solution, float, float]:

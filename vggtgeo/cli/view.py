@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-import warnings
 import webbrowser
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +12,7 @@ from typing import Annotated, Literal
 import typer
 
 from vggtgeo.cli.options import JsonOption, QuietOption
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.results.output_checks import EXPORTS, check_can_be_shown, check_is_run
 
 
@@ -29,9 +28,8 @@ def view(
         _open_page(folder, as_json)
         return
     from vggtgeo.viewing.folder import log_folder, recording_of
-    from vggtgeo.viewing.target import check_target, flush, has_screen, open_target
+    from vggtgeo.viewing.target import flush, has_screen, open_target
 
-    check_target(rerun)
     recording = recording_of(folder) if rerun in ("spawn", "serve") else None
     if recording is None:
         check_can_be_shown(folder)
@@ -49,7 +47,7 @@ def view(
     if problem and opened.file is not None:
         raise InputError(problem)
     if problem:
-        warnings.warn(problem, InputWarning, stacklevel=2)
+        warn(problem)
     if as_json:
         typer.echo(json.dumps({"target": rerun, "shown": str(recording or folder), "url": opened.url}))
     if rerun == "serve":

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.interpolate import CubicSpline
 from scipy.linalg import cholesky_banded, solve_banded
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from vggtgeo.evaluation.alignment import umeyama
+from vggtgeo.evaluation.association import ContinuousTrajectory
 from vggtgeo.geometry.gauss_newton import gauss_newton
 from vggtgeo.geometry.rigid import cross
 from vggtgeo.geometry.trajectory import Trajectory
@@ -106,40 +106,6 @@ class DriftNoise:
 
 
 Noises = tuple[DriftNoise, DriftNoise]
-
-
-class ContinuousTrajectory:
-    """Poses and velocities of a trajectory (two or more poses) at any time between its first and last pose.
-
-    Cubic splines of positions and rotations (scipy's `RotationSpline`), with continuous velocity.
-    """
-
-    def __init__(self, trajectory: Trajectory) -> None:
-        self.times = trajectory.timestamps
-        self._begin = self.times[0]  # relative times keep microseconds, which times since 1970 lose in the spline
-        since = self.times - self._begin
-        self._positions = CubicSpline(since, trajectory.positions)
-        self._rotations = RotationSpline(since, Rotation.from_matrix(trajectory.rotations))
-
-    def covers(self, times: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Return which times lie between two poses at most two median intervals apart: a spline is wrong in gaps."""
-        after = np.searchsorted(self.times, times).clip(1, len(self.times) - 1)
-        gap = self.times[after] - self.times[after - 1]
-        inside = (times >= self.times[0]) & (times <= self.times[-1])
-        return inside & (gap <= 2.0 * np.median(np.diff(self.times)))
-
-    def poses(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-        """Return the poses, body -> world."""
-        found = np.tile(np.eye(4), (len(times), 1, 1))
-        found[:, :3, :3] = self._rotations(times - self._begin).as_matrix()
-        found[:, :3, 3] = self._positions(times - self._begin)
-        return found
-
-    def velocities(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
-        """Return linear and angular velocity of the body in the world frame, m/s and rad/s."""
-        since = times - self._begin
-        turning = self._rotations(since).apply(self._rotations(since, 1))
-        return np.concatenate([self._positions(since, 1), turning], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,7 +357,7 @@ class OffsetModel:
         return first, second
 
     def _scaled(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return both Jacobians J and Z, whitened, in units of the prior, and a basis of the determined directions.
+        """Return both Jacobians J and Z, whitened, in units of the prior, along a basis of the determined directions.
 
         A direction is determined if `Z^T J` has four times the prior's information (half its standard deviation), and
         more than two independent noises would have by chance.
@@ -401,7 +367,8 @@ class OffsetModel:
         values, vectors = np.linalg.eigh(0.5 * (other.T @ own + own.T @ other))
         lengths = np.sqrt(((own @ vectors) ** 2).sum(axis=0) * ((other @ vectors) ** 2).sum(axis=0))
         chance = norm.ppf(1 - LEVEL / 2) / np.sqrt(0.5 * len(own))
-        return own, other, vectors[:, (values > _MIN_GAIN) & (values > chance * lengths)]
+        basis = vectors[:, (values > _MIN_GAIN) & (values > chance * lengths)]
+        return own @ basis, other @ basis, basis
 
     def _balanced(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> Unknowns:
         """Return the solution of `Z^T r = 0` (instrumental variables, see `_covariance`), starting from that of `J^T r
@@ -413,7 +380,6 @@ class OffsetModel:
         size = np.inf
         for _ in range(_STEPS):
             own, other, basis = self._scaled(unknowns, free, noise)
-            own, other = own @ basis, other @ basis
             residuals = self._whitened(self._residuals(unknowns), noise)
             step = -basis @ np.linalg.lstsq(other.T @ own, other.T @ residuals, rcond=None)[0]
             moved = unknowns.moved(step * self._prior, self._middle)
@@ -428,7 +394,6 @@ class OffsetModel:
         directions the covariance of the prior.
         """
         own, other, basis = self._scaled(unknowns, free, noise)
-        own, other = own @ basis, other @ basis
         gain = basis @ np.linalg.pinv(other.T @ own, rcond=1e-18)
         covariance = gain @ (other.T @ other) @ gain.T + np.eye(UNKNOWNS) - basis @ basis.T
         return covariance * np.outer(self._prior, self._prior), free & (np.diag(covariance) < 1.0 / _MIN_GAIN)

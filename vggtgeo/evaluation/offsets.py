@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
-from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, associate
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, ContinuousTrajectory, associate, shifted
 from vggtgeo.evaluation.comparability import MAX_LEFT, comparability
 from vggtgeo.evaluation.offset_model import (
     LEVEL,
@@ -23,7 +23,6 @@ from vggtgeo.evaluation.offset_model import (
     TIME,
     TURN,
     UNKNOWNS,
-    ContinuousTrajectory,
     Fit,
     OffsetModel,
 )
@@ -169,20 +168,6 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
     verdict = comparability(estimate, rest, max_dt)
     doubts = set(verdict.doubts) - set(comparability(estimate, truth, max_dt).doubts)
     return replace(found, ate_left=left, explains=bool(names) and most and not (verdict.reasons or doubts))
-
-
-def shifted(estimate: Trajectory, truth: Trajectory, seconds: float) -> Trajectory:
-    """Return the ground truth with `seconds` added to its times, and poses interpolated at the estimate's times."""
-    times = truth.timestamps + seconds
-    moved = Trajectory(times, truth.poses)
-    if len(truth) < 2:
-        return moved
-    continuous = ContinuousTrajectory(moved)
-    between = estimate.timestamps[continuous.covers(estimate.timestamps)]
-    between = between[~np.isin(between, times)]
-    order = np.argsort(np.concatenate([times, between]), kind="stable")
-    poses = np.concatenate([truth.poses, continuous.poses(between)])
-    return Trajectory(np.concatenate([times, between])[order], poses[order])
 
 
 def _reduced(model: OffsetModel, fit: Fit, tried: int) -> tuple[Fit, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Errors of matched trajectories: absolute (ATE) and relative (RPE; RTE and RRE of each pair).
+"""Errors of matched trajectories: absolute (ATE) and relative (RPE; RTE and RRE of each pair), and their NEES.
 
 ATE: distance of the camera centres from the ground truth after alignment.
 
@@ -7,6 +7,10 @@ RPE: for poses `Q` (truth) and `P` (estimate), camera -> world, the error of the
 RPE is their root mean square. No alignment is needed; a reconstruction of free scale must be scaled before.
 
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
+
+NEES, the normalised estimation error squared: for an error `e` of k numbers and its covariance C, `e' C^-1 e` follows
+the chi-square law with k degrees of freedom, so its mean over n independent errors, n times, that with n k. Source: Y.
+Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.
 """
 
 from dataclasses import dataclass
@@ -14,8 +18,12 @@ from typing import Literal, Self, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from vggtgeo.evaluation.alignment import VERTICAL, Alignment, Similarity, align
+from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, nearest_in_time
+from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_real
@@ -25,6 +33,8 @@ UNITS: tuple[Unit, ...] = get_args(Unit)
 _MAX_POSES = 2**31
 PATH_TOLERANCE = 0.1
 """Share of a delta in seconds or metres by which overlapping pairs may miss it; evo's default."""
+LEVEL = 0.95
+"""Probability of the interval of a mean NEES."""
 
 
 @dataclass(frozen=True)
@@ -182,3 +192,63 @@ def _motion(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     motion[:, :3, :3] = transposed @ end[:, :3, :3]
     motion[:, :3, 3] = np.einsum("nij,nj->ni", transposed, end[:, :3, 3] - start[:, :3, 3])
     return motion
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """Fields:
+    nees: float64 [n], of each error.
+    degrees: dimension of an error, the expected NEES for correct covariances.
+    low, high: interval of the mean for correct covariances and independent errors, with probability `LEVEL`.
+    """
+
+    nees: Float[np.ndarray, " n"]
+    degrees: int
+    low: float
+    high: float
+
+    @property
+    def mean(self) -> float:
+        """Mean NEES. Above `high` the covariances are too small (overconfident), below `low` too large."""
+        return float(self.nees.mean())
+
+
+def consistency(errors: Float[np.ndarray, "n k"], covariances: Float[np.ndarray, "n k k"]) -> Consistency:
+    """Return the NEES of `errors` with their `covariances`, in the same coordinates and units.
+
+    InputError if there is no error. Covariances must be positive definite.
+    """
+    if not errors.size:
+        raise InputError("`errors` is empty; at least one error is needed")
+    white = np.linalg.solve(np.linalg.cholesky(covariances), errors[..., None])[..., 0]
+    count, degrees = errors.shape
+    low, high = chi2.ppf([0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], count * degrees) / count
+    return Consistency((white**2).sum(axis=1), degrees, float(low), float(high))
+
+
+def pose_consistency(
+    estimate: Trajectory,
+    truth: Trajectory,
+    place_sigma: Float[np.ndarray, " n"],
+    rotation_sigma: Float[np.ndarray, " n"],
+    scale: float = 1.0,
+) -> tuple[Consistency, Consistency]:
+    """Return the NEES of positions and of rotations, for standard deviations relative to the first pose.
+
+    Both trajectories are expressed relative to the first matched pose. Standard deviations (metres, rad) are isotropic.
+    scale: factor on the estimate's lengths. Poses with a standard deviation of zero or NaN are left out; InputError if
+    none is left.
+    """
+    rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, MAX_TIME_DIFFERENCE)
+    found, true = (
+        rigid.invert(poses[:1]) @ poses if len(poses) else poses
+        for poses in (estimate.poses[rows], truth.poses[others])
+    )
+    moved = scale * found[:, :3, 3] - true[:, :3, 3]
+    turned = Rotation.from_matrix(found[:, :3, :3].mT @ true[:, :3, :3]).as_rotvec() if len(rows) else moved
+    return _by_deviations(moved, place_sigma[rows]), _by_deviations(turned, rotation_sigma[rows])
+
+
+def _by_deviations(errors: np.ndarray, sigma: np.ndarray) -> Consistency:
+    stated = np.isfinite(sigma) & (sigma > 0)
+    return consistency(errors[stated], sigma[stated, None, None] ** 2 * np.eye(3))

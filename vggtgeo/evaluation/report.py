@@ -29,7 +29,7 @@ class TrajectoryReport:
     Fields: matched, estimated, true: number of poses compared, in the estimate, in the ground truth; coverage: share of
     the ground truth's duration covered by the estimate, without gaps above a second; se3, sim3, yaw, unaligned: ATE
     after each alignment, and without; relative: RPE as estimated; relative_sim3: RPE after the scale of the Sim(3)
-    alignment; still: which of "estimate" and "truth" do not move.
+    alignment.
     """
 
     matched: int
@@ -42,7 +42,6 @@ class TrajectoryReport:
     yaw: AbsoluteError
     relative: RelativeError
     relative_sim3: RelativeError
-    still: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -61,8 +60,6 @@ class TrajectoryReport:
             )
         if not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE:
             found.append(f"the scale is {scale:.3g}: the units differ, which errors after Sim(3) do not show")
-        if self.still:
-            found.append(f"all positions of the {' and the '.join(self.still)} are equal: the scale is undefined")
         if not len(self.relative.translation):
             found.append(f"no two poses are {self.relative.interval} apart: no RPE, give a smaller `delta`")
         return tuple(found)
@@ -131,7 +128,6 @@ def evaluate_trajectory(
             f"{spans(estimate, truth)}"
         )
     sim3 = absolute_error(matched, reference, "sim3")
-    compared = {"estimate": matched, "truth": reference}
     return TrajectoryReport(
         matched=len(matched),
         estimated=len(estimate),
@@ -143,7 +139,6 @@ def evaluate_trajectory(
         yaw=absolute_error(matched, reference, "yaw", vertical),
         relative=relative_error(matched, reference, delta, all_pairs, unit),
         relative_sim3=relative_error(sim3.alignment.trajectory(matched), reference, delta, all_pairs, unit),
-        still=tuple(name for name, path in compared.items() if not np.ptp(path.positions, axis=0).any()),
     )
 
 

@@ -7,49 +7,23 @@ centre: half a pixel is added.
 from __future__ import annotations
 
 import struct
-import warnings
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from vggtgeo.datasets.image_files import image_header
-from vggtgeo.export.surfaces import EmptyRunError
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, warn
+from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import MASK, Scene
-from vggtgeo.results.summary import POSES
 
 PINHOLE = 1
 """COLMAP's identifier of the model fx, fy, cx, cy."""
 
 
-def scene_of(source: Path) -> Scene:
-    """Load the views of the run in `source`; warn if they do not match its pose files."""
-    scene = Scene.load(source)
-    known = []
-    for name in POSES:
-        with suppress(InputError), warnings.catch_warnings():  # pose files are optional here
-            warnings.simplefilter("ignore", InputWarning)
-            known.append(Trajectory.load_tum(source / name))
-    if not known:
-        return scene
-    times = np.concatenate([poses.timestamps for poses in known])
-    mismatch = scene.mismatch(times, np.concatenate([poses.positions for poses in known]))
-    if mismatch:
-        warn(
-            f"`{source / 'scene.npz'}` does not match the pose files beside it (edited, or of another run): {mismatch}"
-            "; those of `scene.npz` are exported"
-        )
-    return scene
-
-
 def copy_pictures(scene: Scene, source: Path, target: Path) -> bytes | None:
     """Copy `images/` of the run in `source` below `target`; return the PNG mask of valid pixels, white, None if all are
-    valid. Raise InputError for missing images or a wrong size.
+    valid. Raise InputError for a missing image.
     """
     (target / "images").mkdir(parents=True, exist_ok=True)
     for view in range(len(scene.frames)):
@@ -57,36 +31,21 @@ def copy_pictures(scene: Scene, source: Path, target: Path) -> bytes | None:
         if not file.is_file():
             raise InputError(f"`{file}` does not exist; run again, with `-o {source}`")
         with atomic_open(target / "images" / file.name, "wb") as handle:
-            handle.write(_image(file, scene, source))
+            handle.write(file.read_bytes())
     mask = source / MASK
-    return _image(mask, scene, source) if mask.is_file() else None
-
-
-def _image(file: Path, scene: Scene, source: Path) -> bytes:
-    """Return the content of an image file; raise InputError for a damaged image or another size than the scene's."""
-    content = file.read_bytes()
-    try:
-        header = image_header(content, file)
-    except InputError as error:
-        raise InputError(f"{error}; run again, with `-o {source}`") from None
-    if (header.width, header.height) != scene.size:
-        raise InputError(
-            f"`{file}` must be an image of {scene.size[0]} x {scene.size[1]} pixels, got {header.width} x "
-            f"{header.height}; run again, with `-o {source}`"
-        )
-    return content
+    return mask.read_bytes() if mask.is_file() else None
 
 
 def write_colmap(source: Path, target: Path) -> dict[str, float]:
     """Write `images/` and `sparse/0/` of the run in `source` below `target`; also `masks/` if the undistorted images
     have invalid borders (black: not used).
 
-    Returns counts, and the mean over points of each point's mean reprojection error, pixels. EmptyRunError if no point
-    was observed from two keyframes.
+    Returns counts, and the mean over points of each point's mean reprojection error, pixels. InputError if no point was
+    observed from two keyframes.
     """
-    scene = scene_of(source)
+    scene = Scene.load(source)
     if not len(scene.tracks):
-        raise EmptyRunError(f"`{source / 'scene.npz'}` has no point with observations in two keyframes")
+        raise InputError(f"`{source / 'scene.npz'}` has no point with observations in two keyframes")
     mask = copy_pictures(scene, source, target)
     for view in range(len(scene.frames) if mask is not None else 0):
         with atomic_open(target / "masks" / f"{scene.image_name(view)}.png", "wb") as handle:

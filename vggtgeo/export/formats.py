@@ -13,8 +13,8 @@ import numpy as np
 
 from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.export.colmap import copy_pictures, scene_of, write_colmap
-from vggtgeo.export.surfaces import EmptyRunError, cloud_of, write_glb, write_las, write_ply
+from vggtgeo.export.colmap import copy_pictures, write_colmap
+from vggtgeo.export.surfaces import cloud_of, write_glb, write_las, write_ply
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, warn
@@ -23,7 +23,8 @@ from vggtgeo.io.given import path_of
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.output_checks import EXPORTS, check_is_run
-from vggtgeo.results.summary import load_poses, read_summary
+from vggtgeo.results.scene import Scene
+from vggtgeo.results.summary import read_summary
 
 MILLI = 1000.0
 
@@ -32,7 +33,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     """Write `transforms.json`, `images/`, `depth/` (if the run saved it) and `points.ply` below `target`; also
     `mask.png` if the undistorted images have invalid borders: black pixels are not used for training.
     """
-    scene, cloud = scene_of(source), cloud_of(source)
+    scene, cloud = Scene.load(source), cloud_of(source)
     poses = rigid.invert(scene.poses) @ FROM_OPENGL
     mask = copy_pictures(scene, source, target)
     if mask is not None:
@@ -45,12 +46,13 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
         frame |= {} if mask is None else {"mask_path": "mask.png"}
         depth = source / "depth" / f"{scene.frames[view]:06d}.depth.png"
         if depth.is_file():
-            frame["depth_file_path"] = _depth(depth, scene.size, target, f"depth/{scene.frames[view]:06d}.png")
+            frame["depth_file_path"] = f"depth/{scene.frames[view]:06d}.png"
+            millimetres = np.rint(read_codes(depth) * (MILLI / DEPTH_UNIT)).astype(np.uint16)
+            write_picture(target / frame["depth_file_path"], millimetres)
             deep += 1
         frames.append(frame)
     if not deep:
-        text = f"`{source / 'depth'}` does not exist, the export has no depth; run again with `--save-depth`"
-        warn(text)
+        warn(f"`{source / 'depth'}` does not exist, the export has no depth; run again with `--save-depth`")
     cloud.save_ply(target / "points.ply")
     fx, fy, cx, cy = (float(value) for value in scene.intrinsics)
     camera = {"camera_model": "PINHOLE", "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
@@ -59,23 +61,12 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     return {"images": len(frames), "depth_images": deep}
 
 
-def _depth(file: Path, size: tuple[int, int], target: Path, name: str) -> str:
-    """Write the depth of one image of `size` (width, height) in nerfstudio's units; return its name."""
-    counts = read_codes(file)
-    if counts.shape != size[::-1] or counts.dtype != np.uint16:
-        raise InputError(
-            f"`{file}` must be depth of {size[0]} x {size[1]} pixels in 16 bits, as of `vggtgeo run --save-depth`, got "
-            f"{counts.dtype} of shape {counts.shape}"
-        )
-    write_picture(target / name, np.rint(counts * (MILLI / DEPTH_UNIT)).astype(np.uint16))
-    return name
-
-
 def write_tum(source: Path, target: Path) -> dict[str, float]:
     """Write `trajectory.txt` and `keyframes.txt`: `time x y z qx qy qz qw` per line, camera -> world."""
-    for name in ("trajectory.txt", "keyframes.txt"):
-        load_poses(source, name).save_tum(target / name)
-    return {"poses": len(Trajectory.load_tum(target / "trajectory.txt"))}
+    poses, keyframes = (Trajectory.load_tum(source / name) for name in ("trajectory.txt", "keyframes.txt"))
+    poses.save_tum(target / "trajectory.txt")
+    keyframes.save_tum(target / "keyframes.txt")
+    return {"poses": len(poses)}
 
 
 def write_kitti(source: Path, target: Path) -> dict[str, float]:
@@ -83,7 +74,7 @@ def write_kitti(source: Path, target: Path) -> dict[str, float]:
 
     The format cannot represent frames without a pose: they are left out of both files.
     """
-    trajectory = load_poses(source, "trajectory.txt")
+    trajectory = Trajectory.load_tum(source / "trajectory.txt")
     rows = [" ".join(f"{value:.9e}" for value in pose[:3].reshape(-1)) for pose in trajectory.poses]
     write_text(target / "poses.txt", "".join(f"{row}\n" for row in rows))
     write_text(target / "times.txt", "".join(f"{time:.6f}\n" for time in trajectory.timestamps))
@@ -128,19 +119,15 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     if whole_path(output) == whole_path(place):
         raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
     verdict = read_summary(place)[1]
-    failed = f"the verdict of the run is failed: {'; '.join(verdict.reasons)}" if verdict.level == "failed" else ""
-    try:
-        with _staged(output) as stage:  # existing files stay until all new ones are complete
-            written = FORMATS[to](place, stage)
-            names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
-            _record(output, names, ours=whole_path(output) == whole_path(place / EXPORTS / to))
-            for name in names:
-                (output / name).parent.mkdir(parents=True, exist_ok=True)
-                (stage / name).replace(output / name)
-    except EmptyRunError as error:
-        raise InputError(f"{error} ({failed})" if failed else str(error)) from None
-    if failed:
-        warn(f"`{place}`: {failed}")
+    if verdict.level == "failed":
+        warn(f"`{place}`: the verdict of the run is failed: {'; '.join(verdict.reasons)}")
+    with _staged(output) as stage:  # existing files stay until all new ones are complete
+        written = FORMATS[to](place, stage)
+        names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
+        _record(output, names, ours=whole_path(output) == whole_path(place / EXPORTS / to))
+        for name in names:
+            (output / name).parent.mkdir(parents=True, exist_ok=True)
+            (stage / name).replace(output / name)
     return written
 
 

@@ -32,32 +32,24 @@ Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 LAS_UNIT = 1e-3
 _CUSTOM_ATTRIBUTE = "_color"
 """Names of custom attributes of glTF begin with an underscore."""
-_LAS_COUNTS = 2**31 - 1
 FULL_SCALE = 65535
 _LINEAR_BELOW, _SLOPE, _OFFSET, _GAMMA = 0.04045, 12.92, 0.055, 2.4
 """Of the transfer function of sRGB."""
 
 
-class EmptyRunError(InputError):
-    """The run lacks the data that a format needs, for example points."""
-
-
 def cloud_of(source: Path) -> PointCloud:
-    """Load the cloud of the run in `source`; raise EmptyRunError if it has no points."""
-    file = source / "map.ply"
-    if not file.is_file():
-        raise InputError(f"`{file}` does not exist; give a folder that `vggtgeo run` wrote")
-    cloud = PointCloud.load_ply(file)
+    """Load the cloud of the run in `source`; raise InputError if it has no points."""
+    cloud = PointCloud.load_ply(source / "map.ply")
     if not len(cloud):
-        raise EmptyRunError(f"`{file}` has no points")
+        raise InputError(f"`{source / 'map.ply'}` has no points")
     return cloud
 
 
 def mesh_of(source: Path) -> Mesh:
-    """Load the mesh of the run in `source`; raise EmptyRunError if it has none."""
+    """Load the mesh of the run in `source`; raise InputError if it has none."""
     file = source / "mesh.ply"
     if not file.is_file():
-        raise EmptyRunError(
+        raise InputError(
             f"`{file}` does not exist, the run has no mesh; run again with `--dense auto` or `--dense mvs`, or export "
             "the points with `--to ply`"
         )
@@ -102,11 +94,6 @@ def write_las(source: Path, target: Path) -> dict[str, float]:
     laspy = _package("laspy")
     cloud = cloud_of(source)
     points = cloud.points.astype(np.float64) @ Z_UP.T
-    if np.ptp(points, axis=0).max() >= LAS_UNIT * _LAS_COUNTS:
-        raise InputError(
-            f"`{source / 'map.ply'}` is {np.ptp(points, axis=0).max():.3g} m across; LAS in millimetres is limited to "
-            f"{LAS_UNIT * _LAS_COUNTS:.0f} m: export it with `--to ply`"
-        )
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.generating_software = "vggtgeo"
     header.scales = np.full(3, LAS_UNIT)

@@ -20,8 +20,6 @@ from vggtgeo.figures.plots import (
     INK,
     ORANGE,
     NotebookFigure,
-    energy_figure,
-    errors_figure,
     line_colour,
     style,
     trajectory_figure,
@@ -88,21 +86,41 @@ def check_truth(value: Trajectory, truth: Trajectory | None) -> None:
 
 
 @plot.register(TrajectoryReport)
-def _errors(value: TrajectoryReport) -> NotebookFigure:
-    return errors_figure(value)
+def _errors(report: TrajectoryReport) -> NotebookFigure:
+    """Draw histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
+    figure = NotebookFigure(figsize=(6.0, 3.2), layout="constrained")
+    axes = figure.subplots()
+    found = (("SE(3)", report.se3, BLUE), ("Sim(3)", report.sim3, ORANGE))
+    edges = np.linspace(0, 100 * max(float(error.errors.max()) for _, error, _ in found) + 1e-9, 31)
+    for name, error, colour in found:
+        label = f"after {name}: RMSE {100 * error.statistics.rmse:.2f} cm"
+        axes.hist(100 * error.errors, edges.tolist(), histtype="stepfilled", color=colour, alpha=0.45, label=label)
+    axes.set_xlabel("error of a camera centre [cm]")
+    axes.set_ylabel("poses")
+    axes.legend(frameon=False)
+    return figure
 
 
 @plot.register(Solution)
 def _energy(value: Solution) -> NotebookFigure:
+    """Draw the energy before the first and after each iteration, logarithmic."""
     history = np.asarray(value.history)
     check_single(history, 1)
-    return energy_figure(history[np.isfinite(history)], value.result)
+    figure = NotebookFigure(figsize=(5.0, 3.0), layout="constrained")
+    axes = figure.subplots()
+    axes.semilogy(history[np.isfinite(history)], ".-", color=BLUE)
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("energy")
+    axes.set_title(value.result, loc="left", fontsize=10, color=INK)
+    style(axes)
+    return figure
 
 
 @plot.register(Covariances)
 def _covariances(
     value: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, *, sigmas: float | None = None
 ) -> NotebookFigure:
+    """Draw the camera centres in the horizontal plane of the first camera, with ellipses, and the true centres."""
     check_single(value.poses, 3)
     check_kind("state", state, State, "a `State`, for example `solution.state`")
     keyframes = len(value.poses)
@@ -116,17 +134,8 @@ def _covariances(
         real_array("truth", truth, (keyframes, 3))
     if sigmas is not None:
         check_positive("sigmas", sigmas, "standard deviations")
-    return _covariance_figure(value, state, truth, sigmas)
-
-
-def _covariance_figure(
-    found: Covariances, state: State, truth: Float[np.ndarray, "n 3"] | None = None, sigmas: float | None = None
-) -> NotebookFigure:
-    """Draw the camera centres of `state` in the horizontal plane of the first camera, with ellipses of `sigmas`
-    standard deviations (by default chosen to be visible), and the true centres (world frame) if given.
-    """
     poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
-    blocks = np.asarray(found.poses, np.float64)[:, :3, :3]
+    blocks = np.asarray(value.poses, np.float64)[:, :3, :3]
     turn = poses[0, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)  # from each camera to the first
     known = np.all(np.isfinite(blocks), axis=(1, 2))
     spread = (turn @ np.where(known[:, None, None], blocks, 0.0) @ turn.transpose(0, 2, 1))[:, [0, 2]][:, :, [0, 2]]

@@ -1,4 +1,4 @@
-"""Figures of a trajectory from above and from the side, with the ground truth; of errors; of the energy.
+"""Style of all figures, and the figure of a trajectory from above and from the side, with the ground truth.
 
 The frame of a reconstruction is arbitrary, so up is estimated from the cameras: hand-held cameras have little roll, so
 up is the direction most nearly orthogonal to all image rows. If the camera hardly rotates, its pitch is unknown. Then
@@ -9,7 +9,6 @@ itself, and the figure's title says so. The longest horizontal extent is along t
 from __future__ import annotations
 
 import io
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +17,9 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from vggtgeo.evaluation import AbsoluteError, TrajectoryReport, absolute_error, associate
+from vggtgeo.evaluation import AbsoluteError, absolute_error, associate
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import atomic_path
 
 BLUE, ORANGE, GREEN, INK, RULE, GRID = "#1f5fbf", "#e07b1a", "#3a8f5c", "#333333", "#bbbbbb", "#e3e3e3"
 """The report replaces them by variables of its style sheet."""
@@ -76,26 +74,6 @@ class _Aligned:
     error: AbsoluteError | None
 
 
-def plot_trajectory(
-    path: str | os.PathLike[str],
-    estimate: Trajectory,
-    truth: Trajectory | None = None,
-    keyframes: Trajectory | None = None,
-    with_scale: bool = False,
-    title: str = "",
-    metres: bool = True,
-) -> None:
-    """Write a PNG with the top and side view of `estimate`, with equal axes, atomically.
-
-    With `truth`, the estimate is aligned to it by SE(3), or by Sim(3) if `with_scale` or the ground truth is not in
-    `metres`, and the title has the ATE of the poses that match in time; if too few match, `truth` is left out.
-    `keyframes` are marked. InputError for an empty estimate.
-    """
-    figure = trajectory_figure(estimate, truth, keyframes, with_scale, title, metres=metres)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130, format="png", facecolor="white")
-
-
 def trajectory_figure(
     estimate: Trajectory,
     truth: Trajectory | None = None,
@@ -105,19 +83,17 @@ def trajectory_figure(
     width: float = _WIDTH,
     metres: bool = True,
 ) -> NotebookFigure:
-    """Return the figure of `plot_trajectory`, `width` inches wide; without a title if `title` is None."""
+    """Return the top and side view of `estimate`, with equal axes, `width` inches wide; `keyframes` are marked.
+
+    With `truth`, the estimate is aligned to it by SE(3), or by Sim(3) if `with_scale` or the ground truth is not in
+    `metres`, and the title has the ATE of the poses that match in time; if too few match, `truth` is left out. No title
+    if `title` is None. InputError for an empty estimate.
+    """
     if len(estimate) == 0:
         raise InputError("`estimate` has no pose; there is nothing to draw")
     drawn = _align(estimate, truth, keyframes, with_scale or not metres)
-    seen = drawn.truth or drawn.estimate
     in_metres = metres if drawn.error else not with_scale
-    figure = _draw(
-        drawn,
-        view_axes(seen, level_world=drawn.truth is not None),
-        "m" if in_metres else "unit of the truth" if drawn.error else "no unit",
-        width,
-        "seen from the side" + ("" if drawn.truth or _yaws(seen) else "; up is that of the images"),
-    )
+    figure = _draw(drawn, "m" if in_metres else "unit of the truth" if drawn.error else "no unit", width)
     if title is not None:
         figure.suptitle(_title(drawn, title, with_scale, metres), x=0.01, ha="left", fontsize=12, color=INK)
     return figure
@@ -171,8 +147,10 @@ def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
     return up if up @ mean_up >= 0 else -up
 
 
-def _draw(drawn: _Aligned, axes_of_view: np.ndarray, unit: str, width: float, side_title: str) -> NotebookFigure:
-    origin = (drawn.truth or drawn.estimate).positions[0]
+def _draw(drawn: _Aligned, unit: str, width: float) -> NotebookFigure:
+    seen = drawn.truth or drawn.estimate
+    axes_of_view, origin = view_axes(seen, level_world=drawn.truth is not None), seen.positions[0]
+    side_title = "seen from the side" + ("" if drawn.truth or _yaws(seen) else "; up is that of the images")
     everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
     points = (np.concatenate(everything) - origin) @ axes_of_view.T
     low, high = points.min(axis=0), points.max(axis=0)
@@ -220,30 +198,3 @@ def _title(drawn: _Aligned, title: str, with_scale: bool, metres: bool) -> str:
         error = f"{100 * statistics.rmse:.2f} cm" if metres else f"{statistics.rmse:.4g}"
         facts = f"ATE {error} after {alignment} ({statistics.count} poses)"
     return f"{title}:  {facts}" if title else facts
-
-
-def errors_figure(report: TrajectoryReport) -> NotebookFigure:
-    """Draw histograms of the errors of the camera centres, centimetres, after SE(3) and after Sim(3) alignment."""
-    figure = NotebookFigure(figsize=(6.0, 3.2), layout="constrained")
-    axes = figure.subplots()
-    found = (("SE(3)", report.se3, BLUE), ("Sim(3)", report.sim3, ORANGE))
-    edges = np.linspace(0, 100 * max(float(error.errors.max()) for _, error, _ in found) + 1e-9, 31)
-    for name, error, colour in found:
-        label = f"after {name}: RMSE {100 * error.statistics.rmse:.2f} cm"
-        axes.hist(100 * error.errors, edges.tolist(), histtype="stepfilled", color=colour, alpha=0.45, label=label)
-    axes.set_xlabel("error of a camera centre [cm]")
-    axes.set_ylabel("poses")
-    axes.legend(frameon=False)
-    return figure
-
-
-def energy_figure(history: np.ndarray, message: str) -> NotebookFigure:
-    """Draw the energy before the first and after each iteration, logarithmic; `history` [h] without NaN."""
-    figure = NotebookFigure(figsize=(5.0, 3.0), layout="constrained")
-    axes = figure.subplots()
-    axes.semilogy(history, ".-", color=BLUE)
-    axes.set_xlabel("iteration")
-    axes.set_ylabel("energy")
-    axes.set_title(message, loc="left", fontsize=10, color=INK)
-    style(axes)
-    return figure

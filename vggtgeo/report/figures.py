@@ -24,9 +24,7 @@ from vggtgeo.figures.plots import (
     NotebookFigure,
     line_colour,
     style,
-    trajectory_figure,
 )
-from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.window_recorder import WindowRecord
 
 COLOURS = {
@@ -51,13 +49,6 @@ _LABELS = {
 _UNITS = {"px": "pixels", "sigma": "standard deviations"}
 _WIDTH = 4.6
 """Inches: legible at its own size on a desktop and on a phone."""
-
-
-def trajectory_svg(
-    estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory, with_scale: bool, metres: bool = True
-) -> str:
-    """Return the top and side view of the path. metres: whether the ground truth is in metres."""
-    return svg(trajectory_figure(estimate, truth, keyframes, with_scale, None, _WIDTH + 0.4, metres))
 
 
 def residuals_svg(records: Sequence[WindowRecord]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from vggtgeo.evaluation import align, associate
+from vggtgeo.evaluation import align, associate, nearest_in_time
 from vggtgeo.figures.plots import view_axes
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud, cell_numbers
@@ -213,12 +213,12 @@ def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> T
 
 def _sigma_at(uncertainty: PoseUncertainty | None, keyframes: Sequence[Pictured]) -> np.ndarray:
     """Return the standard deviation of each keyframe's position; NaN = unknown."""
-    if uncertainty is None or not len(uncertainty.timestamps):
-        return np.full(len(keyframes), np.nan)
-    times = np.array([keyframe.timestamp for keyframe in keyframes])
-    rows = np.abs(times[:, None] - uncertainty.timestamps).argmin(axis=1)
-    apart = np.abs(times - uncertainty.timestamps[rows]) > 1e-4
-    return np.where(apart, np.nan, uncertainty.translation[rows])
+    sigma = np.full(len(keyframes), np.nan)
+    if uncertainty is not None:
+        times = np.array([keyframe.timestamp for keyframe in keyframes])
+        rows, nearest = nearest_in_time(times, uncertainty.timestamps, 1e-4)
+        sigma[rows] = uncertainty.translation[nearest]
+    return sigma
 
 
 def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> Float[np.ndarray, "k 5 3"]:
@@ -227,10 +227,6 @@ def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> 
     x, y = cx / fx, cy / fy
     corners = length * np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]])
     return np.einsum("kij,cj->kci", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
-
-
-_GROWTH = 1.2
-"""Of the cells' edge from one try to the next."""
 
 
 def decimated_cloud(cloud: PointCloud, max_points: int) -> PointCloud:
@@ -252,7 +248,7 @@ def decimated_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     edge = float(np.median(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)))
     cell = max(edge, 1e-9) * np.sqrt(len(mesh.faces) / max_faces)
     while len((found := _clustered(mesh, cell)).faces) > max_faces:
-        cell *= _GROWTH
+        cell *= 1.2
     return found
 
 

@@ -10,20 +10,18 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.figures import map_view
-from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.figures.plots import trajectory_figure
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.files import write_text
 from vggtgeo.mapping.dense import DenseMap
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
-from vggtgeo.report.map_scene import map_scene, pictured, spread
-from vggtgeo.report.viewer import INSTALL, has_viewer, style, template, view_html
-from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
+from vggtgeo.report.map_scene import spread
+from vggtgeo.report.viewer import INSTALL, style, template
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.window_recorder import WindowRecord
 
@@ -61,8 +59,7 @@ def write_page(
     record: RunRecord,
     summary: Mapping[str, Any],
     verdict: Verdict,
-    uncertainty: PoseUncertainty | None = None,
-    mesh: Callable[[], Mesh | None] = lambda: None,
+    view: Callable[[], str | None] = lambda: None,
 ) -> None:
     """Write the report of a run, a self-contained HTML file, atomically.
 
@@ -71,16 +68,19 @@ def write_page(
         record: of the run, with at least one frame.
         summary: content of `summary.json`.
         verdict: how far the result can be trusted; the first part of the page.
-        uncertainty: of the poses, for the 3D view.
-        mesh: returns the mesh of the map for the 3D view, which is made last.
+        view: returns the 3D view, which is made last, since it waits for the mesh; None: not available.
 
     """
     slam, cloud, truth = record.slam, record.dense.cloud, record.truth
     trajectory = frame_trajectory(slam)
     chosen = [(slam.keyframes[row], record.dense.depth_maps[row]) for row in spread(len(slam.keyframes), SAMPLES)]
     low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
-    in_metres, keyframes = summary.get("truth", {}).get("in_metres", True), keyframe_trajectory(slam)
-    drawn = figures.trajectory_svg(trajectory, truth, keyframes, not slam.metric, in_metres) if len(trajectory) else ""
+    drawn = ""
+    if len(trajectory):
+        in_metres = summary.get("truth", {}).get("in_metres", True)
+        drawn = figures.svg(
+            trajectory_figure(trajectory, truth, keyframe_trajectory(slam), not slam.metric, None, 5.0, in_metres)
+        )
     text = template("vggtgeo.report", "page.html.j2").render(
         style=style(),
         title=record.title,
@@ -111,38 +111,12 @@ def write_page(
         scale=summary["scale"],
         scale_basis=summary.get("scale_basis"),
         install=INSTALL,
-        view=_view(record, trajectory, summary, uncertainty, mesh),
+        view=view(),
     )
     write_text(path, text)
 
 
-def _view(
-    record: RunRecord,
-    trajectory: Trajectory,
-    summary: Mapping[str, Any],
-    uncertainty: PoseUncertainty | None,
-    mesh: Callable[[], Mesh | None],
-) -> str | None:
-    """Return the 3D view; None if no frame has a pose, or K3D is not installed."""
-    if not len(trajectory) or not has_viewer():
-        return None
-    slam = record.slam
-    scene = map_scene(
-        record.dense.cloud,
-        trajectory,
-        pictured([slam.keyframes[number] for number in submaps_by_size(slam)[0]]),
-        [float(value) for value in slam.intrinsics],
-        mesh=mesh(),
-        truth=record.truth,
-        uncertainty=uncertainty,
-        metric=slam.metric,
-        truth_in_metres=summary.get("truth", {}).get("in_metres", True),
-    )
-    return view_html(scene)
-
-
 def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the numbers at the top of the page, each with its name."""
     facts = [
         (f"{summary['frames_tracked']} / {summary['frames']}", "frames tracked"),
         (f"{summary['keyframes']}", "keyframes"),
@@ -213,7 +187,6 @@ def _depth_range(depth_maps: Sequence[DepthMap]) -> tuple[float, float]:
 
 
 def _sample(keyframe: Keyframe, depth_map: DepthMap | None, low: float, high: float) -> dict[str, str | None]:
-    """Return a name, and image, depth and confidence as data URIs."""
     image = figures.picture(keyframe.image, _SAMPLE_WIDTH)
     depth = confidence = None
     if depth_map is not None and np.isfinite(low):
@@ -231,7 +204,6 @@ def _map_picture(view: Any, cloud: PointCloud, trajectory: Trajectory) -> str | 
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the settings as text, by name or `group.name`."""
     rows: dict[str, Any] = {}
     for name, value in settings.items():
         rows |= {f"{name}.{key}": own for key, own in value.items()} if isinstance(value, Mapping) else {name: value}

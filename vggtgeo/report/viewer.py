@@ -53,11 +53,12 @@ def check_viewer() -> None:
 def view_html(scene: MapScene) -> str:
     """Return the view as elements for a page with the style sheet of all pages; raise InputError without K3D."""
     check_viewer()
+    library, licences = _library()
     return template("vggtgeo.report", "viewer.html.j2").render(
         header=scene.json,
         block=base64.b64encode(scene.block).decode(),
-        library=_library(),
-        licences=_licences(),
+        library=library,
+        licences=licences,
         script=(files("vggtgeo.report") / "viewer.js").read_text(encoding="utf-8"),
         scene=scene.header,
     )
@@ -86,20 +87,15 @@ class MapView:
 
 
 @cache
-def _library() -> str:
-    """Return K3D's JavaScript, compressed, without importing `k3d`, which takes a second."""
-    return base64.b64encode(zlib.compress((_folder() / "standalone.js").read_bytes(), 9)).decode()
+def _library() -> tuple[str, str]:
+    """Return K3D's JavaScript, compressed, and its licences (three.js and others), as they require.
 
-
-@cache
-def _licences() -> str:
-    """Return the licences of K3D and of what its JavaScript contains (three.js and others), as they require."""
-    texts = [text.read_text() for text in distribution("k3d").files or () if text.name == "LICENSE.txt"]
-    return "\n".join([*texts, (_folder() / "standalone.js.LICENSE.txt").read_text()])
-
-
-def _folder() -> Path:
+    `k3d` is not imported, which takes a second.
+    """
     spec = find_spec("k3d")
     assert spec is not None
     assert spec.submodule_search_locations
-    return Path(spec.submodule_search_locations[0]) / "static"
+    folder = Path(spec.submodule_search_locations[0]) / "static"
+    texts = [text.read_text() for text in distribution("k3d").files or () if text.name == "LICENSE.txt"]
+    licences = "\n".join([*texts, (folder / "standalone.js.LICENSE.txt").read_text()])
+    return base64.b64encode(zlib.compress((folder / "standalone.js").read_bytes(), 9)).decode(), licences

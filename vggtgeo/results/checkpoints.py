@@ -25,7 +25,7 @@ from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.output_checks import EVERY, check_checkpoint_path
+from vggtgeo.results.output_checks import EVERY
 from vggtgeo.results.summary import versions
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -64,26 +64,18 @@ class Checkpoints:
 
     def __post_init__(self) -> None:
         path_of("path", self.path)
-        check_real("checkpoint-every", self.every, "seconds, at least 0")
+        check_real("every", self.every)
         if not 0 <= self.every < math.inf:
-            raise InputError(f"`checkpoint-every` must be seconds, at least 0, got {self.every:g}")
+            raise InputError(f"`every` is {self.every:g}; it must be seconds between checkpoints, at least 0")
 
 
-@dataclass(frozen=True)
-class Notice:
-    """A warning about the input. frames: number of frames left out; None for other warnings."""
+Notice = tuple[str, int | None]
+"""A warning about the input: its text, and the number of frames left out; None for other warnings."""
 
-    text: str
-    frames: int | None = None
 
-    @classmethod
-    def of(cls, warning: Warning | str) -> Notice:
-        """Return the notice of a warning."""
-        return cls(str(warning), warning.frames if isinstance(warning, LeftOutWarning) else None)
-
-    def warning(self) -> Warning:
-        """Return the warning of a notice."""
-        return InputWarning(self.text) if self.frames is None else LeftOutWarning(self.text, self.frames)
+def notice_of(warning: Warning | str) -> Notice:
+    """Return the notice of a warning."""
+    return str(warning), warning.frames if isinstance(warning, LeftOutWarning) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +99,14 @@ class RunSoFar:
         known = Counter(self.notices)
         fresh: list[Warning | str] = []
         for warning in collected:
-            if known[Notice.of(warning)] > 0:
-                known[Notice.of(warning)] -= 1
+            if known[notice_of(warning)] > 0:
+                known[notice_of(warning)] -= 1
             else:
                 fresh.append(warning)
-        return [*(notice.warning() for notice in self.notices), *fresh]
+        before = (
+            InputWarning(text) if frames is None else LeftOutWarning(text, frames) for text, frames in self.notices
+        )
+        return [*before, *fresh]
 
     def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
         """Add the checkpoint's counts to `refusals`."""
@@ -119,7 +114,7 @@ class RunSoFar:
             vars(refusals[role]).update(vars(Refusals(*counts)))
 
 
-KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, Notice, FrameEvidence, WindowRecord)
+KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, FrameEvidence, WindowRecord)
 CHECKPOINT = Format("checkpoint", VERSION, by_name(KEPT_CLASSES))
 
 
@@ -143,14 +138,12 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
     """Return the run to resume; None if `asked` does not resume, or the file does not exist.
 
     Raises:
-        InputError: the file is damaged, its run has another identity, or the path is not a file.
+        InputError: the file is damaged, or its run has another identity.
 
     """
-    if asked is not None:
-        check_checkpoint_path(asked.path)
     if asked is None or not asked.resume or not asked.path.is_file():
         return None
-    saved = _header(asked.path)["identity"]
+    saved = CHECKPOINT.facts(asked.path)["identity"]
     differing = [name for name in {**saved, **identity} if saved.get(name) != identity.get(name)]
     if differing:  # report the shortest: a seed, for example, also appears in every role that samples
         name = min(differing, key=lambda one: len(saved.get(one, "")) + len(identity.get(one, "")))
@@ -159,21 +152,9 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
             f"`{name}` is {now}, but the run in `{asked.path}` had {before}: use the same, or start again with "
             "`--no-resume`"
         )
-    try:
-        found, _ = CHECKPOINT.read(asked.path)
-        if not isinstance(found, RunSoFar) or not found.slam.frames:
-            raise InputError(f"`{asked.path}` contains no run")
-        checked_state(asked.path, found.slam)
-    except InputError as error:
-        raise InputError(f"{error}; start again with `--no-resume`") from None
+    found: RunSoFar = CHECKPOINT.read(asked.path)[0]
+    checked_state(asked.path, found.slam)
     return found
-
-
-def _header(path: Path) -> dict[str, Any]:
-    try:
-        return CHECKPOINT.facts(path)
-    except InputError as error:
-        raise InputError(f"{error}; start again with `--no-resume`") from None
 
 
 def _excerpt(value: str | None) -> str:
@@ -182,13 +163,13 @@ def _excerpt(value: str | None) -> str:
 
 def frames_kept(path: Path) -> str:
     """Return the number of frames in a checkpoint, as text."""
-    count = _header(path)["frames"]
+    count = CHECKPOINT.facts(path)["frames"]
     return f"{count} frame{'s' * (count != 1)}"
 
 
 def check_same_frame(asked: Checkpoints, frame: Frame | None) -> None:
     """Raise InputError unless `frame` is the last one of the checkpoint."""
-    saved = _header(asked.path)
+    saved = CHECKPOINT.facts(asked.path)
     if frame is None or saved["digest"] != digest_of(frame):
         raise InputError(
             f"frame {saved['last']} differs from the one of the run in `{asked.path}`: use the same input, or start "

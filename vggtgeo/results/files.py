@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import write_picture, write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
@@ -90,7 +89,7 @@ def write_depth(folder: Path, depth_maps: Iterable[tuple[int, DepthMap | None]],
         for name, image in (("depth", counts), ("confidence", confidence)):
             write_picture(folder / "depth" / f"{frame:06d}.{name}.png", image)
     if not written:
-        warnings.warn("`depth` is empty: no keyframe has dense depth", InputWarning, stacklevel=2)
+        warn("`depth` is empty: no keyframe has dense depth")
         return
     write_text(folder / "depth" / "README.txt", DEPTH_README + (METRES if metric else FREE_SCALE))
 

@@ -113,7 +113,6 @@ def check_output(place: Path, source: Path | None = None) -> None:
                 )
     if stage.exists() and not stage.is_dir():
         raise InputError(f"`{stage}` is a file, and a run creates a folder there; give another folder with `-o`")
-    check_checkpoint_path(stage / CHECKPOINT)
     for path in stage.iterdir() if stage.is_dir() and not stage.is_symlink() else ():
         if not (is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, NOTE)):
             raise InputError(
@@ -123,19 +122,13 @@ def check_output(place: Path, source: Path | None = None) -> None:
 
 
 def check_can_be_written(place: Path, option: str = "-o") -> None:
-    """Raise InputError if the folder `place` is not writable, or cannot be created. option: that names it."""
+    """Raise InputError if the folder `place` is not writable, or cannot be created. option: of the command line."""
     there = next(folder for folder in (place, *place.absolute().parents) if folder.exists())
     try:
         tempfile.TemporaryFile(dir=there).close()
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"`{place}` cannot be written: {reason}; give another with `{option}`") from None
-
-
-def check_checkpoint_path(path: Path) -> None:
-    """Raise InputError if `path` exists and is not a file."""
-    if os.path.lexists(path) and not path.is_file():
-        raise InputError(f"`{path}` is not a file, but the run writes its checkpoint there: remove it")
 
 
 def _inside(place: Path, source: Path) -> str | None:

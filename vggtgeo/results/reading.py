@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,15 @@ from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.given import check_kind, path_of
+from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.result import Result
-from vggtgeo.results.summary import warn_if_truncated
+
+_WRITTEN_BY_RUNS = ("trajectory.txt", "keyframes.txt")
+_BENCHMARKS = ("groundtruth.txt", "groundtruth.csv", "data.csv", ".gt.freiburg")
+"""Endings of ground-truth files in metres: TUM RGB-D (and datasets of its layout), EuRoC, ICL-NUIM."""
 
 
 def read(path: str | os.PathLike[str]) -> Result | Sequence:
@@ -61,9 +65,12 @@ def evaluate(
         30 poses: ATE 0.000 m after SE(3), 0.000 m after Sim(3) (scale 1.0000); RPE over 1 pose: 0.000 m, 0.000 deg
 
     """
-    known = Trajectory | Result | str | os.PathLike
-    check_kind("estimate", estimate, known, "a trajectory, a result, or a path")
-    true = _truth(truth)
+    check_kind("estimate", estimate, Trajectory | Result | str | os.PathLike, "a trajectory, a result, or a path")
+    if isinstance(truth, str | os.PathLike):
+        true, _ = load_truth(path_of("truth", truth))
+    else:
+        check_kind("truth", truth, Trajectory | Sequence, "a trajectory, a sequence with ground truth, or a path")
+        true = truth if isinstance(truth, Trajectory) else _truth_of(truth)
     if isinstance(estimate, Result):
         estimate = estimate.trajectory
     elif not isinstance(estimate, Trajectory):
@@ -72,30 +79,40 @@ def evaluate(
 
 
 def load_estimate(path: Path, truth: Trajectory) -> Trajectory:
-    """Load the trajectory of a file, or of a run's folder; warn if the run is unfinished, or the file truncated.
+    """Load the trajectory of a file, or of a run's folder; warn if the run is unfinished.
 
     truth: gives the times of poses without times.
     """
     if unfinished := unfinished_message(path):
-        warnings.warn(unfinished, InputWarning, stacklevel=2)
-    file = path / "trajectory.txt" if path.is_dir() else path
-    return warn_if_truncated(file, load_trajectory(file, truth))
+        warn(unfinished)
+    return load_trajectory(path / "trajectory.txt" if path.is_dir() else path, truth)
 
 
-def truth_of(sequence: Sequence) -> Trajectory:
-    """Return the ground truth of a sequence; raise InputError if it has none."""
+def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
+    """Load the trajectory of a file, or the ground truth of a dataset folder; return it, and whether its lengths are
+    metres: by a run's summary, or by a benchmark's file name; None if unknown.
+    """
+    if path.is_dir():
+        sequence = open_sequence(path)
+        return _truth_of(sequence), getattr(sequence, "truth_in_metres", True)
+    scale = load_scale(path)
+    known = True if path.name.endswith(_BENCHMARKS) else None
+    return load_trajectory(path), known if scale is None else scale.startswith("metric")
+
+
+def load_scale(path: Path) -> str | None:
+    """Return the scale in a run's summary, for its folder or a pose file in it; None for other files."""
+    file = (path.parent if path.name in _WRITTEN_BY_RUNS and path.is_file() else path) / "summary.json"
+    if not file.is_file():
+        return None
+    try:
+        return str(json.loads(whole_text(file, errors="strict"))["scale"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"`{file}` is invalid ({error}); give a folder that `vggtgeo run` wrote") from None
+
+
+def _truth_of(sequence: Sequence) -> Trajectory:
     truth = sequence.ground_truth()
     if truth is None:
         raise InputError(f"`{sequence.name}` has no ground truth; give a trajectory in the TUM format")
     return truth
-
-
-def _truth(given: Any) -> Trajectory:
-    if isinstance(given, Trajectory):
-        return given
-    if isinstance(given, str | os.PathLike):
-        if path_of("truth", given).is_file():
-            return load_trajectory(given)
-        given = open_sequence(given)
-    check_kind("truth", given, Sequence, "a trajectory, a sequence with ground truth, or a path")
-    return truth_of(given)

@@ -7,39 +7,35 @@ import time
 import warnings
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
-
-import numpy as np
 
 from vggtgeo.compilation.process_settings import program_settings
 from vggtgeo.datasets import Sequence
-from vggtgeo.datasets.frame import Frame
+from vggtgeo.datasets.frame import check_range
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.errors import InputError, InputWarning, collected_warnings
-from vggtgeo.io.given import check_kind
+from vggtgeo.io.errors import InputError, InputWarning, collected_warnings, warn
+from vggtgeo.io.given import check_kind, check_plain, check_whole
 from vggtgeo.io.process import Interruption, interruption
-from vggtgeo.mapping.dense import check_dense, dense_map
+from vggtgeo.mapping.dense import check_dense, check_mode, dense_map
 from vggtgeo.report import RunRecord
-from vggtgeo.results.checkpoints import digest_of_map, load_checkpoint, run_identity
+from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, load_checkpoint, run_identity
 from vggtgeo.results.result import Result
-from vggtgeo.results.run_options import RunOptions
-from vggtgeo.results.source import PosePrior, Source, open_source, reduction_summary, with_pose_prior
-from vggtgeo.results.summary import compare_with_truth, summarise
+from vggtgeo.results.source import (
+    PosePrior,
+    Source,
+    StaticOverlaySearch,
+    open_source,
+    reduction_summary,
+    with_pose_prior,
+)
+from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import RunCallbacks, TrackingLoop
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.perception.static_overlay import (
-    MAX_IMAGES,
-    STRIDE,
-    StaticOverlay,
-    find_static_overlay,
-    small_grey,
-    static_overlay_of,
-)
 from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
@@ -49,14 +45,71 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
-from vggtgeo.slam.verdict.finding import Finding, Verdict
-from vggtgeo.slam.verdict.judge import check_input, check_refusals, check_static_overlay, judge_or_report
+from vggtgeo.slam.verdict.finding import Verdict
+from vggtgeo.slam.verdict.judge import check_input, check_refusals, judge_or_report
 from vggtgeo.slam.window_recorder import WindowRecorder
 
-FREE_MAP = (
-    "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not used; start "
-    "a new map for a metric one"
-)
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of `vggtgeo.reconstruct` beside the settings of the pipeline.
+
+    Fields:
+        start: first frame.
+        end: frame to stop before; None: after the last.
+        stride: take every n-th frame.
+        seed: of the random samples of robust estimators; equal seeds give equal results.
+        dense: source of the dense depth: auto, mvs, sensor, network or none (`vggtgeo/mapping/dense.py`).
+        title: of the report; None: the name of the sequence.
+        facts: more entries of the summary.
+        warned: earlier warnings about the input, for the verdict and the report.
+        checkpoints: where to write checkpoints, and whether to resume from an existing one.
+
+    Raises:
+        InputError: a value is invalid; names the field.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> vg.RunOptions(end=100, dense="none").stride
+        1
+        >>> vg.RunOptions(start=5, end=5)
+        Traceback (most recent call last):
+            ...
+        vggtgeo.io.errors.InputError: `start` is 5 and `end` 5; they must be 0 <= start < end
+
+    """
+
+    start: int = 0
+    end: int | None = None
+    stride: int = 1
+    seed: int = 0
+    dense: str = "auto"
+    title: str | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    warned: Iterable[Warning | str] = ()
+    checkpoints: Checkpoints | None = None
+
+    def __post_init__(self) -> None:
+        check_range(*self.selection)
+        check_whole("seed", self.seed)
+        check_mode(self.dense)
+        check_kind("title", self.title, str | None, "a text")
+        check_plain("facts", self.facts)
+        facts: Any = self.facts  # of a user: annotations are not checked
+        invalid = [key for key in facts if not isinstance(key, str) or key in RESERVED_KEYS]
+        if invalid:
+            raise InputError(
+                f"`facts` has the key {invalid[0]!r:.60}; keys must be texts other than the summary's own: "
+                f"{', '.join(sorted(RESERVED_KEYS))}"
+            )
+        if isinstance(self.warned, str) or not isinstance(self.warned, Iterable):
+            check_kind("warned", self.warned, (), "a list of warnings or texts")
+        check_kind("checkpoints", self.checkpoints, Checkpoints | None, "`vggtgeo.settings.Checkpoints`, or None")
+
+    @property
+    def selection(self) -> tuple[int, int | None, int]:
+        """Return start, end and stride."""
+        return self.start, self.end, self.stride
 
 
 @in_double_precision
@@ -196,6 +249,7 @@ def _conclude(
             seconds={**clock.seconds, "all": time.perf_counter() - began},
             report=report,
             truth_in_metres=source.truth_in_metres,
+            recorded=facts.get("pose_prior", {}).get("used", False),
             map_points=len(built.cloud),
             dense=options.dense,
         ),
@@ -215,7 +269,10 @@ def _first_state(known: Slam | None, source: Source, settings: SlamSettings, rol
     """
     if known is not None:
         if source.has_depth and not known.metric:
-            warnings.warn(FREE_MAP, InputWarning, stacklevel=4)
+            warn(
+                "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not "
+                "used; start a new map for a metric one"
+            )
         return entered(known, source.camera, roles.points)
     if settings.keyframes.localise_only:
         raise InputError("`keyframes.localise_only` needs a map: pass `known_map` (`--map FILE`)")
@@ -300,50 +357,3 @@ def _finish(
     except KeyboardInterrupt:
         hooks.each("on_message", "interrupted: keeping the result without the last adjustment")
         return slam, True
-
-
-class StaticOverlaySearch(Callback):
-    """Finds the static overlay of a run's images, and gives the verdict its findings.
-
-    found: the mask to leave out of perception; None before `search`, and where no overlay is certain.
-    """
-
-    def __init__(self) -> None:
-        self.found: StaticOverlay | None = None
-        self._overlay: StaticOverlay | None = None
-        self._searched = False
-        self._images: list[np.ndarray] = []
-        self._size = (0, 0)
-        self._stride = 1
-        self._frames = 0
-
-    def search(self, source: Source, selection: tuple[int, int | None, int]) -> None:
-        """Search in a sample of the first frames, before the run; warn where an overlay is left out."""
-        self._searched = True
-        self._overlay = find_static_overlay(source.sample_images(*selection, MAX_IMAGES, STRIDE))
-        if self._overlay is None or not self._overlay.separable:
-            return
-        self.found = self._overlay
-        warnings.warn(
-            f"{100 * self.found.share:.1f} % of the image is a static overlay (bars, a watermark, something on the "
-            "lens?); features and depth there are ignored",
-            InputWarning,
-            stacklevel=4,
-        )
-
-    def on_frame(self, slam: Slam, frame: Frame) -> None:
-        """Keep 20 to 40 images, evenly spread over at most the first `MAX_IMAGES * STRIDE` frames."""
-        if self._searched or self._frames >= MAX_IMAGES * STRIDE:
-            return
-        if self._frames % self._stride == 0:
-            self._size = frame.image.shape[1], frame.image.shape[0]
-            self._images.append(small_grey(frame.image))
-            if len(self._images) == 2 * MAX_IMAGES:
-                self._images, self._stride = self._images[::2], 2 * self._stride
-        self._frames += 1
-
-    def findings(self) -> tuple[Finding, ...]:
-        """Return the findings for the verdict, after the last frame."""
-        if not self._searched:
-            self._overlay = static_overlay_of(self._images, self._size)
-        return check_static_overlay(self._overlay, left_out=self.found is not None)

@@ -1,10 +1,9 @@
-"""The result of a run: trajectory, map and verdict, from the last state or loaded from a folder."""
+"""The result of a run: trajectory, map and verdict, from the last state or from a folder; its figure and view."""
 
 from __future__ import annotations
 
 import os
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -16,24 +15,37 @@ import numpy as np
 from vggtgeo.datasets.frame import Sequence
 from vggtgeo.figures.map_view import result_figure
 from vggtgeo.figures.plot import check_truth, plot
-from vggtgeo.figures.plots import NotebookFigure, plot_trajectory
+from vggtgeo.figures.plots import NotebookFigure, trajectory_figure
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import write_json
+from vggtgeo.io.errors import InputError, warn
+from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.io.given import check_kind, check_plain, path_of
 from vggtgeo.mapping.dense import dense_map
-from vggtgeo.report import RunRecord, write_page
+from vggtgeo.report import (
+    MAX_POINTS,
+    MapScene,
+    MapView,
+    Pictured,
+    RunRecord,
+    check_viewer,
+    has_viewer,
+    map_scene,
+    pictured,
+    view_html,
+    write_page,
+)
 from vggtgeo.results.files import read_uncertainty, write_depth, write_settings, write_trajectories, write_uncertainty
 from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.run_folder import RunFolder, open_folder_for_result
 from vggtgeo.results.scene import depth_of_frames, write_scene
-from vggtgeo.results.summary import add_writing_time, compare_with_truth, load_poses, read_summary, summarise
+from vggtgeo.results.summary import add_writing_time, compare_with_truth, read_summary, summarise
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
@@ -41,6 +53,8 @@ from vggtgeo.slam.window_steps import merge_pending_window
 
 DepthChoice = bool | Literal["every"]
 """Which depth images to save: none, those of the keyframes, or those of every frame."""
+NOTEBOOK_POINTS = 150_000
+"""Of a view in a notebook, which keeps it in its file, some 3 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +141,12 @@ class Result:
         """Load the folder of `Result.save` or `vggtgeo run`; raise InputError if a file is missing or invalid."""
         place = path_of("folder", folder)
         if unfinished := unfinished_message(place):
-            warnings.warn(unfinished, InputWarning, stacklevel=2)
+            warn(unfinished)
         summary, verdict = read_summary(place)
         fx, fy, cx, cy = summary["intrinsics"].values()
         return cls(
-            load_poses(place, "trajectory.txt"),
-            load_poses(place, "keyframes.txt"),
+            Trajectory.load_tum(place / "trajectory.txt"),
+            Trajectory.load_tum(place / "keyframes.txt"),
             PointCloud.load_ply(place / "map.ply"),
             (fx, fy, cx, cy),
             verdict.metric,
@@ -243,8 +257,7 @@ class Result:
     def _draw(self, place: Path, name: str, summary: Mapping[str, Any], mesh: Callable[[], Mesh | None]) -> None:
         record = self.record
         if len(self.trajectory):
-            plot_trajectory(
-                place / "trajectory.png",
+            figure = trajectory_figure(
                 self.trajectory,
                 record.truth if record else None,
                 self.keyframes,
@@ -252,9 +265,32 @@ class Result:
                 title=record.title if record else name,
                 metres=record is None or summary.get("truth", {}).get("in_metres", True),
             )
+            with atomic_path(place / "trajectory.png") as temporary:
+                figure.savefig(temporary, dpi=130, format="png", facecolor="white")
         if record is not None:
-            page = place / "report.html"
-            write_page(page, record, summary, self.verdict, self.uncertainty, mesh)
+            shown = has_viewer() and len(self.trajectory) > 0
+            view = lambda: view_html(self._scene(mesh(), record.truth)) if shown else None
+            write_page(place / "report.html", record, summary, self.verdict, view)
+
+    def _scene(self, mesh: Mesh | None, truth: Trajectory | None, max_points: int = MAX_POINTS) -> MapScene:
+        record = self.record
+        if record is not None:
+            keyframes = pictured([record.slam.keyframes[number] for number in submaps_by_size(record.slam)[0]])
+        else:
+            poses = zip(self.keyframes.timestamps, self.keyframes.poses, strict=True)
+            keyframes = [Pictured(f"keyframe {row}", pose, time) for row, (time, pose) in enumerate(poses)]
+        return map_scene(
+            self.cloud,
+            self.trajectory,
+            keyframes,
+            self.intrinsics,
+            mesh=mesh,
+            truth=truth,
+            uncertainty=self.uncertainty,
+            metric=record.slam.metric if record else self.metric,
+            truth_in_metres=self.summary.get("truth", {}).get("in_metres", True),
+            max_points=max_points,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return counts, path length, intrinsics and summary as plain values."""
@@ -282,3 +318,35 @@ class Result:
 def _plot(value: Result, truth: Trajectory | None = None) -> NotebookFigure:
     check_truth(value.trajectory, truth)
     return result_figure(value.trajectory, value.keyframes, value.cloud, value.metric, truth)
+
+
+def show(result: Result, truth: Trajectory | None = None, *, max_points: int = NOTEBOOK_POINTS) -> MapView:
+    """Return a 3D view of a result: a notebook displays it, and its `save(path)` writes a page.
+
+    The view has the coloured map, the mesh, the camera path with its uncertainty, and the keyframes; a click on a
+    keyframe shows its image. A result loaded from a folder has no images.
+
+    Args:
+        result: of `vggtgeo.reconstruct` or `vggtgeo.read`, with at least one pose.
+        truth: ground truth, camera -> world, aligned and shown beside the path; by default that of the run.
+        max_points: of the view; a larger map is decimated.
+
+    Raises:
+        InputError: an argument is invalid, no frame has a pose, or the package `k3d` is not installed.
+
+    Example:
+        >>> import vggtgeo as vg
+        >>> update = next(vg.run(vg.simulate("room", 3, size=(160, 120))))
+        >>> view = vg.show(vg.Result.of(update))  # in a notebook its last line shows it
+        >>> "Map in 3D" in view.html
+        True
+
+    """
+    check_kind("result", result, Result, "of `vggtgeo.reconstruct` or `vggtgeo.read`")
+    check_kind("truth", truth, Trajectory | None, "for example of `sequence.ground_truth()`")
+    check_viewer()
+    if not len(result.trajectory):
+        raise InputError("`result` has no pose: no frame was tracked, and there is no map to show")
+    record = result.record
+    own = truth if truth is not None or record is None else record.truth
+    return MapView.of(result._scene(result.mesh, own, max_points), "map")

@@ -14,13 +14,12 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import locked_folder, not_written, write_text
 from vggtgeo.io.process import interruption
 from vggtgeo.results.checkpoints import frames_kept
@@ -87,11 +86,9 @@ def open_folder_for_result(folder: str | os.PathLike[str]) -> Iterator[RunFolder
     with open_run_folder(folder, resume=True) as place:
         keeps = checkpoint.is_file()
         if keeps:
-            warnings.warn(
+            warn(
                 f"`{folder}` contains the checkpoint of a killed run, which is kept; `vggtgeo run --resume` continues "
-                "that run and replaces the files of this result",
-                InputWarning,
-                stacklevel=4,
+                "that run and replaces the files of this result"
             )
         yield replace(place, keeps=keeps)
 
@@ -131,7 +128,8 @@ def open_run_folder(
                 _prepare(run, reserve, bool(resume))
                 yield run
             finally:
-                _remove_stage_unless_needed(run.stage)
+                needed = any((run.stage / name).is_file() for name in ("trajectory.txt", CHECKPOINT))
+                _remove(run.stage / _RESERVED if needed else run.stage)
     finally:
         for path in created:
             if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
@@ -152,26 +150,10 @@ def _prepare(run: RunFolder, reserve: int, resume: bool) -> None:
         )
         if reserve and hasattr(os, "posix_fallocate"):
             with (run.stage / _RESERVED).open("wb") as file:
-                _allocate(file.fileno(), reserve)
+                os.posix_fallocate(file.fileno(), 0, reserve)
     except OSError as error:
-        raise not_written(run.folder, error, reserve) from None
-
-
-def _allocate(file: int, size: int) -> None:
-    """Allocate disk space, where the file system supports it."""
-    try:
-        os.posix_fallocate(file, 0, size)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):
-            raise
-
-
-def _remove_stage_unless_needed(stage: Path) -> None:
-    """Remove the stage; if it has a checkpoint or unpublished poses, keep it without the reserved space."""
-    if (stage / "trajectory.txt").is_file() or (stage / CHECKPOINT).is_file():
-        (stage / _RESERVED).unlink(missing_ok=True)
-    else:
-        _remove(stage)
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # of a file system that reserves no space
+            raise not_written(run.folder, error, reserve) from None
 
 
 def _remove(path: Path) -> None:

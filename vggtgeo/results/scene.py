@@ -18,7 +18,6 @@ import numpy as np
 
 from vggtgeo.datasets import Frame
 from vggtgeo.datasets import Sequence as Frames
-from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError, InputWarning
 from vggtgeo.io.files import write_picture
 from vggtgeo.io.persistence import Format, by_name
@@ -36,8 +35,6 @@ MASK = "image-mask.png"
 JPEG_QUALITY = 95
 BATCH = 16
 """Frames in memory at a time: a run keeps images of its keyframes only, so others are read a second time."""
-_TIME_TOLERANCE, _POSITION_TOLERANCE = 1e-5, 1e-4
-"""Seconds, and relative length: the rounding of pose files."""
 
 
 def image_name(frame: int) -> str:
@@ -86,22 +83,6 @@ class Scene:
         """Return the file name of a view's image in `images/`."""
         return image_name(int(self.frames[view]))
 
-    def mismatch(self, times: np.ndarray, centres: np.ndarray) -> str:
-        """Describe the first view that is not one of these poses (times [n], s, and camera centres [n, 3]); empty if
-        there is none.
-        """
-        order = np.argsort(times, kind="stable")
-        times, centres = times[order], centres[order]
-        own = rigid.invert(self.poses)[:, :3, 3]
-        first, behind = (np.searchsorted(times, self.timestamps + span) for span in (-_TIME_TOLERANCE, _TIME_TOLERANCE))
-        for view, (low, high) in enumerate(zip(first, behind, strict=True)):
-            if low == high:
-                return f"frame {self.frames[view]} has no pose at its time"
-            off = np.linalg.norm(centres[low:high] - own[view], axis=1).min()
-            if off > _POSITION_TOLERANCE * (1.0 + np.linalg.norm(own[view])):
-                return f"the poses of frame {self.frames[view]} differ by {off:.3g}"
-        return ""
-
     def with_frames(self, others: Sequence[tuple[int, float, np.ndarray]]) -> Scene:
         """Return the scene with more views, which observe no points; each is (frame number, time in s, pose
         world -> camera). Views are sorted by frame number.
@@ -123,10 +104,7 @@ class Scene:
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Scene:
         """Load `scene.npz` of a run's folder; raise InputError if it is missing, invalid or of another version."""
-        path = Path(folder) / "scene.npz"
-        scene, _ = SCENE.read(path)
-        if not isinstance(scene, Scene):
-            raise InputError(f"`{path}` holds no scene; give a folder that `vggtgeo run` wrote")
+        scene: Scene = SCENE.read(Path(folder) / "scene.npz")[0]
         return scene
 
 

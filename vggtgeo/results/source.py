@@ -1,5 +1,5 @@
-"""The input of a run: a folder, a file, a sequence or a stream of images; opened, validated, reduced in size; and the
-poses that it is given as a prior.
+"""The input of a run: a folder, a file, a sequence or a stream of images; opened, validated, reduced in size; the poses
+that it is given as a prior; and a static overlay of its images.
 """
 
 from __future__ import annotations
@@ -17,19 +17,30 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence
-from vggtgeo.datasets.frame import check_selection
+from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.datasets.views import FrameStream, frame_stream, reduced
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
+from vggtgeo.io.errors import InputError, InputWarning, NoteWarning, warn
 from vggtgeo.io.given import check_kind
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.summary import lens_parameters
 from vggtgeo.simulation.sequence import SyntheticSequence
+from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
+from vggtgeo.slam.perception.static_overlay import (
+    MAX_IMAGES,
+    STRIDE,
+    StaticOverlay,
+    find_static_overlay,
+    small_grey,
+    static_overlay_of,
+)
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.finding import Finding
+from vggtgeo.slam.verdict.judge import check_static_overlay
 
 MIN_SIDE = 32
 """Pixels: the windows of features and of the image pyramid need as many."""
@@ -141,10 +152,10 @@ def _truth(sequence: Sequence) -> Trajectory | None:
         truth = sequence.ground_truth()
         if truth is not None and not getattr(sequence, "truth_in_metres", True):
             text = "has a free scale: errors are in its own unit, after Sim(3) alignment"
-            warnings.warn(f"the ground truth of `{sequence.name}` {text}", NoteWarning, stacklevel=4)
+            warn(f"the ground truth of `{sequence.name}` {text}", NoteWarning)
         return truth
     except InputError as error:
-        warnings.warn(f"the ground truth is invalid and is left out: {error}", InputWarning, stacklevel=4)
+        warn(f"the ground truth is invalid and is left out: {error}")
         return None
 
 
@@ -184,3 +195,48 @@ def with_pose_prior(source: Source, given: PosePrior) -> tuple[Source, RecordedP
             "tx ty tz qx qy qz qw`), or None"
         )
     return replace(source, truth=None), RecordedPoses(source.truth, metres=source.truth_in_metres)
+
+
+class StaticOverlaySearch(Callback):
+    """Finds the static overlay of a run's images, and gives the verdict its findings.
+
+    found: the mask to leave out of perception; None before `search`, and where no overlay is certain.
+    """
+
+    def __init__(self) -> None:
+        self.found: StaticOverlay | None = None
+        self._overlay: StaticOverlay | None = None
+        self._searched = False
+        self._images: list[np.ndarray] = []
+        self._size = (0, 0)
+        self._stride = 1
+        self._frames = 0
+
+    def search(self, source: Source, selection: tuple[int, int | None, int]) -> None:
+        """Search in a sample of the first frames, before the run; warn where an overlay is left out."""
+        self._searched = True
+        self._overlay = find_static_overlay(source.sample_images(*selection, MAX_IMAGES, STRIDE))
+        if self._overlay is None or not self._overlay.separable:
+            return
+        self.found = self._overlay
+        warn(
+            f"{100 * self.found.share:.1f} % of the image is a static overlay (bars, a watermark, something on the "
+            "lens?); features and depth there are ignored"
+        )
+
+    def on_frame(self, slam: Slam, frame: Frame) -> None:
+        """Keep 20 to 40 images, evenly spread over at most the first `MAX_IMAGES * STRIDE` frames."""
+        if self._searched or self._frames >= MAX_IMAGES * STRIDE:
+            return
+        if self._frames % self._stride == 0:
+            self._size = frame.image.shape[1], frame.image.shape[0]
+            self._images.append(small_grey(frame.image))
+            if len(self._images) == 2 * MAX_IMAGES:
+                self._images, self._stride = self._images[::2], 2 * self._stride
+        self._frames += 1
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return the findings for the verdict, after the last frame."""
+        if not self._searched:
+            self._overlay = static_overlay_of(self._images, self._size)
+        return check_static_overlay(self._overlay, left_out=self.found is not None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +16,7 @@ from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, InputWarning
+from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.process import peak_memory_gb
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import submap_file
@@ -39,7 +38,7 @@ def compare_with_truth(slam: Slam, truth: Trajectory | None) -> TrajectoryReport
     try:
         return evaluate_trajectory(estimate, truth)
     except InputError as error:
-        warnings.warn(f"the ground truth is not evaluated: {error}", InputWarning, stacklevel=2)
+        warn(f"the ground truth is not evaluated: {error}")
         return None
 
 
@@ -62,14 +61,16 @@ def summarise(
     seconds: Mapping[str, float],
     report: TrajectoryReport | None = None,
     truth_in_metres: bool = True,
+    recorded: bool = False,
     **counts: Any,
 ) -> dict[str, Any]:
     """Return verdict, settings, versions, counts, time by stage, final intrinsics, and errors against the ground truth.
 
-    truth_in_metres: whether lengths of the ground truth are metres; written as `in_metres` beside the errors.
+    truth_in_metres: whether lengths of the ground truth are metres; written as `in_metres` beside the errors. recorded:
+    whether recorded poses were used as a prior, which then give a map without depth its unit.
     """
     tracked = sum(record.tracked for record in slam.frames)
-    values = {
+    values: dict[str, Any] = {
         "verdict": verdict.to_dict(),
         "settings": dict(settings),
         "versions": versions(),
@@ -79,7 +80,7 @@ def summarise(
         "pairs": len(slam.map.pairs),
         "submaps": list_submaps(slam),
         "peak_memory_gb": round(peak_memory_gb(), 3),
-        "scale": scale_name(slam, verdict, recorded=counts.get("pose_prior", {}).get("used", False)),
+        "scale": scale_name(slam, verdict, recorded),
         **({"scale_basis": SCALE_BASIS} if slam.metric else {}),
         **_pose_sigma(slam),
         "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, slam.intrinsics), strict=True)),
@@ -139,10 +140,8 @@ def lens_parameters(lens: Camera) -> dict[str, float]:
 SCALE_BASIS = "depth only: a constant factor on the depth cannot be observed in the images"
 
 
-def scale_name(slam: Slam, verdict: Verdict, *, recorded: bool = False) -> str:
-    """Return the kind of scale; "metric" only if no check of the verdict doubts it. recorded: whether recorded poses
-    were used as a prior, which then give a map without depth its unit.
-    """
+def scale_name(slam: Slam, verdict: Verdict, recorded: bool) -> str:
+    """Return the kind of scale; "metric" only if no check of the verdict doubts it."""
     if not slam.metric:
         unit = "lengths are in the unit of the recorded poses" if recorded else "lengths have no unit"
         return f"free (no metric depth): {unit}"
@@ -168,42 +167,5 @@ def read_summary(folder: Path) -> tuple[dict[str, Any], Verdict]:
         summary["intrinsics"] = {name: float(summary["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy")}
         return summary, Verdict.from_dict(summary["verdict"], summary["scale"] == "metric")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"`summary.json` in `{folder}` is invalid ({describe_error(error)}); give a folder that `vggtgeo run` wrote"
-        ) from None
-
-
-def describe_error(error: Exception) -> str:
-    """Describe why a JSON file is invalid: the messages of Python's own exceptions do not name its entries."""
-    if isinstance(error, KeyError):
-        return f"`{error.args[0]}` is missing"
-    return "an entry has the wrong type" if isinstance(error, TypeError | AttributeError) else str(error)
-
-
-POSES = {"trajectory.txt": "poses", "keyframes.txt": "keyframes"}
-"""Pose files of a run's folder, and the summary's key for the number of poses in the largest submap."""
-
-
-def load_poses(folder: Path, name: str) -> Trajectory:
-    """Load one of the files of `POSES`; raise InputError if it is invalid, warn as `warn_if_truncated`."""
-    return warn_if_truncated(folder / name, Trajectory.load_tum(folder / name))
-
-
-def warn_if_truncated(file: Path, poses: Trajectory) -> Trajectory:
-    """Return `poses`; warn if the summary beside `file` states another number of them.
-
-    A file cut off at the end of a line is still valid: only the number of poses shows it.
-    """
-    try:
-        largest = json.loads(whole_text(file.with_name("summary.json"), errors="strict"))["submaps"][0]
-        count = largest[POSES[file.name]]
-    except (ValueError, LookupError, TypeError):  # not a run's, or without the number
-        return poses
-    if count != len(poses):
-        warnings.warn(
-            f"`{file}` has {len(poses)} poses, expected {count} from `summary.json`: it is truncated or was edited; "
-            "used as it is",
-            InputWarning,
-            stacklevel=3,
-        )
-    return poses
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"`{folder / 'summary.json'}` is invalid ({reason}); give a folder of `vggtgeo run`") from None

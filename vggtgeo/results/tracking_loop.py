@@ -14,7 +14,7 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 from vggtgeo.io.process import Interruption
-from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, Notice, RunSoFar, check_same_frame
+from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, RunSoFar, check_same_frame, notice_of
 from vggtgeo.results.source import Source
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
@@ -162,7 +162,7 @@ class TrackingLoop:
         return RunSoFar(
             slam,
             self.hooks.so_far(),
-            tuple(map(Notice.of, notices)),
+            tuple(map(notice_of, notices)),
             {role: astuple(counts) for role, counts in self.perception.refusals.items()},
             dict(self.hooks.clock.seconds),
             now - first + (0.0 if before is None else before.tracking),

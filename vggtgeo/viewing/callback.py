@@ -27,7 +27,7 @@ from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window_recorder import WindowRecorder
-from vggtgeo.viewing import entities
+from vggtgeo.viewing.entities import Entities
 from vggtgeo.viewing.target import flush
 
 MAX_POINTS = 4000
@@ -50,8 +50,8 @@ class _Logged:
 class LiveMap:
     """Logs the cloud of each keyframe and its pose, camera -> world, to `world/live/NUMBER`."""
 
-    def __init__(self, stream: Any):
-        self._stream = stream
+    def __init__(self, entities: Entities) -> None:
+        self._entities = entities
         self._logged: dict[int, _Logged] = {}
 
     def update(self, slam: Slam) -> None:
@@ -61,20 +61,17 @@ class LiveMap:
             before = self._logged.get(keyframe.number)
             if room and _is_stale(keyframe, before, slam):
                 points, colours = own_cloud(keyframe, slam.intrinsics, dense=slam.metric)
-                entities.log_cloud(self._stream, f"world/live/{keyframe.number}", points, colours)
+                self._entities.cloud(f"world/live/{keyframe.number}", points, colours)
                 room -= 1
-                entities.log_pose(self._stream, f"world/live/{keyframe.number}", keyframe.pose)
+                self._entities.pose(f"world/live/{keyframe.number}", keyframe.pose)
                 self._logged[keyframe.number] = _Logged(keyframe.frame, keyframe.pose, keyframe.points)
             elif before is not None and keyframe.pose is not before.pose:
-                entities.log_pose(self._stream, f"world/live/{keyframe.number}", keyframe.pose)
+                self._entities.pose(f"world/live/{keyframe.number}", keyframe.pose)
                 self._logged[keyframe.number] = replace(before, pose=keyframe.pose)
 
     def clear(self) -> None:
         """Remove the clouds and the window's points, from the current time on."""
-        import rerun as rr
-
-        for path in ("world/live", "world/points"):
-            self._stream.log(path, rr.Clear(recursive=True))
+        self._entities.clear("world/live", "world/points")
         self._logged.clear()
 
 
@@ -119,14 +116,12 @@ class RerunCallback(Callback):
     """
 
     def __init__(self, stream: Any, window: int = WindowSettings().size, file: Path | None = None):
-        import rerun as rr
-
         self.stream, self._file, self.cut_short = stream, file, False
-        self._recorder = WindowRecorder()
-        self._window, self._live = window, LiveMap(stream)
+        self._entities, self._recorder = Entities(stream), WindowRecorder()
+        self._window, self._live = window, LiveMap(self._entities)
         self._keyframes = self._notes = self._iterations = 0
         self._was_lost = False
-        stream.log("world", rr.ViewCoordinates.RDF, static=True)
+        self._entities.axes()
 
     @in_double_precision
     def on_warm_up(self, problem: Problem, state: State) -> None:
@@ -138,13 +133,13 @@ class RerunCallback(Callback):
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         self.stream.set_time("frame", sequence=frame.index)
         self.stream.set_time("time", duration=frame.timestamp)
-        entities.log_camera(self.stream, slam.last_pose, slam.intrinsics, frame.image)
-        entities.log_tracking(self.stream, slam)
+        self._entities.camera(slam.last_pose, slam.intrinsics, frame.image)
+        self._entities.tracking(slam)
         if bool(slam.tracker.lost) != self._was_lost:
             self._was_lost = bool(slam.tracker.lost)
-            entities.log_lost(self.stream, slam)
+            self._entities.lost(slam)
         for note in slam.notes[self._notes :]:
-            entities.log_note(self.stream, note)
+            self._entities.note(note)
         self._notes = len(slam.notes)
         self._log_adjusted(slam)
 
@@ -155,9 +150,9 @@ class RerunCallback(Callback):
         """Log the path after the last adjustment, and replace the live map by the dense map."""
         self._log_path(slam)
         self._live.clear()
-        entities.log_cloud(self.stream, "world/map", cloud.points, cloud.colours)
+        self._entities.cloud("world/map", cloud.points, cloud.colours)
         counts = f"{len(slam.frames)} frames, {len(slam.keyframes)} keyframes, {len(cloud)} points in the map"
-        entities.log_note(self.stream, f"finished: {counts}", level="INFO")
+        self._entities.note(f"finished: {counts}", level="INFO")
         if problem := flush(self.stream, self._file):
             self.cut_short = self._file is not None
             warn(problem)
@@ -176,27 +171,27 @@ class RerunCallback(Callback):
         members = [slam.keyframes[number] for number in numbers]
         newest = members[-1].number
         matched = [pair for pair in slam.map.pairs if pair.second == newest]
-        entities.log_keyframe(self.stream, members[-1], max(matched, key=lambda pair: pair.first, default=None))
-        entities.log_window(self.stream, members, list(slam.map.pairs))
+        self._entities.keyframe(members[-1], max(matched, key=lambda pair: pair.first, default=None))
+        self._entities.window(members, list(slam.map.pairs))
         self._log_path(slam)
-        entities.log_points(self.stream, members, slam.intrinsics)
+        self._entities.points(members, slam.intrinsics)
         if slam.window.solved is None or not self._recorder.records:
             return
         adjustment, state = slam.window.solved
         found = np.asarray(covariances(adjustment.problem, state).poses)[: len(members)]
-        entities.log_covariance(self.stream, members, found)
-        entities.log_residuals(self.stream, self._recorder.records[-1])
+        self._entities.covariance(members, found)
+        self._entities.residuals(self._recorder.records[-1])
         self._log_iterations(slam)
 
     def _log_path(self, slam: Slam) -> None:
-        entities.log_path(self.stream, frame_trajectory(slam), keyframe_trajectory(slam))
-        entities.log_loops(self.stream, slam, self._window)
-        entities.log_lost(self.stream, slam)
+        self._entities.path(frame_trajectory(slam), keyframe_trajectory(slam))
+        self._entities.loops(slam, self._window)
+        self._entities.lost(slam)
 
     def _log_iterations(self, slam: Slam) -> None:
         if slam.window.energies is None:
             return
         for row, energy in enumerate(slam.window.energies):
             self.stream.set_time("iteration", sequence=self._iterations)
-            entities.log_iteration(self.stream, row, float(energy), slam.window.iterations, len(slam.window.members))
+            self._entities.iteration(row, float(energy), slam.window.iterations, len(slam.window.members))
             self._iterations += 1

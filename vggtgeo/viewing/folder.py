@@ -6,18 +6,14 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-
 from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
-from vggtgeo.io.errors import InputError
+from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.output_checks import check_can_be_shown
-from vggtgeo.results.summary import load_poses
-from vggtgeo.viewing import entities
+from vggtgeo.viewing.entities import Entities
 from vggtgeo.viewing.target import STAND_IN
 
 
@@ -44,31 +40,19 @@ def log_folder(stream: Any, folder: Path) -> None:
         InputError: `trajectory.txt`, `keyframes.txt` or `map.ply` is missing in `folder`.
 
     """
-    import rerun as rr
-
     check_can_be_shown(folder)
-    trajectory = load_poses(folder, "trajectory.txt")
-    stream.log("world", rr.ViewCoordinates.RDF, static=True)
+    entities = Entities(stream)
+    entities.axes()
     stream.set_time("frame", sequence=0)
-    entities.log_path(stream, trajectory, load_poses(folder, "keyframes.txt"))
+    entities.path(*(Trajectory.load_tum(folder / name) for name in ("trajectory.txt", "keyframes.txt")))
     cloud = PointCloud.load_ply(folder / "map.ply")
-    entities.log_cloud(stream, "world/map", cloud.points, cloud.colours)
+    entities.cloud("world/map", cloud.points, cloud.colours)
     if (folder / "mesh.ply").is_file():
-        entities.log_mesh(stream, Mesh.load_ply(folder / "mesh.ply"))
+        entities.mesh(Mesh.load_ply(folder / "mesh.ply"))
     for file in sorted(folder.glob("depth/*.depth.png")):
         if (number := file.name.split(".")[0]).isdecimal():
             stream.set_time("frame", sequence=int(number))
-            depth = rr.DepthImage(_pixels(file, np.uint16), meter=DEPTH_UNIT, colormap="viridis")
-            stream.log("keyframe/depth", depth)
+            entities.depth(read_codes(file), DEPTH_UNIT)
             confidence = file.with_name(f"{number}.confidence.png")
             if confidence.is_file():
-                coloured = cv2.applyColorMap(_pixels(confidence, np.uint8), cv2.COLORMAP_VIRIDIS)
-                stream.log("keyframe/confidence", rr.Image(coloured[..., ::-1]))
-
-
-def _pixels(file: Path, kind: type) -> np.ndarray:
-    pixels = read_codes(file)
-    if pixels.ndim != 2 or pixels.dtype != kind:
-        found = f"{pixels.dtype} {pixels.shape}"
-        raise InputError(f"`{file}` is {found}; expected {np.dtype(kind)} [H, W]: run again with `--save-depth`")
-    return pixels
+                entities.confidence(read_codes(confidence))

@@ -14,8 +14,7 @@ from vggtgeo.models.classical import OrbMatcher, SiftMatcher
 from vggtgeo.models.roles import Segments
 
 import vggtgeo as vg
-from vggtgeo.results.reconstruction import StaticOverlaySearch
-from vggtgeo.results.source import open_source
+from vggtgeo.results.source import StaticOverlaySearch, open_source
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.perception.static_overlay import StaticOverlay, find_static_overlay
 from vggtgeo.slam.pipeline import begin

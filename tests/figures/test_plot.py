@@ -1,4 +1,4 @@
-"""Covariances and observability as numbers and pictures; steps of a state."""
+"""Covariances and observability as numbers and pictures."""
 
 from __future__ import annotations
 
@@ -67,17 +67,3 @@ def test_observability_as_numbers_words_and_picture(solved: dict[str, Any]) -> N
     assert repr(report) == "Observability(12 coordinates free, 10 held, weak: none)"
     heights = [bar.get_height() for bar in vg.plot(report).axes[1].patches]
     assert heights[0] == pytest.approx(100 * scale["points"])
-
-
-def test_a_step_moves_each_coordinate(solved: dict[str, Any]) -> None:
-    """`State.moved` turns a pose by `exp`, adds to intrinsics and depths; oracle: jaxlie, sums."""
-    import jaxlie
-
-    state = solved["state"]
-    step = jnp.zeros(state.num_unknowns).at[8].set(0.1).at[10].set(0.3).at[18].set(2.0).at[22].set(0.05)
-    moved = state.moved(step)
-    expected = jaxlie.SE3.exp(step[6:12]) @ jaxlie.SE3(state.poses.wxyz_xyz[1])
-    np.testing.assert_allclose(moved.poses.wxyz_xyz[1], expected.wxyz_xyz, atol=1e-12)
-    np.testing.assert_array_equal(moved.poses.wxyz_xyz[2], state.poses.wxyz_xyz[2])
-    assert float(moved.intrinsics[0] - state.intrinsics[0]) == pytest.approx(2.0)
-    assert float((moved.inverse_depth - state.inverse_depth).reshape(-1)[0]) == pytest.approx(0.05)

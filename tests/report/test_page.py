@@ -21,8 +21,7 @@ from vggtgeo.figures import map_view
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.mapping.dense import DenseMap, dense_depths
-from vggtgeo.report import RunRecord, write_page
-from vggtgeo.report.viewer import has_viewer
+from vggtgeo.report import RunRecord, has_viewer, map_scene, view_html, write_page
 from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
@@ -65,7 +64,10 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     dense = DenseMap(maps, slam.keyframes, maps, slam.intrinsics, options.get("cloud", run.cloud), 0.02)
     given = {"windows": tuple(run.recorder.records), "truth": truth, "warnings": (), "title": "a <room>"}
     given = {name: options.get(name, value) for name, value in given.items()}
-    write_page(folder / "report.html", RunRecord(slam, dense, **given), options.get("summary", summary), verdict)
+    record = RunRecord(slam, dense, **given)
+    write_page(
+        folder / "report.html", record, options.get("summary", summary), verdict, options.get("view", lambda: None)
+    )
     return (folder / "report.html").read_text()
 
 
@@ -127,7 +129,8 @@ def test_errors_against_a_truth_without_metres_are_no_centimetres(run: RecordedR
 
 def test_the_page_is_whole_and_needs_nothing_else(run: RecordedRun, tmp_path: Path) -> None:
     """Elements close, no address leads out of the file, identifiers are unique, and every part is there."""
-    text = _page(run, tmp_path, warnings=("frame 3 is torn & skipped",))
+    view = lambda: view_html(map_scene(run.cloud, frame_trajectory(run.slam), [], run.slam.intrinsics.tolist()))
+    text = _page(run, tmp_path, warnings=("frame 3 is torn & skipped",), **({"view": view} if has_viewer() else {}))
     checker = CheckedPage(text)
     assert checker.wrong == []
     assert checker.open == []
@@ -173,6 +176,8 @@ def test_the_page_without_depth_and_without_windows(run: RecordedRun, tmp_path: 
     slam = replace(run.slam, map=replace(run.slam.map, keyframes=tuple(blank), metric=False))
     empty = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     text = _page(run, tmp_path, slam, cloud=empty, windows=(), truth=None)
+    told = summarise(slam, Verdict("good"), settings={}, seconds={}, recorded=True)["scale"]
+    assert told == "free (no metric depth): lengths are in the unit of the recorded poses"
     for words in ("No window was adjusted", "The sequence has no depth", "too few points", "lengths have no unit"):
         assert words in text, words
 
