@@ -27,6 +27,7 @@ from vggtgeo.slam.window_steps import camera_prior
 
 GUESS = Camera.guess(320, 240)
 FEW = vg.RunOptions(end=3, dense="none")
+NO_FRAMES = lambda stride: iter(())  # what the fakes below do not look at
 LENS = Camera((280.0, 280.0, 158.0, 121.0), 320, 240, (-0.1, 0.01, 0.0, 0.0), known=False)
 
 
@@ -42,7 +43,7 @@ def begun(monkeypatch: pytest.MonkeyPatch, end: Slam) -> Slam | None:
     """The state that self-calibration gives whose last adjustment ends with `end`."""
     monkeypatch.setattr(self_calibration, "run_frames", lambda *_: iter([end.with_camera(lens=None)]))
     monkeypatch.setattr(self_calibration, "finish", lambda *_, **__: end)
-    return self_calibration.self_calibrate(tuple, GUESS, ROLES, SETTINGS)
+    return self_calibration.self_calibrate(NO_FRAMES, 10, GUESS, ROLES, SETTINGS)
 
 
 def test_the_state_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,10 +98,42 @@ def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.M
     guess = GUESS.intrinsics[0]
     for answers, cameras in (([1.01 * guess], [guess]), ([400.0, 300.0, 280.0], [guess, 400.0, 300.0])):
         tracked.clear()
-        slam = self_calibration.self_calibrate(tuple, GUESS, ROLES, SETTINGS)
+        slam = self_calibration.self_calibrate(NO_FRAMES, 10, GUESS, ROLES, SETTINGS)
         assert tracked == pytest.approx(cameras)
         assert slam.intrinsics[0] == pytest.approx(answers[len(cameras) - 1])
     assert "3 passes" in slam.notes[0]
+
+
+def test_few_of_the_calibration_frames_are_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first pass tracks every third of 150 frames, the next its keyframes; all if the third are not enough.
+
+    Oracle: the indices of the frames that each pass is given.
+    """
+    frame = recorded_run().frames[0]
+    read = lambda stride: (replace(frame, index=index) for index in range(0, 150, stride))
+    keyframes, passes = {0, 30, 60, 147}, []
+    focal = [GUESS.intrinsics[0]]
+
+    def run(frames: Iterable[Frame], *_: Any) -> Any:
+        passes.append([frame.index for frame in frames])
+        slam = found().with_camera(intrinsics=np.array([focal[-1]] * 2 + [160.0, 120.0]))
+        numbers = [*sorted(keyframes), *(len(slam.keyframes) - len(keyframes)) * [0]]
+        own = tuple(replace(one, frame=number) for one, number in zip(slam.keyframes, numbers, strict=True))
+        return iter([slam.with_map(keyframes=own if determined(passes) else own[:2])])
+
+    def end(slam: Slam, *_: Any, **__: Any) -> Slam:
+        focal.append(1.1 * focal[-1] if len(focal) == 1 else focal[-1])
+        return slam.with_camera(intrinsics=np.array([focal[-1]] * 2 + [160.0, 120.0]))
+
+    monkeypatch.setattr(self_calibration, "run_frames", run)
+    monkeypatch.setattr(self_calibration, "finish", end)
+    determined = lambda _: True
+    assert self_calibration.self_calibrate(read, 150, GUESS, ROLES, SETTINGS) is not None
+    assert passes == [list(range(0, 150, 3)), sorted(keyframes)]
+    passes.clear()
+    determined = lambda passes: len(passes) > 1
+    assert self_calibration.self_calibrate(read, 150, GUESS, ROLES, SETTINGS) is not None
+    assert passes == [list(range(0, 150, 3)), list(range(150))]
 
 
 def test_a_pass_that_tells_no_camera(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,8 +156,12 @@ class _Passes:
         self.counts: list[int] = []
         self._camera = camera
 
-    def __call__(self, frames: Callable[[], Iterable[Frame]], camera: Camera, roles: Any, *_: Any) -> Slam | None:
-        self.counts.append(len(list(frames())))
+    def __call__(
+        self, frames: Callable[[int], Iterable[Frame]], count: int, camera: Camera, roles: Any, *_: Any
+    ) -> Slam | None:
+        self.counts.append(len(list(frames(1))))
+        assert self.counts[-1] == count
+        assert len(list(frames(2))) == -(-count // 2)
         if self._camera is None:
             return None
         own = np.array(self._camera.intrinsics)

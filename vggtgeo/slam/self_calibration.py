@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def self_calibrate(
     its map is adjusted now.
     """
     for stride in sorted({max(count // FRAMES_PER_PASS, 1), 1}, reverse=True):
-        found = _calibrated_by(lambda stride=stride: frames(stride), camera, roles, settings, progress)
+        found = _calibrated_by(partial(frames, stride), camera, roles, settings, progress)
         if found is not None:
             return found
     return None

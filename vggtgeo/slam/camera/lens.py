@@ -5,7 +5,7 @@ of the run. So is a given one without distortion coefficients, in a map without 
 the focal length absorbs the distortion and is wrong. So two radial coefficients `k` are estimated
 (`benchmarks/no_calibration.py`). If they explain the matches significantly better and move pixels by more than
 `MIN_WARP`, then images, key points and segments of the keyframes are undistorted, and all later steps use the ideal
-pinhole.
+pinhole. The last adjustment of a self-calibrated run searches what its first guess of the lens left.
 
 The estimate minimises the energy of the adjusted map, `E(k) = min_x e(x, k)`, where `e` is that of the pinhole for
 undistorted pixels. Its gradient needs no other adjustment: it is the partial derivative of `e` at the adjusted map
@@ -224,6 +224,24 @@ def largest_shift(camera: Camera) -> float:
     if drawn[before].max() < side:
         return float("inf")
     return float(fx * np.abs(drawn - radius)[before & (drawn <= corner)].max())
+
+
+def composed(first: Camera, second: Camera) -> Camera:
+    """Return the camera of both lenses in a row: `second` is that of images that were undistorted by `first`.
+
+    Its distortion (k1, k2, p1, p2) is the least-squares fit to both over the image; p1 and p2 are of the principal
+    point, which the second may have elsewhere.
+    """
+    across, down = np.meshgrid(np.linspace(0, second.width - 1, 20), np.linspace(0, second.height - 1, 20))
+    ideal = np.column_stack([across.ravel(), down.ravel()])
+    fx, fy, cx, cy = second.intrinsics
+    rays, drawn = ((pixels - [cx, cy]) / [fx, fy] for pixels in (ideal, first.distorted(second.distorted(ideal))))
+    x, y = rays.T
+    square = x**2 + y**2
+    along_x = np.column_stack([x * square, x * square**2, 2 * x * y, square + 2 * x**2])
+    along_y = np.column_stack([y * square, y * square**2, square + 2 * y**2, 2 * x * y])
+    distortion, *_ = np.linalg.lstsq(np.vstack([along_x, along_y]), (drawn - rays).T.ravel(), rcond=None)
+    return replace(second, distortion=tuple(distortion.tolist()))
 
 
 def can_undistort(keyframes: Iterable[Keyframe]) -> bool:

@@ -20,7 +20,7 @@ from vggtgeo.slam.camera.given_camera import (
     refine_given_camera,
     without_surfaces,
 )
-from vggtgeo.slam.camera.lens import FoundLens, can_undistort, find_lens, undistorted_map, undistorted_pixels
+from vggtgeo.slam.camera.lens import FoundLens, can_undistort, composed, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pixel_aspect import FoundAspect, are_square, aspect_prior, find_aspect
 from vggtgeo.slam.camera.rolling_shutter import FoundReadout, find_readout, problem_to_global_shutter
 from vggtgeo.slam.global_map.carried_poses import camera_motions, frame_interval
@@ -214,7 +214,8 @@ def _try_camera(done: _Solved, edges: list[Directed], settings: SlamSettings) ->
         done = done._replace(adjustment=replace(done.adjustment, problem=free), state=refined.state or done.state)
     elif done.adjustment.problem.shared_focal:
         done = _try_pixel_aspect(done)
-    if camera.lens is None and not camera.given_lens and can_undistort(done.slam.keyframes):
+    unknown = (camera.lens is None or camera.self_calibrated) and not camera.given_lens
+    if unknown and can_undistort(done.slam.keyframes):
         lens = find_lens(done.adjustment.problem, done.state, done.slam.keyframes[0].size, _solved)
         undistorting = _apply_lens(done.slam, done.adjustment, lens)
         if undistorting is not done.slam:
@@ -282,7 +283,7 @@ def _apply_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> 
 
 
 def undistorted(slam: Slam, lens: Camera) -> Slam:
-    """Return the state for the ideal pinhole of `lens`; poses and depths are unchanged."""
+    """Return the state for the ideal pinhole of `lens`, of the images as they are now; poses and depths stay."""
     frames = tuple(
         record
         if record.seen is None
@@ -290,7 +291,9 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
         for record in slam.frames
     )
     ideal = replace(slam, map=undistorted_map(slam.map, lens)).with_tracker(frames=frames)
-    ideal = ideal.with_camera(intrinsics=np.array(lens.intrinsics, np.float64), lens=lens)
+    before = slam.camera.lens
+    whole = lens if before is None else composed(before, lens)
+    ideal = ideal.with_camera(intrinsics=np.array(lens.intrinsics, np.float64), lens=whole)
     return ideal.with_window(solved=None, prior=None)
 
 
