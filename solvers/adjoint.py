@@ -49,7 +49,7 @@ from vggtgeo.solvers.arrow import (
 from vggtgeo.solvers.flat_directions import at_least
 from vggtgeo.solvers.levenberg_marquardt import LevenbergMarquardtState, SchurLevenbergMarquardt
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
-from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, DenseCholesky
 
 STATIONARY = 1e-6
 """Gradient after the refinement, scaled by the root of the curvature (the unit of `sqrt(energy)`), above which a point

@@ -48,6 +48,12 @@ class AbstractKernel(eqx.Module):
 
     """
 
+    def __check_init__(self) -> None:
+        """Raise ValueError unless the width, if there is one, is positive; a traced width is not checked."""
+        width = getattr(self, "delta", None)
+        if isinstance(width, jax.Array) and not isinstance(width, jax.core.Tracer) and not np.all(width > 0):
+            raise ValueError(f"`delta` of `{type(self).__name__}` must be positive, got {width}")
+
     @abc.abstractmethod
     def rho(self, s: Values) -> Values:
         """Return the kernel's value, same shape and unit as `s`."""
@@ -190,6 +196,12 @@ class Barron(AbstractKernel):
 
     delta: Float[Array, ""] = eqx.field(converter=_number, default=1.5)
     alpha: Float[Array, ""] = eqx.field(converter=_number, default=1.0)
+
+    def __check_init__(self) -> None:
+        """Raise ValueError for a shape that is not below 2, or is 0."""
+        known = isinstance(self.alpha, jax.Array) and not isinstance(self.alpha, jax.core.Tracer)
+        if known and not np.all((self.alpha < 2) & (self.alpha != 0)):
+            raise ValueError(f"`alpha` of `Barron` must be below 2 and not 0 (use `Cauchy` for 0), got {self.alpha}")
 
     def _base(self, s: Values) -> tuple[Float[Array, ""], Values]:
         breadth = self.delta**2 * (2 - self.alpha)

@@ -27,7 +27,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_gradient
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 
 class Termination(eqx.Enumeration):

@@ -11,7 +11,7 @@ from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, ConjugateGradients
 from vggtgeo.solvers.kernels import Huber
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced import AbstractReducedSolver
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve

@@ -13,7 +13,7 @@ from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from scenes import Scene, make_scene
 from vggtgeo.solvers.arrow import ArrowVector
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced import DenseCholesky
+from vggtgeo.solvers.reduced_solvers import DenseCholesky
 
 from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment

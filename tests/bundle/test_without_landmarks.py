@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BlockJacobi, ConjugateGradients
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 import vggtgeo as vg
 from vggtgeo.bundle.linearise import scale_direction

@@ -21,7 +21,7 @@ from vggtgeo.solvers.conjugate_gradients import (
 from vggtgeo.solvers.flat_directions import flat_stiffness
 from vggtgeo.solvers.kernels import Square
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.marginalisation import empty_prior

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtgeo.bundle.packing_checks import check_fixed, check_range
+from vggtgeo.bundle.checks import check_fixed, check_range
 from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, with_shared_focal
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import real_numbers
@@ -56,12 +56,6 @@ class CheckedIntrinsics:
     prior_mean: np.ndarray
     prior_sigma: np.ndarray | None
     fixed: np.ndarray
-
-    def focal(self, keyframes: int) -> np.ndarray:
-        """Return the first parameter of each keyframe's camera, `[n]`, pixels."""
-        camera = np.zeros(keyframes, int) if self.camera_of is None else self.camera_of
-        focal: np.ndarray = np.atleast_2d(self.values)[camera, 0]
-        return focal
 
 
 def checked_intrinsics(given: Any, keyframes: int) -> CheckedIntrinsics:

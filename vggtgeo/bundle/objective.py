@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
+from vggtgeo.bundle.checks import check_pair
 from vggtgeo.bundle.fast import any_camera, pinhole
-from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
-from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.landmark import HostPixel
 from vggtgeo.bundle.terms.node import node_residuals
 from vggtgeo.bundle.terms.term import robust_energy
 from vggtgeo.geometry import lie

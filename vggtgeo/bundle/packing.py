@@ -19,19 +19,19 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
-from vggtgeo.bundle.intrinsics import CheckedIntrinsics, Intrinsics, checked_intrinsics
-from vggtgeo.bundle.observations import FlatTerm, Observations
-from vggtgeo.bundle.packing_checks import (
-    as_poses,
+from vggtgeo.bundle.checks import (
     check_dtype,
     check_fixed,
     check_kernel,
     check_observations,
+    check_observed,
+    check_poses,
     check_positive,
-    check_resolution,
     check_size,
     check_terms,
 )
+from vggtgeo.bundle.intrinsics import CheckedIntrinsics, Intrinsics, checked_intrinsics
+from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.padding import (
     COUNTED,
     GivenTerm,
@@ -42,15 +42,11 @@ from vggtgeo.bundle.padding import (
     pad_edges,
     rows_of_keyframes,
 )
-from vggtgeo.bundle.pair_checks import check_observed
 from vggtgeo.bundle.problem import Edges, Problem, State
-from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
-from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.image import LineTerm, PointTerm
-from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.node import DenseTerm
-from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.landmark import DepthPrior, HostPixel, SlotTerm
+from vggtgeo.bundle.terms.node import DenseTerm, IntrinsicsPrior
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.io.errors import InputError
@@ -88,8 +84,8 @@ def pack(
         InputError: an array of a wrong shape, an index out of range, a duplicate match, a landmark with both points
             and lines, an observation along an edge that does not start at the landmark's host, an inverse depth, focal
             length or standard deviation that is not positive, weights that are negative or NaN, lines that are not
-            normalised, a duplicate edge or one from a keyframe to itself, an invalid kernel, a size that is too small,
-            all weights zero, or positions so far from the origin that the precision is too low for most of the matches.
+            normalised, a duplicate edge or one from a keyframe to itself, an invalid kernel, a size that is too
+            small, or all weights zero.
 
     Example:
         >>> import vggtgeo as vg
@@ -104,19 +100,16 @@ def pack(
     check_dtype(dtype)
     check_kind("observations", observations, Observations, "`vggtgeo.Observations`")
     check_kind("size", size, PaddedSize | None, "a `vggtgeo.PaddedSize`")
-    observations, poses = as_arrays(observations), as_poses(poses)
+    observations, poses = _as_arrays(observations), check_poses(poses)
     inverse_depth = real_numbers("inverse_depth", inverse_depth)
-    check_kernel("kernel", observations.kernel)
-    check_observations(observations, poses)
+    check_observations(observations, len(poses))
     check_positive("inverse_depth", inverse_depth, len(observations.host))
     cameras = checked_intrinsics(intrinsics, len(poses))
     terms = check_terms(terms, observations, len(poses))
-    check_resolution(observations, poses, cameras.focal(len(poses)), inverse_depth, dtype)
+    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
     size, graph, host, index = _layout(observations, len(poses), size)
     padding, camera_of = size.keyframes - len(poses), cameras.camera_of
-    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
-    kernel = observations.kernel or Cauchy(jnp.asarray(1.5, dtype))
-    seen = _seen(observations, index, size, kernel, dtype)
+    seen = _seen(observations, index, size, dtype)
     problem = Problem(
         pixels=_per_slot(index, observations.pixel, 0.0, dtype),
         edges=graph,
@@ -129,7 +122,6 @@ def pack(
     )
     problem = _of_type(problem, dtype)
     check_observed(problem)
-    offset = jnp.zeros((index.shape[0], size.points, 2), dtype) if problem.pixel_terms else None
     # Empty slots get a positive depth: residuals may divide by it or take its logarithm.
     depths = _per_slot(index, inverse_depth, 1.0, dtype)
     if observations.segment is not None:
@@ -138,6 +130,7 @@ def pack(
     # Padding keyframes are fixed and unobserved, but a quaternion of length zero would be NaN when normalised.
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
     start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
+    offset = jnp.zeros((index.shape[0], size.points, 2), dtype) if problem.pixel_terms else None
     return problem, State(start, jnp.asarray(cameras.values, dtype), depths, offset), index
 
 
@@ -146,7 +139,7 @@ def _of_type(problem: Problem, dtype: DTypeLike) -> Problem:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, problem)
 
 
-def as_arrays(observations: Observations) -> Observations:
+def _as_arrays(observations: Observations) -> Observations:
     """Return the same observations with lists converted to arrays."""
     names = [field.name for field in fields(observations) if field.name not in ("alpha", "kernel")]
     given = {name: getattr(observations, name) for name in names}
@@ -178,11 +171,14 @@ def _layout(
     return size, stored.edges, host, SlotIndex(row, slot, stored.position[place], shape, part, stored.step[place])
 
 
-def _seen(
-    observations: Observations, index: SlotIndex, size: PaddedSize, kernel: AbstractKernel, dtype: DTypeLike
-) -> tuple[AbstractTerm, ...]:
+def _seen(observations: Observations, index: SlotIndex, size: PaddedSize, dtype: DTypeLike) -> tuple[AbstractTerm, ...]:
     """Return the terms of `Observations`: points, lines, depths and host pixels."""
     seen, every = observations, np.arange(len(observations.host))
+    kernel = seen.kernel
+    if kernel is None:
+        kernel = Cauchy(jnp.asarray(1.5, dtype))
+    else:
+        check_kernel("kernel", kernel)
     points = {"target": seen.point_target.astype(float), "weight": seen.point_weight, "kernel": kernel}
     lines = {"coefficients": seen.line_coefficients.astype(float), "weight": seen.line_weight, "kernel": kernel}
     end = size.points + size.lines

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtgeo.bundle.checks import check_kinds, check_pair
 from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, prepared
-from vggtgeo.bundle.pair_checks import check_kinds, check_pair
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.landmark import HostPixel, SlotTerm
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm, node_residuals
-from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.io.kept_program import KeptProgram
 from vggtgeo.io.readable import Readable

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
+from vggtgeo.bundle.checks import check_pair
 from vggtgeo.bundle.marginalisation import marginalise, permute_prior
-from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError

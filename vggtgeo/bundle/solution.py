@@ -12,10 +12,10 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.checks import check_observed, check_pair
 from vggtgeo.bundle.diagnosis import MAJORITY, Diagnosis, diagnose, diagnosis_like
 from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.pair_checks import check_observed, check_pair
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.solver_choice import default_solver
 from vggtgeo.io.errors import InputError

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtgeo.bundle.checks import check_finite, check_pair
 from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
-from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import count_rows
 from vggtgeo.bundle.terms.node import CameraTerm, NodeTerm, node_derivatives
@@ -34,7 +34,7 @@ from vggtgeo.io.readable import Readable
 from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.flat_directions import flat_stiffness
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600
 """Number of keyframes above which a dense inverse is not advisable: 104 MB and about 10 s (2.5 s for 355)."""

@@ -34,10 +34,10 @@ from jaxtyping import Array, Bool, Float
 from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import SHOWN, Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
+from vggtgeo.bundle.checks import check_finite, check_pair
 from vggtgeo.bundle.diagnosis import check_linearisation
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import term_residuals, used_slots
 from vggtgeo.geometry import lie

@@ -9,7 +9,7 @@ Local coordinates of one edge `(i, j)`: the left tangent `eta` of the relative p
 independent of the number of other cameras; if both ends have the same camera, the derivative is the sum of both. Slots
 come last in every array, so that each quantity is contiguous: columns are `[6 + c + 2, m p]`, in the order eta,
 cameras, residual, inverse depth, for `m` consecutive residual rows. If the pixels of the slots in their host are also
-unknowns (`terms/host_pixel.py`), two rows follow: by `u`, by `v`.
+unknowns (`HostPixel`), two rows follow: by `u`, by `v`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,56 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.bundle.fast import any_camera, pinhole
 from vggtgeo.bundle.fast.pinhole import Projection
 from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighted_rows, robust_energy
-from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.camera_models import Cameras, Pinhole, with_shared_focal
+from vggtgeo.geometry.camera_models import AbstractCamera, Cameras, Pinhole, with_shared_focal
 
 CENTRE = lie.TANGENT + 2
 """Index of the derivative by the principal point in a row."""
+
+
+class View(eqx.Module):
+    """A landmark of host camera i in target camera j.
+
+    The landmark is scaled by its inverse depth, `R ray + d t`, which stays finite for points at infinity.
+
+    Example: a landmark seen by two cameras at the same pose.
+        >>> import jax.numpy as jnp, jaxlie
+        >>> camera = vg.cameras.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0]))
+        >>> vg.terms.View(jaxlie.SE3.identity(), camera, jnp.array([100.0, 50.0]), jnp.asarray(0.5)).projected.tolist()
+        [100.0, 50.0]
+
+    """
+
+    relative: jaxlie.SE3
+    """`M = T_j T_i^-1`: host to target camera."""
+    camera: AbstractCamera
+    """Camera of keyframe j."""
+    pixel: Float[Array, "2"]
+    """Pixel in the host."""
+    inverse_depth: Float[Array, ""]
+    """1/m, in the host."""
+    host: AbstractCamera | None = None
+    """Camera of keyframe i if it differs from that of keyframe j."""
+
+    @property
+    def ray(self) -> Float[Array, "3"]:
+        """Viewing ray in the host, `z = 1`."""
+        return (self.camera if self.host is None else self.host).unproject(self.pixel)
+
+    @property
+    def scaled_point(self) -> Float[Array, "3"]:
+        """The landmark in target coordinates times its inverse depth."""
+        return self.relative.rotation().as_matrix() @ self.ray + self.inverse_depth * self.relative.translation()
+
+    @property
+    def point(self) -> Float[Array, "3"]:
+        """The landmark in target coordinates, metres."""
+        return self.scaled_point / self.inverse_depth
+
+    @property
+    def projected(self) -> Float[Array, "2"]:
+        """Pixel of the landmark in the target (equation 5 of the paper)."""
+        return self.camera.project(self.scaled_point)
 
 
 class EdgeView(eqx.Module):

@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vggtgeo.bundle.fast import any_camera, pinhole
-from vggtgeo.bundle.terms.edge import CENTRE, EdgeTerm, EdgeView, Gradient, LocalModel, PixelModel
+from vggtgeo.bundle.terms.edge import CENTRE, EdgeTerm, EdgeView, Gradient, LocalModel, PixelModel, View
 from vggtgeo.bundle.terms.term import reweighting, robust_energy, squared_norm
-from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry.camera_models import Pinhole
 
 Rows = tuple[Float[Array, " p"], ...]
