@@ -130,17 +130,13 @@ def permute_prior(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPr
 
 
 def _order_of(given: Any, count: int) -> Int[Array, " n"]:
-    traced = isinstance(given, jax.core.Tracer)
-    order = given if traced else real_numbers("order", given)
-    inside = np.zeros(0, int) if traced else order[order >= 0]
-    if (
-        order.dtype.kind not in "iu"
-        or order.ndim != 1
-        or len(np.unique(inside)) < len(inside)
-        or (inside >= count).any()
-    ):
-        found = f"{order.dtype}{list(order.shape)}" if traced else order.tolist()
-        raise InputError(f"`order` must have distinct whole numbers below {count}, or -1, got {found}")
+    if isinstance(given, jax.core.Tracer):
+        return given
+    order = real_numbers("order", given)
+    known = order[order >= 0]
+    distinct = len(np.unique(known)) == len(known)
+    if order.ndim != 1 or order.dtype.kind not in "iu" or not distinct or known.max(initial=0) >= count:
+        raise InputError(f"`order` must have distinct whole numbers below {count}, or -1, got {order.tolist()}")
     return jnp.asarray(order)
 
 

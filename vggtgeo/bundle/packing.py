@@ -30,7 +30,7 @@ from vggtgeo.bundle.checks import (
     check_size,
     check_terms,
 )
-from vggtgeo.bundle.intrinsics import CheckedIntrinsics, Intrinsics, checked_intrinsics
+from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.padding import (
     COUNTED,
@@ -104,7 +104,8 @@ def pack(
     inverse_depth = real_numbers("inverse_depth", inverse_depth)
     check_observations(observations, len(poses))
     check_positive("inverse_depth", inverse_depth, len(observations.host))
-    cameras = checked_intrinsics(intrinsics, len(poses))
+    cameras = intrinsics if isinstance(intrinsics, Intrinsics) else Intrinsics(real_numbers("intrinsics", intrinsics))
+    cameras = cameras.checked(len(poses))
     terms = check_terms(terms, observations, len(poses))
     fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
     size, graph, host, index = _layout(observations, len(poses), size)
@@ -196,10 +197,9 @@ def _seen(observations: Observations, index: SlotIndex, size: PaddedSize, dtype:
     return (*terms, _placed(pixels, index, (0, size.points), dtype))
 
 
-def _intrinsics_prior(cameras: CheckedIntrinsics, dtype: DTypeLike) -> IntrinsicsPrior:
-    mean, sigma = cameras.prior_mean, cameras.prior_sigma
-    known = 0.0 if sigma is None else _weight_of(sigma)
-    weight = np.broadcast_to(known, mean.shape)
+def _intrinsics_prior(cameras: Intrinsics, dtype: DTypeLike) -> IntrinsicsPrior:
+    mean = np.asarray(cameras.prior_mean)
+    weight = np.broadcast_to(_weight_of(np.asarray(cameras.prior_sigma)), mean.shape)
     return IntrinsicsPrior(
         index=jnp.arange(mean.size), mean=jnp.asarray(mean.ravel(), dtype), weight=jnp.asarray(weight.ravel(), dtype)
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ from vggtgeo.io.errors import InputError
 
 GivenTerm = AbstractTerm | FlatTerm
 """A term as an argument of `pack`."""
+_Places = tuple[np.ndarray, np.ndarray]
+"""Row and column of each value in a padded array."""
 
 
 @dataclass(frozen=True)
@@ -137,11 +139,12 @@ class SlotIndex:
             return self.edge[edge]
         return self.edge[edge] + self.part[landmark] * self.step[edge]
 
-    @overload
-    def gather(self, per_slot: np.ndarray) -> np.ndarray: ...
-    @overload
-    def gather(self, per_slot: Array) -> Any: ...
-    def gather(self, per_slot: np.ndarray | Array) -> Any:
+    def _points(self, observations: Observations) -> _Places:
+        """Return stored edge and slot of each point match."""
+        landmark = observations.point_landmark
+        return self.stored_edge(observations.point_edge, landmark), self.slot[landmark]
+
+    def gather(self, per_slot: ArrayLike) -> Any:
         """Return values of the landmarks, `[D, ...]`, from an array `[h, s, ...]`.
 
         The result is a NumPy array, or a JAX array if `per_slot` is traced (`jit`, `vmap`, `grad`).
@@ -150,20 +153,9 @@ class SlotIndex:
             InputError: `per_slot` has another shape.
 
         """
-        found = per_slot if isinstance(per_slot, jax.core.Tracer) else np.asarray(per_slot)
-        rows, _, slots = self.shape
-        if found.shape[:2] != (rows, slots):
-            raise InputError(
-                f"`per_slot` must have shape ({rows}, {slots}, ...), got {found.shape}: a value for each slot of each "
-                "row, such as `state.inverse_depth`"
-            )
-        return found[self.host, self.slot]
+        return _gathered("per_slot", per_slot, (self.host, self.slot), self.shape[0])
 
-    @overload
-    def gather_points(self, per_match: np.ndarray, observations: Observations) -> np.ndarray: ...
-    @overload
-    def gather_points(self, per_match: Array, observations: Observations) -> Any: ...
-    def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> Any:
+    def gather_points(self, per_match: ArrayLike, observations: Observations) -> Any:
         """Return values of the point matches, `[A, ...]`, in the order of `observations`, from an array `[e, p, ...]`.
 
         Works under `jit` like `gather`.
@@ -172,15 +164,7 @@ class SlotIndex:
             InputError: `per_match` has another shape.
 
         """
-        found = per_match if isinstance(per_match, jax.core.Tracer) else np.asarray(per_match)
-        _, edges, slots = self.shape
-        if found.ndim < 2 or found.shape[0] != edges or found.shape[1] > slots:
-            raise InputError(
-                f"`per_match` must have shape ({edges}, at most {slots}, ...), got {found.shape}: a value for each "
-                "point of each edge, such as `problem.points.weight`"
-            )
-        landmark = observations.point_landmark
-        return found[self.stored_edge(observations.point_edge, landmark), self.slot[landmark]]
+        return _gathered("per_match", per_match, self._points(observations), self.shape[1])
 
     def scatter(self, values: ArrayLike, into: ArrayLike) -> Array:
         """Write values of the landmarks to their slots in `into`: the inverse of `gather`.
@@ -213,9 +197,7 @@ class SlotIndex:
             InputError: an array has a wrong shape.
 
         """
-        landmark = observations.point_landmark
-        where = (self.stored_edge(observations.point_edge, landmark), self.slot[landmark])
-        return _scattered(values, into, where, self.shape[1])
+        return _scattered(values, into, self._points(observations), self.shape[1])
 
     def scatter_lines(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
         """Write values of the line samples to their slots in `into`, like `scatter_points`.
@@ -235,20 +217,29 @@ class SlotIndex:
         return _scattered(values, into, where, self.shape[1])
 
 
-def _scattered(values: ArrayLike, into: ArrayLike, where: tuple[np.ndarray, np.ndarray], rows: int) -> Array:
-    """Return `into` with each value at its row and column."""
-    given, whole, column = jnp.asarray(values), jnp.asarray(into), where[1]
-    room = whole.ndim > 1 and whole.shape[0] == rows
-    if not room or (column.size and not 0 <= column.min() <= column.max() < whole.shape[1]):
+def _check_room(name: str, array: Any, where: _Places, rows: int) -> None:
+    """Check that an array has the rows of a problem, and the columns of all places."""
+    column = where[1]
+    room = array.ndim > 1 and array.shape[0] == rows
+    if not room or (column.size and not 0 <= column.min() <= column.max() < array.shape[1]):
         raise InputError(
-            f"`into` must have shape ({rows}, slots, ...), got {whole.shape}: an array of the problem packed with this "
-            "index, such as the `weight` of the term"
+            f"`{name}` must have shape ({rows}, slots, ...), got {array.shape}: an array of the problem packed with "
+            "this index, such as the `weight` of the term"
         )
-    if given.shape != (len(column), *whole.shape[2:]):
-        raise InputError(
-            f"`values` must have shape {(len(column), *whole.shape[2:])}, got {given.shape}: a row an observation, in "
-            "the order of the arguments of `pack`"
-        )
+
+
+def _gathered(name: str, values: ArrayLike, where: _Places, rows: int) -> Any:
+    found = values if isinstance(values, jax.core.Tracer) else np.asarray(values)
+    _check_room(name, found, where, rows)
+    return found[where]
+
+
+def _scattered(values: ArrayLike, into: ArrayLike, where: _Places, rows: int) -> Array:
+    given, whole = jnp.asarray(values), jnp.asarray(into)
+    _check_room("into", whole, where, rows)
+    wanted = (len(where[1]), *whole.shape[2:])
+    if given.shape != wanted:
+        raise InputError(f"`values` must have shape {wanted}, a row an observation, got {given.shape}")
     # `pack` has checked that landmarks and matches are distinct, so XLA need not order the writes.
     return whole.at[where].set(given.astype(whole.dtype), unique_indices=True)
 
