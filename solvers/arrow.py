@@ -1,4 +1,5 @@
-"""Arrow-shaped normal equations of an edge-factored least-squares problem; `assembly.py` has their Schur complement.
+"""Arrow-shaped normal equations of an edge-factored least-squares problem; for their elimination see
+`schur_complement.py`.
 
 Unknowns: `n` nodes of `b` coordinates each, `q` shared coordinates (together `c = n b + q`: the dense part `x`), and
 `h` rows of `s` scalar landmarks `z`. A node hosts one row or several, so that rows are short even if one node hosts

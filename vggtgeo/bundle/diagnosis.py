@@ -42,11 +42,6 @@ SIGNIFICANCE = 1e-3
 fixed pose as inconsistent."""
 
 
-def finer_than_precision(weight: Any, squared_slope: Any, squared_distance: Any, eps: float) -> Any:
-    """Return which observations have a standard deviation below the effect of one step of the position."""
-    return weight * squared_slope * squared_distance * eps**2 > 1
-
-
 class Diagnosis(eqx.Module):
     """Faults of a problem at a state, one entry for each term; a pytree of arrays, for one problem or a batch.
 
@@ -167,11 +162,9 @@ def diagnosis_like(problem: Problem) -> Diagnosis:
     """Return a diagnosis with the structure of that of `problem` and placeholder values."""
     count, dtype = len(problem.terms), problem.pixels.dtype
     whole, share = jnp.zeros(count, int), jnp.zeros(count, dtype)
-    names, shapes = (
-        tuple(term.name for term in problem.terms),
-        tuple(jnp.shape(term.weight) for term in problem.terms),
-    )
     motion, number = jnp.zeros((count, lie.TANGENT), dtype), jnp.zeros((), dtype)
+    names = tuple(term.name for term in problem.terms)
+    shapes = tuple(jnp.shape(term.weight) for term in problem.terms)
     return Diagnosis(whole, whole, share, share, share, motion, number, jnp.asarray(0), names, shapes)
 
 
@@ -288,29 +281,24 @@ def _unresolved(problem: Problem, term: AbstractTerm, state: State, slopes: _Slo
         depth = state.inverse_depth[row, term.first_slot : term.first_slot + term.weight.shape[1]]
         # The relative pose has the rounding error of the position with the larger step.
         farther = jnp.maximum(away[source], away[target])[:, None]
-        return _share(finer_than_precision(term.weights, (focal * depth) ** 2, farther, eps), term.weights != 0)
+        return _share(term.weights * (focal * depth) ** 2 * farther * eps**2 > 1, term.weights != 0)
     if slopes is not None and isinstance(term, NodeTerm):
         jacobian = slopes.jacobian[0]
         moved: Array = jnp.zeros(len(term.weight), jacobian.dtype)
         for place, index in enumerate(term.touched()):
             by_position = jacobian[:, :, lie.TANGENT * place : lie.TANGENT * place + 3]
             moved = jnp.maximum(moved, jnp.sum(by_position**2, (1, 2)) * away[index])
-        return _share(finer_than_precision(term.weights, moved / jacobian.shape[1], 1.0, eps), term.weights != 0)
+        return _share(term.weights * (moved / jacobian.shape[1]) * eps**2 > 1, term.weights != 0)
     return jnp.zeros(())
 
 
-class _Rigid(NamedTuple):
-    """A term's gradient and Hessian by a rigid motion of all poses, and the diagonal summed over single poses."""
-
-    gradient: Float[Array, "6"]
-    hessian: Float[Array, "6 6"]
-    size: Float[Array, "6"]
-
-
-def _rigid(term: AbstractTerm, carry: Float[Array, "n 6 6"], slopes: _Slopes | None) -> _Rigid:
+def _rigid(
+    term: AbstractTerm, carry: Float[Array, "n 6 6"], slopes: _Slopes | None
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"], Float[Array, "6"]]:
+    """Return a term's gradient and Hessian by a rigid motion of all poses, and the diagonal over single poses."""
     if slopes is None or not isinstance(term, NodeTerm):
         nothing = jnp.zeros((lie.TANGENT, lie.TANGENT), carry.dtype)
-        return _Rigid(nothing[0], nothing, nothing[0])
+        return nothing[0], nothing, nothing[0]
     residual, jacobian = slopes.residual[1], slopes.jacobian[1]
     pull = term.weights * term.kernel.weight(term.weights * jnp.sum(residual**2, 1))
     parts = [
@@ -318,10 +306,10 @@ def _rigid(term: AbstractTerm, carry: Float[Array, "n 6 6"], slopes: _Slopes | N
         for place, index in enumerate(term.touched())
     ]
     along = sum(parts[1:], parts[0])
-    return _Rigid(
-        gradient=jnp.einsum("m,mka,mk->a", pull, along, residual),
-        hessian=jnp.einsum("m,mka,mkb->ab", pull, along, along),
-        size=jnp.asarray(sum(jnp.einsum("m,mka->a", pull, part**2) for part in parts)),
+    return (
+        jnp.einsum("m,mka,mk->a", pull, along, residual),
+        jnp.einsum("m,mka,mkb->ab", pull, along, along),
+        jnp.asarray(sum(jnp.einsum("m,mka->a", pull, part**2) for part in parts)),
     )
 
 

@@ -51,9 +51,15 @@ from vggtgeo.solvers.arrow import (
     join_landmarks,
     nan_unless_finite,
 )
-from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
 from vggtgeo.solvers.local_inverse import balance, rank_tolerance
-from vggtgeo.solvers.schur_complement import Blocks, Reduced, dense_schur_complement
+from vggtgeo.solvers.schur_complement import (
+    Blocks,
+    Reduced,
+    SparseLayout,
+    dense_schur_complement,
+    reduced_blocks,
+    sparse_layout,
+)
 
 DENSE_KEYFRAMES = 300
 """Largest number of keyframes for full spectra: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""
