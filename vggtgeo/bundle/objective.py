@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
+from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
 from vggtgeo.bundle.checks import check_pair
-from vggtgeo.bundle.fast import any_camera, pinhole
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
 from vggtgeo.bundle.terms.landmark import HostPixel
@@ -124,7 +124,7 @@ class Hosts(NamedTuple):
     """Data of each row of landmarks for the loops over edges, slots last; computed once for all edges."""
 
     pixels: Float[Array, "h 2 s"]
-    rays: tuple[Float[Array, "h s"], Float[Array, "h s"]] | any_camera.Rays
+    rays: tuple[Float[Array, "h s"], Float[Array, "h s"]] | camera_derivatives.Rays
     """Of a pinhole that all keyframes share; of other cameras with derivatives."""
     inverse_depth: Float[Array, "h s"]
     offset: Float[Array, "h p 2"] | None
@@ -138,7 +138,7 @@ def _hosts_of(problem: Problem, state: State) -> Hosts:
         pixels = pixels.at[:, : state.pixel_offset.shape[1]].add(state.pixel_offset)
     slots_last, known = jnp.swapaxes(pixels, 1, 2), pinhole_parameters(cameras)
     if known is None:
-        rays = any_camera.rays_of(cameras.kind, cameras.of_all(problem.host_of_row), slots_last)
+        rays = camera_derivatives.rays_of(cameras.kind, cameras.of_all(problem.host_of_row), slots_last)
         return Hosts(slots_last, rays, state.inverse_depth, state.pixel_offset)
     fx, fy, cx, cy = known
     rays_x, rays_y = (pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy
@@ -190,10 +190,10 @@ def _view_of(cameras: Cameras, hosts: Hosts, edge: Edge) -> EdgeView:
     free = 0 if hosts.offset is None else hosts.offset.shape[1]
     motions = edge.rotation, edge.translation
     seen = edge.relative, *motions, cameras, edge.ends, own.pixels, own.inverse_depth
-    if isinstance(own.rays, any_camera.Rays):
+    if isinstance(own.rays, camera_derivatives.Rays):
         target = cameras.of(edge.ends[1])
-        return EdgeView(*seen, any_camera.project(target, own.rays, own.inverse_depth, *motions), free)
+        return EdgeView(*seen, camera_derivatives.project(target, own.rays, own.inverse_depth, *motions), free)
     known = pinhole_parameters(cameras)
     assert known is not None
-    one = pinhole.OneEdge(known, *motions)
-    return EdgeView(*seen, (one, pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, one)), free)
+    one = pinhole_derivatives.OneEdge(known, *motions)
+    return EdgeView(*seen, (one, pinhole_derivatives.project(own.rays[0], own.rays[1], own.inverse_depth, one)), free)

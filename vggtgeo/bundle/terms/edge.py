@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.bundle.fast import any_camera, pinhole
-from vggtgeo.bundle.fast.pinhole import Projection
+from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
+from vggtgeo.bundle.pinhole_derivatives import OneEdge, Projection
 from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighted_rows, robust_energy
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import AbstractCamera, Cameras, Pinhole, with_shared_focal
@@ -89,7 +89,7 @@ class EdgeView(eqx.Module):
     """Keyframes `(i, j)`."""
     pixels: Float[Array, "2 p"]
     inverse_depth: Float[Array, " p"]
-    projection: tuple[pinhole.OneEdge, Projection] | any_camera.Seen
+    projection: tuple[OneEdge, Projection] | camera_derivatives.Seen
     """Of one pinhole for all keyframes, or of other cameras."""
     free_pixels: int = eqx.field(static=True, default=0)
     """Number of first slots whose pixel is an unknown."""
@@ -107,7 +107,7 @@ class EdgeView(eqx.Module):
     @property
     def projected(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Pixels of the slots in the target."""
-        if isinstance(self.projection, any_camera.Seen):
+        if isinstance(self.projection, camera_derivatives.Seen):
             return self.projection.u, self.projection.v
         edge, at = self.projection
         fx, fy, cx, cy = edge.intrinsics
@@ -117,13 +117,13 @@ class EdgeView(eqx.Module):
         """Return the derivatives of a row of residuals with image gradient `(a, b)`: by the shared coordinates, by
         inverse depth, and by the pixel in the host, if it is an unknown.
         """
-        if isinstance(self.projection, any_camera.Seen):
-            found = any_camera.row(self.rotation, self.translation, self.projection, a, b)
+        if isinstance(self.projection, camera_derivatives.Seen):
+            found = camera_derivatives.row(self.rotation, self.translation, self.projection, a, b)
             both = zip(found.target, found.host, strict=True)
             one_camera = self.cameras.group is None
             by_cameras = [j + i for j, i in both] if one_camera else [*found.target, *found.host]
             return [*found.motion, *by_cameras], found.depth, found.pixel if self.free_pixels else []
-        *shared, depth = pinhole.row(*self.projection, a, b)
+        *shared, depth = pinhole_derivatives.row(*self.projection, a, b)
         # The centre moves the pixel in the target and, the other way, the ray in the host.
         pixel = [a - shared[CENTRE], b - shared[CENTRE + 1]] if self.free_pixels else []
         return self.tied(shared), depth, pixel
@@ -138,8 +138,8 @@ class EdgeView(eqx.Module):
     def slots(self, first: int, count: int) -> EdgeView:
         """Return the view of some of the slots."""
         part = lambda leaf: leaf[..., first : first + count]
-        of_slots: tuple[pinhole.OneEdge, Projection] | any_camera.Seen
-        if isinstance(self.projection, any_camera.Seen):
+        of_slots: tuple[OneEdge, Projection] | camera_derivatives.Seen
+        if isinstance(self.projection, camera_derivatives.Seen):
             of_slots = jax.tree.map(part, self.projection)
         else:
             of_slots = self.projection[0], jax.tree.map(part, self.projection[1])
