@@ -89,17 +89,6 @@ def test_the_step_is_the_constrained_dense_step() -> None:
     assert np.abs((found - expected) * unit).max() < 1e-7 * np.abs(expected * unit).max()
 
 
-def test_restrict_is_the_transpose_of_expand() -> None:
-    # Proves the pair. Oracle: the definition, `<expand(y), z> = <y, restrict(z)>`, on random vectors.
-    problem, state, _ = scene().pack()
-    system = eqx.filter_jit(lambda problem, state: BundleAdjustment(problem).linearise(state))(problem, state)
-    rng = np.random.default_rng(0)
-    inner = jnp.asarray(rng.normal(size=system.landmark_hessian.shape))
-    outer = jnp.asarray(rng.normal(size=state.inverse_depth.shape))
-    left, right = jnp.sum(system.basis.expand(inner) * outer), jnp.sum(inner * system.basis.restrict(outer))
-    assert float(left) == pytest.approx(float(right), rel=1e-12)
-
-
 @eqx.filter_jit
 def run(problem: Problem, state: State):
     return solve(problem, state, solver=SOLVER)

@@ -96,12 +96,3 @@ def test_the_width_of_a_kernel_counts_in_standard_deviations(sigma: float) -> No
         by_hand = (share * width) ** 2 if share <= 1 else 2 * width * share * width - width**2
         found = vg.analysis.energy_terms(problem, window.truth())["points"]
         assert float(found) == pytest.approx(len(target) * by_hand / 2, rel=1e-9)
-
-
-def test_a_depth_prior_of_ones_own_has_the_sigma_that_it_states() -> None:
-    """The default of `DepthPrior.alpha` leaves `sigma` as it was given. Oracle: `1/2 (difference / sigma)^2`."""
-    problem, initial, _ = vg.simulate_window(2, points=1, lines=0).pack()
-    mean, sigma = initial.inverse_depth + SIGMA, jnp.full_like(initial.inverse_depth, SIGMA)
-    prior = vg.terms.DepthPrior(mean=mean, sigma=sigma, weight=jnp.ones_like(mean))
-    found = vg.analysis.energy_terms(problem.with_term(prior), initial)["depth"]
-    assert float(found) == pytest.approx(mean.size / 2, rel=1e-9)
