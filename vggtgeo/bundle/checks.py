@@ -32,7 +32,6 @@ _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsP
 
 
 def _check_each(name: str, values: Any, wrong: np.ndarray | np.bool_, must: str) -> None:
-    """Raise InputError with the first of the wrong values."""
     if np.any(wrong):
         first = tuple(np.argwhere(wrong)[0].tolist())
         where = "" if not first else f"[{', '.join(map(str, first))}]"
@@ -118,7 +117,6 @@ def check_observations(observations: Observations, keyframes: int) -> None:
 
 
 def _check_shapes(observations: Observations) -> None:
-    """Check that the shapes of the arrays are consistent."""
     landmarks, points, lines = (len(getattr(observations, name)) for name in ("host", "point_edge", "line_edge"))
     expected = {
         "edges": (len(observations.edges), 2),

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.checks import check_finite, check_pair
 from vggtgeo.bundle.diagnosis import check_linearisation
-from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.linearise import free_coordinates, linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
@@ -95,8 +95,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
     leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
     # Known exactly, hence conditioned on; eliminating them would treat them as unknown.
-    held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics.reshape(-1)])
-    quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
+    quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, free_coordinates(problem))
     root, offset = nan_unless_finite(finite, square_root(quadratic, gradient))
     return MarginalPrior(
         root=root, offset=offset, poses=point.poses, intrinsics=point.parameters, weight=jnp.ones_like(offset, shape=())
@@ -182,10 +181,9 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
 
 
 def _eliminate(
-    quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows: Bool[Array, " c"], held: Bool[Array, " c"]
+    quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows: Bool[Array, " c"], free: Bool[Array, " c"]
 ) -> _Quadratic:
     """Condition on fixed coordinates, then eliminate the leaving rows by a Schur complement (pseudo-inverse)."""
-    free = ~held
     quadratic = jnp.where(free[:, None] & free[None, :], quadratic, 0.0)
     gradient = jnp.where(free, gradient, 0.0)
     inner = jnp.where(rows[:, None] & rows[None, :], quadratic, 0.0)

@@ -17,9 +17,9 @@ from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
 from vggtgeo.bundle.checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
-from vggtgeo.bundle.terms.landmark import HostPixel
-from vggtgeo.bundle.terms.node import node_residuals
-from vggtgeo.bundle.terms.term import robust_energy
+from vggtgeo.bundle.terms.landmark import HostPixel, SlotTerm
+from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm, node_residuals
+from vggtgeo.bundle.terms.term import AbstractTerm, robust_energy
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Cameras
 
@@ -88,19 +88,26 @@ def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
 
 
 def _without_edges(problem: Problem, state: State) -> Float[Array, ""]:
-    cameras, poses = cameras_of(problem, state), state.poses.wxyz_xyz
     total = jnp.zeros((), state.inverse_depth.dtype)
-    for slot in problem.slot_terms:
-        total += robust_energy(slot.kernel, slot.weights, slot.residuals(state.inverse_depth))
-    for pixel, offset in pixel_observations(problem, state):
-        total += robust_energy(pixel.kernel, pixel.weights, pixel.residuals(offset))
-    for node in problem.node_terms:
-        total += robust_energy(node.kernel, node.weights, node_residuals(node, poses, cameras))
-    for own in problem.camera_terms:
-        total += robust_energy(own.kernel, own.weights, own.residuals(state.parameters))
-    for dense in problem.dense_terms:
-        total += robust_energy(dense.kernel, dense.weights, dense.residual(state.poses, state.parameters))
+    pixels = [term for term, _ in pixel_observations(problem, state)]
+    for term in (*problem.slot_terms, *pixels, *problem.node_terms, *problem.camera_terms, *problem.dense_terms):
+        total += robust_energy(term.kernel, term.weights, residuals_without_edges(problem, term, state))
     return total
+
+
+def residuals_without_edges(problem: Problem, term: AbstractTerm, state: State) -> Float[Array, "m *observations"]:
+    """Return the residuals of a term on no edge, the residual's own axis first."""
+    if isinstance(term, SlotTerm):
+        return term.residuals(state.inverse_depth)
+    if isinstance(term, HostPixel):
+        assert state.pixel_offset is not None  # ensured by `check_pair`
+        return term.residuals(state.pixel_offset)
+    if isinstance(term, CameraTerm):
+        return term.residuals(state.parameters)
+    if isinstance(term, DenseTerm):
+        return term.residual(state.poses, state.parameters)
+    assert isinstance(term, NodeTerm)
+    return node_residuals(term, state.poses.wxyz_xyz, cameras_of(problem, state))
 
 
 def pixel_observations(problem: Problem, state: State) -> list[tuple[HostPixel, Float[Array, "h p 2"]]]:

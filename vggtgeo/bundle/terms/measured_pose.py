@@ -68,7 +68,6 @@ class RelativePose(PairTerm):
     unit = "sigma"
 
     def __check_init__(self) -> None:
-        """Raise InputError for data of a wrong shape or value."""
         _check_data(self, measured=(7,), root=(6, 6))
 
     def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, "6"]:
@@ -141,7 +140,6 @@ class RotationPrior(PoseTerm):
     unit = "sigma"
 
     def __check_init__(self) -> None:
-        """Raise InputError for data of a wrong shape or value."""
         _check_data(self, measured=(4,), root=(3, 3))
 
     def residual(self, pose: jaxlie.SE3, camera: AbstractCamera) -> Float[Array, "3"]:
@@ -176,7 +174,6 @@ class BaselinePrior(PairTerm):
     unit = "sigma"
 
     def __check_init__(self) -> None:
-        """Raise InputError for data of a wrong shape or value."""
         _check_data(self, length=(), sigma=())
 
     def residual(self, first: jaxlie.SE3, second: jaxlie.SE3) -> Float[Array, ""]:

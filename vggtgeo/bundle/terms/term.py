@@ -109,7 +109,6 @@ class AbstractTerm(eqx.Module):
     """Fields that are not data of an observation: indices, and the fields of this class."""
 
     def __check_init__(self) -> None:
-        """Raise InputError if the kernel is no kernel."""
         check_kind(f"{self.name}.kernel", self.kernel, AbstractKernel, "a kernel, such as `vggtgeo.kernels.Huber(1.5)`")
 
     def __init_subclass__(cls, **options: Any) -> None:
