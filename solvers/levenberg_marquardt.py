@@ -191,7 +191,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def __check_init__(self) -> None:
         most: Any = self.max_iterations  # an argument may violate its annotation
-        if not isinstance(most, numbers.Integral) or isinstance(most, bool) or not 0 <= most <= MAX_ITERATIONS:
+        whole = isinstance(most, numbers.Integral) and not isinstance(most, bool)
+        if not whole or not 0 <= most <= MAX_ITERATIONS:
             raise ValueError(f"`max_iterations` must be a whole number from 0 to {MAX_ITERATIONS}, got {most!r:.60}")
         for name, highest in _HIGHEST.items():
             given: Any = getattr(self, name)

@@ -153,13 +153,6 @@ def of_one(term: type, **data: np.ndarray | float) -> Any:
     return term(**given, weight=jnp.ones((1, 1))).holding({name: jnp.asarray(value) for name, value in data.items()})
 
 
-def test_the_identity_projects_a_pixel_onto_itself() -> None:
-    # Proves that without motion a pixel stays where it is, at any depth, at infinity too.
-    for inverse_depth in (0.0, 1e-6, 0.4, 100.0):
-        seen = view(jaxlie.SE3.identity(), inverse_depth)
-        np.testing.assert_allclose(seen.projected, PIXEL, atol=1e-11)
-
-
 @pytest.mark.parametrize("forward", [2.6, 2.6 - 1e-4, 5.0], ids=["in the plane", "just before it", "behind"])
 def test_behind_the_camera_is_finite_and_far(forward: float) -> None:
     # Proves that a point at or behind the target camera gives finite values and gradients, far outside the image.

@@ -140,14 +140,6 @@ def distance() -> Callable[..., jax.Array]:
     return value
 
 
-def test_the_adjoint_through_the_iterates_can_be_traced_alone(distance: Callable[..., jax.Array]) -> None:
-    """Reverse mode through `RecursiveCheckpointAdjoint()` alone raises nothing, with an explicit solver, too. Oracle:
-    JAX's own trace, which refuses a loop without bounds.
-    """
-    through = jax.grad(lambda share: distance(share, adjoint=optx.RecursiveCheckpointAdjoint()))
-    assert jax.eval_shape(through, jnp.ones(())).shape == ()
-
-
 @pytest.mark.long
 def test_the_adjoint_through_the_iterates_needs_no_option_of_the_solver(distance: Callable[..., jax.Array]) -> None:
     """`RecursiveCheckpointAdjoint()` alone differentiates the iterates. Oracle: the implicit derivative, which is that

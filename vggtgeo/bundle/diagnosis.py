@@ -14,7 +14,7 @@ Four faults that the energy does not show:
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -34,7 +34,9 @@ from vggtgeo.bundle.terms.node import NodeTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
+from vggtgeo.solvers.arrow import ArrowSystem, dense_gradient
 
+_Tree = TypeVar("_Tree")
 MAJORITY = 0.5
 """Maximum share of a term's observations that may be faulty: the breakdown point of a robust estimate."""
 SIGNIFICANCE = 1e-3
@@ -183,6 +185,19 @@ def check_linearisation(problem: Problem, state: State, finite: Any) -> None:
     found = _diagnose_jit(problem, state).sentences(failed=True)
     why = " ".join(found) or "Check for weights or standard deviations that are far too large or too small."
     raise InputError(f"the linearisation of `problem` at `state` must be finite. {why}")
+
+
+def is_finite(system: ArrowSystem) -> Bool[Array, ""]:
+    """Return whether gradient and curvature of every coordinate are finite; this covers all derivatives."""
+    finite = [jnp.all(jnp.isfinite(part)) for part in dense_gradient(system)]
+    landmarks = jnp.all(jnp.isfinite(system.landmark_gradient)) & jnp.all(jnp.isfinite(system.landmark_hessian))
+    return finite[0] & finite[1] & landmarks
+
+
+def nan_unless_finite(finite: Bool[Array, ""], tree: _Tree) -> _Tree:
+    """Return the floats of a pytree, or NaN if its linearisation is not finite: zeros would look like a result."""
+    or_nan = lambda leaf: jnp.where(finite, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
+    return jax.tree.map(or_nan, tree)
 
 
 class Observed(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
@@ -51,7 +52,7 @@ class Intrinsics:
             InputError: a field is invalid; names it.
 
         """
-        values, model = real_numbers("intrinsics", self.values), self.model
+        values, model = real_numbers("intrinsics", self.values), cast(Any, self.model)
         if not (isinstance(model, type) and issubclass(model, AbstractCamera)):
             must = "a camera class, such as `vggtgeo.cameras.RadialTangential`"
             raise InputError(f"`model` must be {must}, got {model!r:.60}")

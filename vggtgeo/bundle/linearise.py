@@ -22,7 +22,15 @@ from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors, add_shared, join_landmarks
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    ArrowVector,
+    EdgeGraph,
+    NodeFactors,
+    add_shared,
+    gather_factors,
+    join_landmarks,
+)
 
 
 def linearise(
@@ -146,7 +154,8 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     dense = _dense_terms(problem, state, None, False)[1]
     factors = _node_factors(problem, state, None, False)
     if factors is not None:
-        dense += _to_nodes(problem, factors)
+        sizes = problem.num_keyframes, lie.TANGENT, problem.num_parameters
+        dense += gather_factors(_graph(problem), factors, factors.gradient, sizes)
     if not problem.edge_terms:
         return ArrowVector(dense, landmarks)
 
@@ -364,16 +373,6 @@ def _node_factors(
     if not found:
         return None
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
-
-
-def _to_nodes(problem: Problem, factors: NodeFactors) -> Float[Array, " c"]:
-    block = lie.TANGENT
-    nodes = jnp.zeros((problem.num_keyframes + 1, block), factors.gradient.dtype)
-    nodes = nodes.at[factors.first].add(factors.gradient[:, :block])
-    nodes = nodes.at[factors.second].add(factors.gradient[:, block : 2 * block])
-    parameters = factors.gradient[:, 2 * block :]
-    seen = _graph(problem).seen(factors.first[:, None], parameters.shape[1])
-    return jnp.concatenate([nodes[:-1].reshape(-1), add_shared(parameters, seen, problem.num_parameters)])
 
 
 def _dense_terms(

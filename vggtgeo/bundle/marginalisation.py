@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.checks import check_finite, check_pair
-from vggtgeo.bundle.diagnosis import check_linearisation
+from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_finite
 from vggtgeo.bundle.linearise import free_coordinates, linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
@@ -36,7 +36,6 @@ from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.io.kept_program import KeptProgram
-from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 _MAX_KEYFRAMES = 1000

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.checks import check_finite, check_pair, check_range
-from vggtgeo.bundle.diagnosis import check_linearisation
+from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_finite
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
 from vggtgeo.bundle.problem import Problem, State
@@ -32,7 +32,6 @@ from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 from vggtgeo.io.readable import Readable
-from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.flat_directions import flat_stiffness
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
@@ -83,7 +82,7 @@ class Covariances(Readable):
         """Return the covariances times the variance factor, for weights that are known up to a common factor."""
         times = lambda values: jnp.where(jnp.isfinite(values), values * self.variance_factor, values)
         names = ("poses", "intrinsics", "inverse_depth", "neighbours")
-        changed = {name: times(getattr(self, name)) for name in names}
+        changed: dict[str, Any] = {name: times(getattr(self, name)) for name in names}
         return replace(self, **changed, variance_factor=jnp.ones_like(self.variance_factor))
 
     def to_dict(self) -> dict[str, Any]:

@@ -35,7 +35,7 @@ from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import SHOWN, Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
 from vggtgeo.bundle.checks import check_finite, check_pair
-from vggtgeo.bundle.diagnosis import check_linearisation
+from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_finite
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
@@ -47,9 +47,7 @@ from vggtgeo.solvers.arrow import (
     couple,
     dense_gradient,
     inverse_landmark_hessian,
-    is_finite,
     join_landmarks,
-    nan_unless_finite,
 )
 from vggtgeo.solvers.local_inverse import balance, rank_tolerance
 from vggtgeo.solvers.schur_complement import (
