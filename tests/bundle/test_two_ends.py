@@ -169,10 +169,9 @@ def test_a_step_beyond_infinity_is_shortened_as_a_whole() -> None:
 def test_segments_of_unequal_length_are_packed() -> None:
     # Proves slots, fractions and straight starts with padding, in a larger size too. Oracles: numbers by hand, polyfit.
     host, number = np.array([0, 0, 0, 1, 1, 0, 0]), np.array([7, 7, 7, 3, 3, 9, 9])
-    slots = segment_slots(host, number)
-    assert (slots.segments, slots.samples) == (2, 3)
-    assert slots.rank.tolist() == [0, 0, 0, 0, 0, 1, 1]
-    assert slots.position.tolist() == [0, 1, 2, 0, 1, 0, 1]
+    rank, position = segment_slots(host, number)
+    assert rank.tolist() == [0, 0, 0, 0, 0, 1, 1]
+    assert position.tolist() == [0, 1, 2, 0, 1, 0, 1]
     pixels = np.array([[[[0, 0], [3, 4], [6, 8]], [[1, 1], [1, 3], [0, 0]]]], float)
     present = np.array([[[True, True, True], [True, True, False]]])
     share = fractions(pixels, present)

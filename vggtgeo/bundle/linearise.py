@@ -154,8 +154,8 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     dense = _dense_terms(problem, state, None, False)[1]
     factors = _node_factors(problem, state, None, False)
     if factors is not None:
-        sizes = problem.num_keyframes, lie.TANGENT, problem.num_parameters
-        dense += gather_factors(_graph(problem), factors, factors.gradient, sizes)
+        of_dense = problem.num_keyframes, lie.TANGENT, problem.num_parameters
+        dense += gather_factors(_graph(problem), factors, factors.gradient, of_dense)
     if not problem.edge_terms:
         return ArrowVector(dense, landmarks)
 

@@ -158,18 +158,18 @@ def _layout(
     check_size(size, needed)
     rows = rows_of_keyframes(slots, size)
     order = np.argsort(observations.edges[:, 0], kind="stable")
-    stored = pad_edges(observations.edges[order], size, rows)
+    stored, position, step = pad_edges(observations.edges[order], size, rows)
     # At least 1, since a kind without slots has no landmark to divide for.
     length = np.where(slots.is_line, max(size.lines, 1), max(size.points, 1))
     part, within = (np.zeros_like(slots.within), slots.within) if size.rows is None else np.divmod(slots.within, length)
     slot = np.where(slots.is_line, size.points + within, within)
     row = (np.cumsum(rows) - rows)[observations.host] + part
-    shape = (int(rows.sum()), len(stored.edges.source), size.points + size.lines)
+    shape = (int(rows.sum()), len(stored.source), size.points + size.lines)
     place = np.argsort(order)  # of each edge among the sorted ones
     if size.rows is None:
-        return size, stored.edges, None, SlotIndex(row, slot, stored.position[place], shape)
+        return size, stored, None, SlotIndex(row, slot, position[place], shape)
     host = jnp.asarray(np.repeat(np.arange(size.keyframes), rows), jnp.int32)
-    return size, stored.edges, host, SlotIndex(row, slot, stored.position[place], shape, part, stored.step[place])
+    return size, stored, host, SlotIndex(row, slot, position[place], shape, part, step[place])
 
 
 def _seen(observations: Observations, index: SlotIndex, size: PaddedSize, dtype: DTypeLike) -> tuple[AbstractTerm, ...]:

@@ -23,7 +23,7 @@ from vggtgeo.bundle.problem import Edges
 from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.line_segments import segment_slots
+from vggtgeo.geometry.line_segments import numbered, segment_slots
 from vggtgeo.io.errors import InputError
 
 GivenTerm = AbstractTerm | FlatTerm
@@ -271,15 +271,15 @@ def count_slots(observations: Observations, keyframes: int, samples: int | None 
         )
     host = np.asarray(observations.host)
     within = np.zeros(len(host), int)
-    within[~is_line], points = _numbered(host[~is_line], keyframes)
+    within[~is_line], within[is_line] = numbered(host[~is_line]), numbered(host[is_line])
+    points, lines = (np.bincount(host[kind], minlength=keyframes) for kind in (~is_line, is_line))
     if observations.segment is None:
-        within[is_line], lines = _numbered(host[is_line], keyframes)
         return Slots(is_line, within, points, lines, None)
-    found = segment_slots(host[is_line], np.asarray(observations.segment)[is_line])
-    samples = max(samples or 0, found.samples, 1)
-    within[is_line] = samples * found.rank + found.position
+    rank, position = segment_slots(host[is_line], np.asarray(observations.segment)[is_line])
+    samples = max(samples or 0, int(position.max(initial=-1)) + 1, 1)
+    within[is_line] = samples * rank + position
     lines = np.zeros(keyframes, int)
-    np.maximum.at(lines, host[is_line], samples * (found.rank + 1))
+    np.maximum.at(lines, host[is_line], samples * (rank + 1))
     return Slots(is_line, within, points, lines, samples)
 
 
@@ -333,25 +333,11 @@ def _shares(count: int) -> list[int]:
     return np.unique(-(-count // np.arange(1, max(count, 1) + 1)))[::-1].tolist()
 
 
-def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position of each landmark among those of its host, and the count of each keyframe."""
-    order = np.argsort(host, kind="stable")
-    starts = np.searchsorted(host[order], np.arange(keyframes))
-    within = np.empty(len(host), int)
-    within[order] = np.arange(len(host)) - starts[host[order]]
-    return within, np.bincount(host, minlength=keyframes)
+def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> tuple[Edges, np.ndarray, np.ndarray]:
+    """Store sorted edges once for each row of their hosts; `rows [n]` is the number of rows of each keyframe.
 
-
-class StoredEdges(NamedTuple):
-    """The graph, the position of each sorted edge at the first row of its host, and the step to the next row."""
-
-    edges: Edges
-    position: np.ndarray
-    step: np.ndarray
-
-
-def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEdges:
-    """Store sorted edges once for each row of their hosts; `rows [n]` is the number of rows of each keyframe."""
+    Returns the graph, the position of each sorted edge at the first row of its host, and the step to the next row.
+    """
     source, target = edges[:, 0], edges[:, 1]
     host = np.repeat(np.arange(size.keyframes), rows)
     rank = np.arange(len(edges)) - np.searchsorted(source, np.arange(size.keyframes))[source]
@@ -375,4 +361,4 @@ def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEd
     of_host[row, index] = np.arange(len(row))
     arrays = (jnp.asarray(array, jnp.int32) for array in (host[row], ends, index, of_host))
     own = None if size.rows is None else jnp.asarray(row, jnp.int32)
-    return StoredEdges(replace(Edges(*arrays), row_of=own), position, step)
+    return replace(Edges(*arrays), row_of=own), position, step

@@ -24,7 +24,7 @@ import jaxlie
 from jaxtyping import Array, Float, Int
 
 from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
-from vggtgeo.bundle.pinhole_derivatives import OneEdge, Projection
+from vggtgeo.bundle.pinhole_derivatives import Gradient, OneEdge, Projection
 from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighted_rows, robust_energy
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import AbstractCamera, Cameras, Pinhole, with_shared_focal
@@ -147,17 +147,6 @@ class EdgeView(eqx.Module):
         free = min(max(self.free_pixels - first, 0), count)
         motion = self.relative, self.rotation, self.translation
         return EdgeView(*motion, self.cameras, self.ends, *own, of_slots, free)
-
-
-class Gradient(NamedTuple):
-    """Gradient of one edge's energy."""
-
-    shared: Float[Array, " d"]
-    """By relative pose and camera."""
-    depth: Float[Array, " p"]
-    """By each inverse depth."""
-    pixel: Float[Array, "2 p"] | None
-    """By each pixel in the host, if those are unknowns."""
 
 
 class LocalModel(NamedTuple):

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
-from vggtgeo.bundle.terms.edge import CENTRE, EdgeTerm, EdgeView, Gradient, LocalModel, PixelModel, View
+from vggtgeo.bundle.pinhole_derivatives import Gradient
+from vggtgeo.bundle.terms.edge import CENTRE, EdgeTerm, EdgeView, LocalModel, PixelModel, View
 from vggtgeo.bundle.terms.term import reweighting, robust_energy, squared_norm
 from vggtgeo.geometry.camera_models import Pinhole
 
@@ -79,9 +80,8 @@ class ImageTerm(EdgeTerm):
         if isinstance(view.projection, camera_derivatives.Seen):
             return super().gradient(view)
         found = pinhole_derivatives.energy_gradient(*view.projection, *self._force(view))
-        return Gradient(
-            jnp.stack(view.tied(list(found.shared))), found.depth, found.pixel if view.free_pixels else None
-        )
+        pixel = found.pixel if view.free_pixels else None
+        return found._replace(shared=jnp.stack(view.tied(list(found.shared))), pixel=pixel)
 
     def model(self, view: EdgeView) -> LocalModel:
         if isinstance(view.projection, camera_derivatives.Seen):
