@@ -213,8 +213,10 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             )
         energy = args.energy(y)
         finite = jnp.isfinite(energy)
-        # For another function this solver would silently minimise something else.
-        same = jnp.isclose(_value(fn(y, args)), energy, rtol=1e-3, atol=0.0) | ~finite
+        # For another function this solver would silently minimise something else; optimistix adds an auxiliary output.
+        value = fn(y, args)
+        value = jnp.asarray(value[0] if isinstance(value, tuple) else value)
+        same = jnp.isclose(value, energy, rtol=1e-3, atol=0.0) | ~finite
         begun = _CODES.running if self.max_iterations else _CODES.max_iterations
         # `jit` needs the length before the number of iterations is known.
         history = jnp.full(self.max_iterations + 1, jnp.nan, energy.dtype).at[0].set(energy)
@@ -395,11 +397,6 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         for happened, code in options:
             termination = _CODES.where(happened, code, termination)
         return termination
-
-
-def _value(returned: Any) -> Array:
-    """Return the value of the function without the auxiliary output that optimistix adds."""
-    return jnp.asarray(returned[0] if isinstance(returned, tuple) else returned)
 
 
 def _negligible(predicted: Float[Array, ""], energy: Float[Array, ""]) -> Bool[Array, ""]:

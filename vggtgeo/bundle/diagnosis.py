@@ -77,11 +77,11 @@ class Diagnosis(eqx.Module):
 
     def sentences(self, failed: bool) -> list[str]:
         """Return the faults as sentences (outside `jit`, for one problem). failed: the solve did not converge."""
-        found = [self._not_finite(k) for k in range(len(self.names))] if failed else []
-        found += [self._unresolved(k) for k in range(len(self.names))]
-        found += [] if failed else [self._rejected(k) for k in range(len(self.names))]
-        found += [] if failed else [self._contradicted(k) for k in range(len(self.names))]
-        return [sentence for sentence in found if sentence]
+        if failed:
+            kinds = [self._not_finite, self._unresolved]
+        else:
+            kinds = [self._unresolved, self._rejected, self._contradicted]
+        return [sentence for kind in kinds for k in range(len(self.names)) if (sentence := kind(k))]
 
     def _not_finite(self, k: int) -> str:
         value, derivative = int(self.value[k]), int(self.derivative[k])

@@ -150,7 +150,7 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     for term in problem.slot_terms:
         landmarks = landmarks.at[:, first:].add(term.gradient(state.inverse_depth))
     for pixel, offset in pixel_observations(problem, state):
-        landmarks = landmarks.at[:, :first].add(_as_landmarks(pixel.gradient(offset)))
+        landmarks = landmarks.at[:, :first].add(jnp.swapaxes(pixel.gradient(offset), 1, 2).reshape(len(offset), -1))
     dense = _dense_terms(problem, state, None, False)[1]
     factors = _node_factors(problem, state, None, False)
     if factors is not None:
@@ -244,10 +244,6 @@ def num_offsets(state: State) -> int:
 def offsets_of(landmarks: Float[Array, "n t"]) -> Float[Array, "n p 2"]:
     """Return the unknowns of free pixels as offsets."""
     return jnp.swapaxes(landmarks.reshape(len(landmarks), 2, -1), 1, 2)
-
-
-def _as_landmarks(offsets: Float[Array, "n p 2"]) -> Float[Array, "n t"]:
-    return jnp.swapaxes(offsets, 1, 2).reshape(len(offsets), -1)
 
 
 def _edge_model(

@@ -121,7 +121,9 @@ def pack(
         host=host,
         camera=cameras.model,
     )
-    problem = _of_type(problem, dtype)
+    # All floats of one strong type, so that `Huber(1.5)` and a kernel from a file share a compilation.
+    cast = lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf
+    problem = jax.tree.map(cast, problem)
     check_observed(problem)
     # Empty slots get a positive depth: residuals may divide by it or take its logarithm.
     depths = _per_slot(index, inverse_depth, 1.0, dtype)
@@ -133,11 +135,6 @@ def pack(
     start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
     offset = jnp.zeros((index.shape[0], size.points, 2), dtype) if problem.pixel_terms else None
     return problem, State(start, jnp.asarray(cameras.values, dtype), depths, offset), index
-
-
-def _of_type(problem: Problem, dtype: DTypeLike) -> Problem:
-    """Cast all floats to one strong type, so that `Huber(1.5)` and a kernel from a file share a compilation."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, problem)
 
 
 def _as_arrays(observations: Observations) -> Observations:

@@ -197,6 +197,7 @@ def _solve_jit(
     if faults is not None:
         beyond = jnp.any(faults.unresolved > MAJORITY)
         termination = codes.where(beyond, codes.beyond_precision, termination)
+    alone = fixed[2].inverse_depth[:, : problem.first_segment]
     return Solution(
         state=found.value,
         energy=_energy_at(last.energy, BundleAdjustment(problem), found.value),
@@ -207,7 +208,7 @@ def _solve_jit(
         termination=termination,
         polished=last.polished,
         gradient_residual=last.gradient_residual,
-        at_bound=_at_bound(problem, fixed[2]),
+        at_bound=jnp.sum(alone <= MIN_INVERSE_DEPTH) if problem.positive_depth else jnp.asarray(0),
         diagnosis=faults,
         record=last.record,
     )
@@ -257,9 +258,3 @@ def solution_like(
         diagnosis=diagnosis_like(problem) if diagnosis else None,
         record=IterationRecord(tries, tries, tries, moved) if solver.record_iterations else None,
     )
-
-
-def _at_bound(problem: Problem, state: State) -> Int[Array, ""]:
-    if not problem.positive_depth:
-        return jnp.asarray(0)
-    return jnp.sum(state.inverse_depth[:, : problem.first_segment] <= MIN_INVERSE_DEPTH)
