@@ -100,8 +100,8 @@ class SlotIndex:
     """Positions of flat lists in padded arrays: landmark `i` is at `[host[i], slot[i]]`; for edges see `stored_edge`.
 
     `gather` and `gather_points` read padded arrays in the order of `Observations`. `scatter`, `scatter_points` and
-    `scatter_lines` write values of that order into padded arrays; they are differentiable, so the values may come from
-    a network.
+    `scatter_lines` write values of that order into padded arrays; they are pure and differentiable, so the values may
+    come from a network. An array of a wrong shape is an `InputError`.
 
     Fields:
         host: int [D], row of each landmark: the host keyframe, unless a keyframe has several rows (`Problem.host`).
@@ -148,10 +148,6 @@ class SlotIndex:
         """Return values of the landmarks, `[D, ...]`, from an array `[h, s, ...]`.
 
         The result is a NumPy array, or a JAX array if `per_slot` is traced (`jit`, `vmap`, `grad`).
-
-        Raises:
-            InputError: `per_slot` has another shape.
-
         """
         return _gathered("per_slot", per_slot, (self.host, self.slot), self.shape[0])
 
@@ -159,25 +155,16 @@ class SlotIndex:
         """Return values of the point matches, `[A, ...]`, in the order of `observations`, from an array `[e, p, ...]`.
 
         Works under `jit` like `gather`.
-
-        Raises:
-            InputError: `per_match` has another shape.
-
         """
         return _gathered("per_match", per_match, self._points(observations), self.shape[1])
 
     def scatter(self, values: ArrayLike, into: ArrayLike) -> Array:
         """Write values of the landmarks to their slots in `into`: the inverse of `gather`.
 
-        Pure: works under `jit`, `vmap` and `grad`.
-
         Args:
             values: [D, ...], in the order of `Observations.host`.
             into: [n, s, ...], such as `initial.inverse_depth` or `problem.depth.weight`; it determines shape and
                 precision. Empty slots keep its values.
-
-        Raises:
-            InputError: an array has a wrong shape.
 
         """
         return _scattered(values, into, (self.host, self.slot), self.shape[0])
@@ -185,16 +172,11 @@ class SlotIndex:
     def scatter_points(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
         """Write values of the point matches to their slots in `into`: the inverse of `gather_points`.
 
-        Pure: works under `jit`, `vmap` and `grad`.
-
         Args:
             values: [A, ...], in the order of `observations`.
             observations: the packed observations.
             into: [e, p, ...], such as `problem.points.weight` or `problem.points.target`; it determines shape and
                 precision. Slots without a match keep its values, so that a weight of 0 stays 0.
-
-        Raises:
-            InputError: an array has a wrong shape.
 
         """
         return _scattered(values, into, self._points(observations), self.shape[1])
@@ -206,9 +188,6 @@ class SlotIndex:
             values: [B, ...], in the order of `observations`.
             observations: the packed observations.
             into: [e, l, ...], such as `problem.lines.weight` or `problem.lines.coefficients`.
-
-        Raises:
-            InputError: an array has a wrong shape.
 
         """
         first = self.shape[2] - (np.shape(into)[1] if np.ndim(into) > 1 else 0)  # the slots of lines come last
