@@ -314,10 +314,10 @@ def check_pair(problem: Any, state: Any, name: str = "state") -> None:
         )
 
 
-def check_finite(state: State, name: str = "state") -> None:
+def check_finite(state: State) -> None:
     """Check that a state is finite, unless traced."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(state)):
         return
     for field in ("poses", "intrinsics", "inverse_depth"):
         if not np.isfinite(np.asarray(jax.tree.leaves(getattr(state, field))[0])).all():
-            raise InputError(f"`{name}.{field}` must be finite: pass the state of a solve that did not fail")
+            raise InputError(f"`state.{field}` must be finite: pass the state of a solve that did not fail")

@@ -230,11 +230,11 @@ class LeastKnown:
         return ", ".join([*moved, f"depths {100 * self.depth:.2g} %"])
 
 
-def least_known(found: Observability, count: int = 3) -> list[LeastKnown]:
-    """Return the `count` determined directions of smallest eigenvalue by all terms, weak or not."""
+def least_known(found: Observability) -> list[LeastKnown]:
+    """Return the three determined directions of smallest eigenvalue by all terms, weak or not."""
     values, free = np.asarray(found.whole.values[0], float), np.asarray(found.free)
     first = int(np.sum(values < undetermined_below(len(free), found.whole.values.dtype)))
-    last = min(first + count, int(np.sum(np.isfinite(values))), len(found.depth_change))
+    last = min(first + 3, int(np.sum(np.isfinite(values))), len(found.depth_change))
     return [_described(found, column) for column in range(first, last)]
 
 
