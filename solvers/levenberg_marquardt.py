@@ -16,6 +16,7 @@ from __future__ import annotations
 import numbers
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Self
 
 import equinox as eqx
@@ -124,21 +125,18 @@ class LevenbergMarquardtState(eqx.Module):
 
 
 class _Try(eqx.Module):
+    """The last tried step: point and state after it, and how it ended."""
+
     point: Any
-    energy: Float[Array, ""]
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]
+    state: LevenbergMarquardtState
     gain: Float[Array, ""]
     """Actual over predicted decrease."""
-    iterations: Int[Array, ""]
-    history: Float[Array, " h"]
     accepted: Bool[Array, ""]
     stuck: Bool[Array, ""]
     overcorrected: Bool[Array, ""]
     """Rejected, possibly due to the correction: linearise again with less of it before the damping is raised."""
     finite: Bool[Array, ""]
     """Whether the step is finite."""
-    record: IterationRecord | None
 
 
 MAX_ITERATIONS = 1_000_000
@@ -245,42 +243,25 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         gradient_norm = _gradient_norm(system)
 
         def attempt(trial: _Try) -> _Try:
-            step, predicted = self.reduced_solver.step(system, prepared, trial.damping)
-            judged = self._judge(args, y, state, system, trial, step, predicted)
-            if trial.record is None:
+            step, predicted = self.reduced_solver.step(system, prepared, trial.state.damping)
+            judged = self._judge(args, y, system, trial.state, step, predicted)
+            record = trial.state.record
+            if record is None:
                 return judged
-            done = (judged.iterations, trial.damping, judged.gain, gradient_norm, args.recorded(judged.point))
-            return eqx.tree_at(lambda t: t.record, judged, trial.record.with_try(*done))
+            done = (judged.state.iterations, trial.state.damping, judged.gain, gradient_norm)
+            written = record.with_try(*done, args.recorded(judged.point))
+            return eqx.tree_at(lambda t: t.state.record, judged, written)
 
-        first = _Try(
-            point=y,
-            energy=state.energy,
-            damping=state.damping,
-            growth=state.growth,
-            gain=jnp.zeros_like(state.energy),
-            iterations=state.iterations,
-            history=state.history,
-            accepted=jnp.asarray(False),
-            stuck=jnp.asarray(False),
-            overcorrected=jnp.asarray(False),
-            finite=jnp.asarray(True),
-            record=state.record,
-        )
-        last = self._loop(attempt, first)
-        new = LevenbergMarquardtState(
-            energy=last.energy,
-            damping=last.damping,
-            growth=last.growth,
+        no, nothing = jnp.asarray(False), jnp.zeros_like(state.energy)
+        last = self._loop(attempt, _Try(y, state, nothing, no, no, no, jnp.asarray(True)))
+        new = replace(
+            last.state,
             correction=self._next_correction(state, last),
-            iterations=last.iterations,
             linearisations=state.linearisations + 1,
             gradient_norm=gradient_norm,
-            history=last.history,
             termination=self._terminate(state.energy, last, gradient_norm, _largest_curvature(system)),
-            polished=state.polished,
             # That before the step: another linearisation would be needed for the gradient at the new point.
             gradient_residual=gradient_norm,
-            record=last.record,
         )
         return last.point, new, None
 
@@ -308,7 +289,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def _loop(self, attempt: Callable[[_Try], _Try], first: _Try) -> _Try:
         go_on: Callable[[_Try], Any] = lambda trial: (
-            ~(trial.accepted | trial.stuck | trial.overcorrected) & (trial.iterations < self.max_iterations)
+            ~(trial.accepted | trial.stuck | trial.overcorrected) & (trial.state.iterations < self.max_iterations)
         )
         if not self.differentiable_loop:
             return jax.lax.while_loop(go_on, attempt, first)
@@ -320,9 +301,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         self,
         problem: AbstractArrowProblem[Point],
         point: Point,
-        state: LevenbergMarquardtState,
         system: ArrowSystem,
-        trial: _Try,
+        state: LevenbergMarquardtState,
         step: ArrowVector,
         predicted: Float[Array, ""],
     ) -> _Try:
@@ -340,26 +320,28 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # Nielsen 1999: an accepted step lowers the damping smoothly with the gain, at most to a third; rejections in a
         # row raise it by 2, 4, 8, ..., so that a poor start needs few of them.
         shrink = jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
-        damping = jnp.where(accepted, trial.damping * shrink, trial.damping * trial.growth)
+        damping = jnp.where(accepted, state.damping * shrink, state.damping * state.growth)
         damping, growth = (
-            jnp.where(overcorrected, trial.damping, damping),
-            jnp.where(overcorrected, trial.growth, trial.growth * 2),
+            jnp.where(overcorrected, state.damping, damping),
+            jnp.where(overcorrected, state.growth, state.growth * 2),
         )
-        iterations = trial.iterations + 1
-        kept = jnp.where(accepted, new_energy, energy)
-        return _Try(
-            point=jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, point),
+        iterations, kept = state.iterations + 1, jnp.where(accepted, new_energy, energy)
+        after = replace(
+            state,
             energy=kept,
             damping=jnp.clip(damping, self.min_damping, self.max_damping),
             growth=jnp.where(accepted, 2.0, growth),
-            gain=gain,
             iterations=iterations,
-            history=trial.history.at[iterations].set(kept),
+            history=state.history.at[iterations].set(kept),
+        )
+        return _Try(
+            point=jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, point),
+            state=after,
+            gain=gain,
             accepted=accepted,
-            overcorrected=overcorrected,
             stuck=~accepted & ~overcorrected & (_negligible(predicted, energy) | (damping > self.max_damping)),
+            overcorrected=overcorrected,
             finite=jnp.isfinite(predicted),
-            record=trial.record,
         )
 
     def _next_correction(self, state: LevenbergMarquardtState, last: _Try) -> Float[Array, ""]:
@@ -367,7 +349,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             return state.correction
         # A rejection means that the model was wrong at this scale, so the correction grows only if the first try
         # succeeded.
-        at_once = last.accepted & (last.iterations == state.iterations + 1)
+        at_once = last.accepted & (last.state.iterations == state.iterations + 1)
         more = jnp.minimum(1 - 0.7 * (1 - state.correction), self.max_correction)
         less = jnp.where(state.correction > 0.1, state.correction / 2, 0.0)
         kept = jnp.where(at_once & (last.gain > 0.5), state.correction, less)
@@ -384,10 +366,10 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # standard deviations has curvatures far above 1, so the unit is 1.
         unit = jnp.sqrt(jnp.minimum(curvature, 1.0))
         # A rejected step leaves the energy as it is, which is not convergence.
-        small = last.accepted & (energy - last.energy <= self.rtol * energy)
+        small = last.accepted & (energy - last.state.energy <= self.rtol * energy)
         # Later entries take precedence: a vanished gradient is convergence however the step ended.
         options = [
-            (last.iterations >= self.max_iterations, _CODES.max_iterations),
+            (last.state.iterations >= self.max_iterations, _CODES.max_iterations),
             (small, _CODES.energy_converged),
             (last.stuck, _CODES.step_converged),
             (last.stuck & ~last.finite, _CODES.nonfinite_step),
