@@ -28,7 +28,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import vggtgeo as vg
-from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.landmark import HostPixel
 from vggtgeo.simulation.small_window import SimulatedWindow, centres_of
 
 

@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from simulated_loop import simulate_loop
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
-from vggtgeo.solvers.reduced import AbstractReducedSolver
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver
 
 import vggtgeo as vg
 from vggtgeo.bundle.analysis.observability import DENSE_KEYFRAMES

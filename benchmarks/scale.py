@@ -107,7 +107,7 @@ def _measure(path: Path, name: str, iterations: int) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)
     from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
     from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-    from vggtgeo.solvers.reduced import DenseCholesky
+    from vggtgeo.solvers.reduced_solvers import DenseCholesky
 
     from vggtgeo.bundle.problem_file import load_problem
     from vggtgeo.bundle.solution import solve

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.bundle.observations import Observations
-from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment, quadratic
+from vggtgeo.bundle.terms.measured_pose import SurfaceAlignment, quadratic
 from vggtgeo.simulation.small_window import SIZE, SimulatedWindow, project_between
 
 _SPACING = 0.15

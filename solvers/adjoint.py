@@ -49,7 +49,7 @@ from vggtgeo.solvers.arrow import (
 from vggtgeo.solvers.flat_directions import at_least
 from vggtgeo.solvers.levenberg_marquardt import LevenbergMarquardtState, SchurLevenbergMarquardt
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
-from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, DenseCholesky
 
 STATIONARY = 1e-6
 """Gradient after the refinement, scaled by the root of the curvature (the unit of `sqrt(energy)`), above which a point
@@ -210,7 +210,9 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
         return _gradient(shifted, shifted.restore_fixed(point), system)
 
     _, right_hand_side = jax.jvp(lambda moving: stationarity(moving, at), (moving,), (moved,))
-    trusted = _derivative_factor(left, options)
+    # NaN if the derivative is undefined, or the point not stationary with the option `nan`.
+    doubtful = ((left > STATIONARY) & (options.not_stationary == "nan")) | ~jnp.isfinite(left)
+    trusted = jnp.where(doubtful, jnp.nan, 1.0)
     flat, unflatten = ravel_pytree(
         _times(right_hand_side, trusted)
     )  # one leaf, since JAX requires that all leaves depend on the differentiated input
@@ -256,12 +258,6 @@ _NOT_SOLVED = (
     "The linear system of the derivative was not solved: minimum residuals did not converge. Raise `exact_iterations` "
     "of `ConjugateGradients`, use a better preconditioner, or another `reduced_solver`."
 )
-
-
-def _derivative_factor(left: Float[Array, ""], options: ArrowAdjoint) -> Float[Array, ""]:
-    """Return 1, or NaN if the derivative is undefined, or the point not stationary with the option `nan`."""
-    doubtful = ((left > STATIONARY) & (options.not_stationary == "nan")) | ~jnp.isfinite(left)
-    return jnp.where(doubtful, jnp.nan, 1.0)
 
 
 def _times(tree: Any, factor: Float[Array, ""]) -> Any:

@@ -1,4 +1,5 @@
-"""Arrow-shaped normal equations of an edge-factored least-squares problem; `assembly.py` has their Schur complement.
+"""Arrow-shaped normal equations of an edge-factored least-squares problem; for their elimination see
+`schur_complement.py`.
 
 Unknowns: `n` nodes of `b` coordinates each, `q` shared coordinates (together `c = n b + q`: the dense part `x`), and
 `h` rows of `s` scalar landmarks `z`. A node hosts one row or several, so that rows are short even if one node hosts
@@ -44,17 +45,14 @@ Levenberg-Marquardt damping multiplies the diagonal: `V (1 + l)`, `H + l diag(H)
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from vggtgeo.solvers import segments, triples
 from vggtgeo.solvers.segments import SegmentLandmarks
 from vggtgeo.solvers.triples import TripleLandmarks, restrict_triples
-
-_Tree = TypeVar("_Tree")
 
 
 class EdgeGraph(eqx.Module):
@@ -328,12 +326,19 @@ def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array
 
 
 def _factors_gathered(system: ArrowSystem, factors: NodeFactors, local: Float[Array, "m l"]) -> Float[Array, " c"]:
-    """Add values in the factors' local coordinates to the nodes and the shared coordinates."""
-    block = system.block
-    nodes = jnp.zeros((system.num_nodes + 1, block), local.dtype)
+    return gather_factors(system.graph, factors, local, (system.num_nodes, system.block, system.shared))
+
+
+def gather_factors(
+    graph: EdgeGraph, factors: NodeFactors, local: Float[Array, "m l"], sizes: tuple[int, int, int]
+) -> Float[Array, " c"]:
+    """Add values in the factors' local coordinates to the nodes and the shared coordinates; sizes: `n`, `b`, `q`."""
+    count, block, shared = sizes
+    nodes = jnp.zeros((count + 1, block), local.dtype)
     nodes = nodes.at[factors.first].add(local[:, :block]).at[factors.second].add(local[:, block : 2 * block])
-    shared = add_shared(local[:, 2 * block :], seen_by_factors(system, factors), system.shared)
-    return jnp.concatenate([nodes[:-1].reshape(-1), shared])
+    own = local[:, 2 * block :]
+    seen = graph.seen(factors.first[:, None], own.shape[1])
+    return jnp.concatenate([nodes[:-1].reshape(-1), add_shared(own, seen, shared)])
 
 
 def seen_by_factors(system: ArrowSystem, factors: NodeFactors) -> Int[Array, "m v"] | None:
@@ -407,16 +412,3 @@ def sum_corners(
     columns = jnp.pad(seen, ((0, 0), (0, 1)), constant_values=system.shared)
     corner = jnp.zeros((system.shared + 1, system.shared + 1), value.dtype)
     return corner.at[columns[:, :, None], columns[:, None, :]].add(value)
-
-
-def is_finite(system: ArrowSystem) -> Bool[Array, ""]:
-    """Return whether gradient and curvature of every coordinate are finite; this covers all derivatives."""
-    finite = [jnp.all(jnp.isfinite(part)) for part in dense_gradient(system)]
-    landmarks = jnp.all(jnp.isfinite(system.landmark_gradient)) & jnp.all(jnp.isfinite(system.landmark_hessian))
-    return finite[0] & finite[1] & landmarks
-
-
-def nan_unless_finite(finite: Bool[Array, ""], tree: _Tree) -> _Tree:
-    """Return the floats of a pytree, or NaN if its linearisation is not finite: zeros would look like a result."""
-    or_nan = lambda leaf: jnp.where(finite, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
-    return jax.tree.map(or_nan, tree)

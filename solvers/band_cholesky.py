@@ -29,7 +29,7 @@ from vggtgeo.solvers.local_inverse import (
     rank_tolerance,
     visible,
 )
-from vggtgeo.solvers.reduced import AbstractFactor, AbstractReducedSolver, predicted_decrease
+from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, predicted_decrease
 
 
 class BandElimination(AbstractFactor):

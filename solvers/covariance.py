@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, inverse_landmark_hessian, moving_landmarks, restricted
 from vggtgeo.solvers.local_inverse import LocalInverse, to_relative, visible
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 
 class ArrowCovariance(eqx.Module):

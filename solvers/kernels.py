@@ -37,8 +37,6 @@ class AbstractKernel(eqx.Module):
     The width `delta` of a kernel applies to `sqrt(w) |r|`. If weights are `1 / sigma^2`, it is in standard deviations:
     `Huber(1.5)` is quadratic up to 1.5 sigma. Only for weights of 1 is it in the unit of the residual.
 
-    Fields:
-
     Example: a user-defined kernel, quadratic for small residuals.
         >>> class Welsch(vg.kernels.AbstractKernel):
         ...     def rho(self, s):
@@ -47,6 +45,12 @@ class AbstractKernel(eqx.Module):
         1.0
 
     """
+
+    def __check_init__(self) -> None:
+        """Raise ValueError unless the width, if there is one, is positive; a traced width is not checked."""
+        width = getattr(self, "delta", None)
+        if isinstance(width, jax.Array) and not isinstance(width, jax.core.Tracer) and not np.all(width > 0):
+            raise ValueError(f"`delta` of `{type(self).__name__}` must be positive, got {width}")
 
     @abc.abstractmethod
     def rho(self, s: Values) -> Values:
@@ -72,8 +76,6 @@ class AbstractKernel(eqx.Module):
 
 class Square(AbstractKernel):
     """No robustness: `rho(s) = s`.
-
-    Fields:
 
     Example:
         >>> float(vg.kernels.Square().weight(jax.numpy.asarray(9.0)))
@@ -190,6 +192,13 @@ class Barron(AbstractKernel):
 
     delta: Float[Array, ""] = eqx.field(converter=_number, default=1.5)
     alpha: Float[Array, ""] = eqx.field(converter=_number, default=1.0)
+
+    def __check_init__(self) -> None:
+        """Raise ValueError for a shape that is not below 2, or is 0."""
+        shape: Any = self.alpha
+        known = isinstance(shape, jax.Array) and not isinstance(shape, jax.core.Tracer)
+        if known and not np.all((shape < 2) & (shape != 0)):
+            raise ValueError(f"`alpha` of `Barron` must be below 2 and not 0 (use `Cauchy` for 0), got {shape}")
 
     def _base(self, s: Values) -> tuple[Float[Array, ""], Values]:
         breadth = self.delta**2 * (2 - self.alpha)

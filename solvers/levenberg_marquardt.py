@@ -16,6 +16,7 @@ from __future__ import annotations
 import numbers
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Self
 
 import equinox as eqx
@@ -27,7 +28,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, dense_gradient
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 
 class Termination(eqx.Enumeration):
@@ -57,7 +58,7 @@ class Termination(eqx.Enumeration):
     )
 
 
-_NUMBERS = {
+_HIGHEST = {
     **dict.fromkeys(("rtol", "atol", "initial_damping", "max_damping", "min_damping"), sys.float_info.max),
     "max_correction": 1.0,
 }
@@ -124,21 +125,18 @@ class LevenbergMarquardtState(eqx.Module):
 
 
 class _Try(eqx.Module):
+    """The last tried step: point and state after it, and how it ended."""
+
     point: Any
-    energy: Float[Array, ""]
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]
+    state: LevenbergMarquardtState
     gain: Float[Array, ""]
     """Actual over predicted decrease."""
-    iterations: Int[Array, ""]
-    history: Float[Array, " h"]
     accepted: Bool[Array, ""]
     stuck: Bool[Array, ""]
     overcorrected: Bool[Array, ""]
     """Rejected, possibly due to the correction: linearise again with less of it before the damping is raised."""
     finite: Bool[Array, ""]
     """Whether the step is finite."""
-    record: IterationRecord | None
 
 
 MAX_ITERATIONS = 1_000_000
@@ -194,19 +192,14 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         whole = isinstance(most, numbers.Integral) and not isinstance(most, bool)
         if not whole or not 0 <= most <= MAX_ITERATIONS:
             raise ValueError(f"`max_iterations` must be a whole number from 0 to {MAX_ITERATIONS}, got {most!r:.60}")
-        for name, highest in _NUMBERS.items():
+        for name, highest in _HIGHEST.items():
             given: Any = getattr(self, name)
             if isinstance(given, jax.Array):  # the value of a traced array is unknown
                 continue
             if not isinstance(given, int | float | np.floating | np.integer) or not 0 <= given <= highest:
-                until = "" if highest > 1 else f", at most {highest:g}"
-                raise ValueError(f"`{name}` must be a number, at least 0{until}, got {given!r:.60}")
-        ends: tuple[Any, Any] = (self.min_damping, self.max_damping)
-        if not any(isinstance(end, jax.Array) for end in ends) and ends[0] > ends[1]:
-            raise ValueError(f"`min_damping` must be at most `max_damping`, {ends[1]:g}, got {ends[0]:g}")
-        parts: tuple[Any, Any] = (self.norm, self.reduced_solver)
-        if not callable(parts[0]) or not isinstance(parts[1], AbstractReducedSolver):
-            raise ValueError("`norm` must be a function, and `reduced_solver` an `AbstractReducedSolver`")
+                raise ValueError(f"`{name}` must be a number from 0 to {highest:g}, got {given!r:.60}")
+        if not isinstance(self.reduced_solver, AbstractReducedSolver):
+            raise ValueError(f"`reduced_solver` must be an `AbstractReducedSolver`, got {self.reduced_solver!r:.60}")
 
     def init(
         self, fn: Any, y: Any, args: AbstractArrowProblem, options: Any, f_struct: Any, aux_struct: Any, tags: Any
@@ -218,8 +211,10 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             )
         energy = args.energy(y)
         finite = jnp.isfinite(energy)
-        # For another function this solver would silently minimise something else.
-        same = jnp.isclose(_value(fn(y, args)), energy, rtol=1e-3, atol=0.0) | ~finite
+        # For another function this solver would silently minimise something else; optimistix adds an auxiliary output.
+        value = fn(y, args)
+        value = jnp.asarray(value[0] if isinstance(value, tuple) else value)
+        same = jnp.isclose(value, energy, rtol=1e-3, atol=0.0) | ~finite
         begun = _CODES.running if self.max_iterations else _CODES.max_iterations
         # `jit` needs the length before the number of iterations is known.
         history = jnp.full(self.max_iterations + 1, jnp.nan, energy.dtype).at[0].set(energy)
@@ -248,42 +243,25 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         gradient_norm = _gradient_norm(system)
 
         def attempt(trial: _Try) -> _Try:
-            step, predicted = self.reduced_solver.step(system, prepared, trial.damping)
-            judged = self._judge(args, y, state, system, trial, step, predicted)
-            if trial.record is None:
+            step, predicted = self.reduced_solver.step(system, prepared, trial.state.damping)
+            judged = self._judge(args, y, system, trial.state, step, predicted)
+            record = trial.state.record
+            if record is None:
                 return judged
-            done = (judged.iterations, trial.damping, judged.gain, gradient_norm, args.recorded(judged.point))
-            return eqx.tree_at(lambda t: t.record, judged, trial.record.with_try(*done))
+            done = (judged.state.iterations, trial.state.damping, judged.gain, gradient_norm)
+            written = record.with_try(*done, args.recorded(judged.point))
+            return eqx.tree_at(lambda t: t.state.record, judged, written)
 
-        first = _Try(
-            point=y,
-            energy=state.energy,
-            damping=state.damping,
-            growth=state.growth,
-            gain=jnp.zeros_like(state.energy),
-            iterations=state.iterations,
-            history=state.history,
-            accepted=jnp.asarray(False),
-            stuck=jnp.asarray(False),
-            overcorrected=jnp.asarray(False),
-            finite=jnp.asarray(True),
-            record=state.record,
-        )
-        last = self._loop(attempt, first)
-        new = LevenbergMarquardtState(
-            energy=last.energy,
-            damping=last.damping,
-            growth=last.growth,
+        no, nothing = jnp.asarray(False), jnp.zeros_like(state.energy)
+        last = self._loop(attempt, _Try(y, state, nothing, no, no, no, jnp.asarray(True)))
+        new = replace(
+            last.state,
             correction=self._next_correction(state, last),
-            iterations=last.iterations,
             linearisations=state.linearisations + 1,
             gradient_norm=gradient_norm,
-            history=last.history,
             termination=self._terminate(state.energy, last, gradient_norm, _largest_curvature(system)),
-            polished=state.polished,
             # That before the step: another linearisation would be needed for the gradient at the new point.
             gradient_residual=gradient_norm,
-            record=last.record,
         )
         return last.point, new, None
 
@@ -311,7 +289,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def _loop(self, attempt: Callable[[_Try], _Try], first: _Try) -> _Try:
         go_on: Callable[[_Try], Any] = lambda trial: (
-            ~(trial.accepted | trial.stuck | trial.overcorrected) & (trial.iterations < self.max_iterations)
+            ~(trial.accepted | trial.stuck | trial.overcorrected) & (trial.state.iterations < self.max_iterations)
         )
         if not self.differentiable_loop:
             return jax.lax.while_loop(go_on, attempt, first)
@@ -323,9 +301,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         self,
         problem: AbstractArrowProblem[Point],
         point: Point,
-        state: LevenbergMarquardtState,
         system: ArrowSystem,
-        trial: _Try,
+        state: LevenbergMarquardtState,
         step: ArrowVector,
         predicted: Float[Array, ""],
     ) -> _Try:
@@ -343,26 +320,28 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # Nielsen 1999: an accepted step lowers the damping smoothly with the gain, at most to a third; rejections in a
         # row raise it by 2, 4, 8, ..., so that a poor start needs few of them.
         shrink = jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
-        damping = jnp.where(accepted, trial.damping * shrink, trial.damping * trial.growth)
+        damping = jnp.where(accepted, state.damping * shrink, state.damping * state.growth)
         damping, growth = (
-            jnp.where(overcorrected, trial.damping, damping),
-            jnp.where(overcorrected, trial.growth, trial.growth * 2),
+            jnp.where(overcorrected, state.damping, damping),
+            jnp.where(overcorrected, state.growth, state.growth * 2),
         )
-        iterations = trial.iterations + 1
-        kept = jnp.where(accepted, new_energy, energy)
-        return _Try(
-            point=jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, point),
+        iterations, kept = state.iterations + 1, jnp.where(accepted, new_energy, energy)
+        after = replace(
+            state,
             energy=kept,
             damping=jnp.clip(damping, self.min_damping, self.max_damping),
             growth=jnp.where(accepted, 2.0, growth),
-            gain=gain,
             iterations=iterations,
-            history=trial.history.at[iterations].set(kept),
+            history=state.history.at[iterations].set(kept),
+        )
+        return _Try(
+            point=jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, point),
+            state=after,
+            gain=gain,
             accepted=accepted,
-            overcorrected=overcorrected,
             stuck=~accepted & ~overcorrected & (_negligible(predicted, energy) | (damping > self.max_damping)),
+            overcorrected=overcorrected,
             finite=jnp.isfinite(predicted),
-            record=trial.record,
         )
 
     def _next_correction(self, state: LevenbergMarquardtState, last: _Try) -> Float[Array, ""]:
@@ -370,7 +349,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             return state.correction
         # A rejection means that the model was wrong at this scale, so the correction grows only if the first try
         # succeeded.
-        at_once = last.accepted & (last.iterations == state.iterations + 1)
+        at_once = last.accepted & (last.state.iterations == state.iterations + 1)
         more = jnp.minimum(1 - 0.7 * (1 - state.correction), self.max_correction)
         less = jnp.where(state.correction > 0.1, state.correction / 2, 0.0)
         kept = jnp.where(at_once & (last.gain > 0.5), state.correction, less)
@@ -387,10 +366,10 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # standard deviations has curvatures far above 1, so the unit is 1.
         unit = jnp.sqrt(jnp.minimum(curvature, 1.0))
         # A rejected step leaves the energy as it is, which is not convergence.
-        small = last.accepted & (energy - last.energy <= self.rtol * energy)
+        small = last.accepted & (energy - last.state.energy <= self.rtol * energy)
         # Later entries take precedence: a vanished gradient is convergence however the step ended.
         options = [
-            (last.iterations >= self.max_iterations, _CODES.max_iterations),
+            (last.state.iterations >= self.max_iterations, _CODES.max_iterations),
             (small, _CODES.energy_converged),
             (last.stuck, _CODES.step_converged),
             (last.stuck & ~last.finite, _CODES.nonfinite_step),
@@ -400,11 +379,6 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         for happened, code in options:
             termination = _CODES.where(happened, code, termination)
         return termination
-
-
-def _value(returned: Any) -> Array:
-    """Return the value of the function without the auxiliary output that optimistix adds."""
-    return jnp.asarray(returned[0] if isinstance(returned, tuple) else returned)
 
 
 def _negligible(predicted: Float[Array, ""], energy: Float[Array, ""]) -> Bool[Array, ""]:

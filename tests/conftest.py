@@ -73,7 +73,6 @@ LONGEST = (
     "test_run_folder",
     "test_single_leaves",
     "test_single_precision",
-    "test_agreement",
     "test_simulation_sequence",
     "test_structured_inverse",
 )

@@ -11,22 +11,22 @@ Ready terms: `PointTerm`, `LineTerm`, `DepthPrior`, `HostPixel`, `BaselinePrior`
 """
 
 from vggtgeo.bundle.observations import FlatTerm as FlatTerm
-from vggtgeo.bundle.terms.baseline import BaselinePrior as BaselinePrior
-from vggtgeo.bundle.terms.depth import DepthPrior as DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm as EdgeTerm
-from vggtgeo.bundle.terms.host_pixel import HostPixel as HostPixel
+from vggtgeo.bundle.terms.edge import View as View
 from vggtgeo.bundle.terms.image import ImageTerm as ImageTerm
 from vggtgeo.bundle.terms.image import LineTerm as LineTerm
 from vggtgeo.bundle.terms.image import PointTerm as PointTerm
-from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior as IntrinsicsPrior
+from vggtgeo.bundle.terms.landmark import DepthPrior as DepthPrior
+from vggtgeo.bundle.terms.landmark import HostPixel as HostPixel
+from vggtgeo.bundle.terms.landmark import SlotTerm as SlotTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior as MarginalPrior
+from vggtgeo.bundle.terms.measured_pose import BaselinePrior as BaselinePrior
+from vggtgeo.bundle.terms.measured_pose import RelativePose as RelativePose
+from vggtgeo.bundle.terms.measured_pose import RotationPrior as RotationPrior
 from vggtgeo.bundle.terms.node import CameraTerm as CameraTerm
 from vggtgeo.bundle.terms.node import DenseTerm as DenseTerm
+from vggtgeo.bundle.terms.node import IntrinsicsPrior as IntrinsicsPrior
 from vggtgeo.bundle.terms.node import PairTerm as PairTerm
 from vggtgeo.bundle.terms.node import PoseTerm as PoseTerm
-from vggtgeo.bundle.terms.relative_pose import RelativePose as RelativePose
-from vggtgeo.bundle.terms.rotation import RotationPrior as RotationPrior
-from vggtgeo.bundle.terms.slot import SlotTerm as SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm as AbstractTerm
 from vggtgeo.bundle.terms.term import shared_field as shared_field
-from vggtgeo.bundle.terms.view import View as View

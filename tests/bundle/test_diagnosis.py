@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vggtgeo.solvers.arrow import is_finite
 
 import vggtgeo as vg
-from vggtgeo.bundle.diagnosis import Diagnosis, diagnose
+from vggtgeo.bundle.diagnosis import Diagnosis, diagnose, is_finite
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State

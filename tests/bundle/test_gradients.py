@@ -190,16 +190,6 @@ def test_every_leaf_is_in_the_table(both: Both, reverse: Both) -> None:
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(reverse))
 
 
-@pytest.mark.parametrize("name", ["point weights", "point targets"])
-def test_what_is_absent_has_no_derivative(name: str, both: Both, reverse: Both) -> None:
-    # Proves that a match of weight 0 counts as absent for derivatives too: whatever its place holds, they are zero.
-    where, _ = LEAVES[name]
-    weight = both[0].points.weight
-    absent = (weight == 0)[(...,) + (None,) * (where(both).ndim - 2)]
-    assert bool(jnp.any(absent))
-    assert float(jnp.abs(jnp.where(absent, where(reverse), 0.0)).max()) == 0.0
-
-
 def test_what_is_not_determined_has_no_derivative(both: Both, value_and_gradient: Callable) -> None:
     # Proves that a problem without any weight gives zero, not NaN: nothing there moves the optimum.
     problem, state = both

@@ -15,7 +15,7 @@ import vggtgeo as vg
 from vggtgeo.bundle.linearise import energy_gradient, linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.landmark import HostPixel
 from vggtgeo.bundle.terms.term import local_model
 
 POINTS, LINES, KEYFRAMES = 6, 2, 3

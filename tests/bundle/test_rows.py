@@ -1,6 +1,5 @@
 """Keyframes that host many landmarks have several rows of them: nothing but the layout may depend on that."""
 
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,7 +14,6 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 import vggtgeo as vg
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.problem_file import load_problem, save_problem
 
 SCENE = make_scene(seed=3, keyframes=3, points=12, lines=3, samples=4, noise=0.5)
 SPLIT = PaddedSize(4, 5, 4, 3, rows=11)
@@ -148,16 +146,6 @@ def test_derivatives_do_not_depend_on_the_rows() -> None:
 def _with_target(problem: Problem, target: jax.Array) -> vg.terms.PointTerm:
     points = problem.points
     return vg.terms.PointTerm(target=target, weight=points.weight, kernel=points.kernel, first_slot=points.first_slot)
-
-
-def test_a_saved_problem_keeps_its_rows(tmp_path: Path) -> None:
-    # Proves that a file holds the rows. Oracle: the problem that was written.
-    save_problem(tmp_path / "rows.npz", *ROWS)
-    problem, state, index = load_problem(tmp_path / "rows.npz", terms=[NotNear, Distance])
-    assert float(vg.energy(problem, state)) == float(vg.energy(*ROWS[:2]))
-    matches = SCENE.observations.point_edge, SCENE.observations.point_landmark
-    np.testing.assert_array_equal(index.stored_edge(*matches), ROWS[2].stored_edge(*matches))
-    np.testing.assert_array_equal(problem.host, ROWS[0].host)
 
 
 def test_pack_chooses_rows_by_itself() -> None:

@@ -95,17 +95,6 @@ def test_a_record_of_the_iterations_changes_nothing(solved: Solve) -> None:
     assert np.isnan(np.asarray(record.gain[steps + 1 :])).all()
 
 
-def test_held_coordinates_stay(solved: Solve) -> None:
-    # Proves that the first pose and held intrinsics keep their bits while all others move.
-    problem, start, _ = NOISY.pack(**OPTIONS)
-    state = solved(problem, start).state
-    moved = np.abs(state.poses.wxyz_xyz - start.poses.wxyz_xyz).max(1)
-    np.testing.assert_allclose(moved[0], 0.0, atol=1e-15)
-    assert np.all(moved[1:] > 1e-6)
-    assert float(state.intrinsics[3]) == float(start.intrinsics[3])
-    assert bool(jnp.all(state.intrinsics[:3] != start.intrinsics[:3]))
-
-
 @pytest.mark.parametrize("spoil", ["pose", "pixel", "target", "weight", "no weight", "negative weight", "depth"])
 def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
     # Proves that NaN anywhere in use ends at once, with the code that says so and the initial state untouched.

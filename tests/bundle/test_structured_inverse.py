@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from benchmark_modules import benchmark
-from vggtgeo.solvers.adjoint import STATIONARY, ArrowAdjoint, exact_model
+from vggtgeo.solvers.adjoint import exact_model
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
@@ -179,20 +179,3 @@ def test_gradients_in_reverse_mode(name: str, solved: State, by_dense: Tree) -> 
     solver, tolerance = SOLVERS[name]
     found = eqx.filter_jit(jax.grad(loss))(MOVING, solver, solved)
     assert worst(found, by_dense) < tolerance
-
-
-@pytest.mark.slow  # a minute of compilation; test_single_leaves.py has the same of the dense way
-def test_a_derivative_whose_system_was_not_solved_can_be_refused(solved: State) -> None:
-    # Proves that a derivative is NaN where it is asked for and its linear system was not solved, though the point is an
-    # optimum. Oracle: two iterations cannot be enough, see above.
-    solver = ConjugateGradients(BandPreconditioner(2), exact_iterations=2)
-    iteration = SchurLevenbergMarquardt(rtol=1e-12, max_iterations=1, reduced_solver=solver)
-
-    def value(mean: jax.Array) -> tuple[jax.Array, jax.Array]:
-        problem = eqx.tree_at(lambda p: p.depth.mean, PROBLEM, mean)
-        found = solve(problem, solved, solver=iteration, adjoint=ArrowAdjoint(not_stationary="nan"))
-        return jnp.sum(found.state.inverse_depth), found.gradient_residual
-
-    gradient, residual = jax.jit(jax.grad(value, has_aux=True))(PROBLEM.depth.mean)
-    assert float(residual) < STATIONARY
-    assert bool(jnp.isnan(gradient).any())

@@ -110,16 +110,6 @@ def test_a_shared_focal_length_needs_two() -> None:
         with_shared_focal(with_shared_focal(Pinhole))
 
 
-def test_without_distortion_they_are_what_they_generalise() -> None:
-    # Proves the meaning of the first parameters. Oracle: the pinhole, and the equidistant law `r = f t`.
-    pixel = jnp.array([400.0, 300.0])
-    straight = Pinhole(jnp.asarray(FOCAL)).unproject(pixel)
-    np.testing.assert_allclose(RadialTangential(jnp.asarray(FOCAL + (0.0,) * 4)).unproject(pixel), straight, rtol=1e-12)
-    ray = KannalaBrandt(jnp.asarray(FOCAL + (0.0,) * 4)).unproject(pixel)
-    radius = np.linalg.norm((np.asarray(pixel) - FOCAL[2:]) / FOCAL[:2])
-    assert np.arctan(np.linalg.norm(ray[:2])) == pytest.approx(radius, rel=1e-12)
-
-
 def test_a_ray_beside_the_camera_has_a_bounded_say_in_the_lens() -> None:
     # Proves that coefficients of distortion move no pixel more than at the bound, and that the bound leaves no step.
     # Oracle: the polynomial there. Powers of the radius itself would be a million times that.

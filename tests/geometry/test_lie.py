@@ -36,13 +36,10 @@ def test_exp_is_the_matrix_exponential(angle: float) -> None:
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("angle", ANGLES)
 def test_log_is_that_of_jaxlie(angle: float, sign: float) -> None:
-    # Proves the logarithm, with both quaternions of a rotation. Oracle: jaxlie's, and the tangent put in.
-    given = tangent(angle)
-    pose = jaxlie.SE3.exp(jnp.asarray(given))
+    # Proves the logarithm, with both quaternions of a rotation. Oracle: jaxlie's.
+    pose = jaxlie.SE3.exp(jnp.asarray(tangent(angle)))
     turned = jaxlie.SE3(jnp.concatenate([sign * pose.wxyz_xyz[:4], pose.wxyz_xyz[4:]]))
-    found = lie.log(turned)
-    np.testing.assert_allclose(found, pose.log(), atol=1e-9)
-    np.testing.assert_allclose(lie.log(lie.exp(jnp.asarray(given))), given, atol=1e-11)
+    np.testing.assert_allclose(lie.log(turned), pose.log(), atol=1e-9)
 
 
 @jax.jit

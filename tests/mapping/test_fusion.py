@@ -17,7 +17,7 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.fusion import SurfaceFusion, fused_mesh
-from vggtgeo.mapping.tsdf import View, blocks_of, merge_meshes
+from vggtgeo.mapping.tsdf import merge_meshes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 RADIUS, AWAY, VOXEL = 0.5, 2.0, 0.04
@@ -145,14 +145,6 @@ def test_the_mesh_of_a_building_is_joined() -> None:
     assert len(part.vertices) > 500
     assert len(whole.vertices) == 2 * len(part.vertices)
     assert len(whole.faces) == 4 * len(part.faces)
-
-
-def test_what_is_out_of_reach_has_no_blocks() -> None:
-    """A camera that ran off by ten million kilometres sees no block, one at its place does; oracle: 32-bit places."""
-    keyframes, depth_maps = sphere_views()
-    seen = lambda pose: blocks_of(View(depth_maps[0], keyframes[0].image, pose, INTRINSICS), VOXEL)
-    assert seen(keyframes[0].pose)
-    assert seen(keyframes[0].pose + np.eye(4, k=3) * 1e10) == []
 
 
 def test_a_small_piece_is_left_out() -> None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.models.classical import NoDepth, SiftMatcher
 from vggtgeo.models.roles import Features, PointMatches
 
-from vggtgeo.bundle.terms.relative_pose import RelativePose
+from vggtgeo.bundle.terms.measured_pose import RelativePose
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid

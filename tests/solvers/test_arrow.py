@@ -13,11 +13,10 @@ from vggtgeo.solvers.arrow import (
     dense_gradient,
 )
 from vggtgeo.solvers.band_cholesky import BandCholesky
-from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
 from vggtgeo.solvers.covariance import ArrowCovariance, covariance
-from vggtgeo.solvers.reduced import DenseCholesky
-from vggtgeo.solvers.schur_complement import dense_schur_complement
+from vggtgeo.solvers.reduced_solvers import DenseCholesky
+from vggtgeo.solvers.schur_complement import dense_schur_complement, reduced_blocks, sparse_layout
 
 from vggtgeo.bundle.analysis.weakest import sparse_matrix
 

@@ -1,5 +1,7 @@
 """Robust kernels: values, derivatives, and what they do to outliers."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,3 +65,10 @@ def test_barron_contains_geman_mcclure() -> None:
     # Proves the shape parameter of the general kernel: alpha = -2 is Geman-McClure with delta scaled by 2 (b = 4).
     general, special = Barron(1.1, -2.0), GemanMcClure(2.2)
     assert _relative(general.rho(SQUARES), special.rho(SQUARES)) < 1e-9
+
+
+@pytest.mark.parametrize(("make", "named"), [(lambda: Huber(-1.0), "delta"), (lambda: Barron(alpha=2.0), "alpha")])
+def test_invalid_parameters(make: Callable[[], AbstractKernel], named: str) -> None:
+    # Proves that a kernel without a positive width, or of a shape without a kernel, cannot be made.
+    with pytest.raises(ValueError, match=named):
+        make()

@@ -11,11 +11,11 @@ import numpy as np
 import optimistix as optx
 from jax.sharding import PartitionSpec
 
+from vggtgeo.bundle.checks import check_kinds
 from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex
-from vggtgeo.bundle.pair_checks import check_kinds
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 from vggtgeo.io.errors import InputError

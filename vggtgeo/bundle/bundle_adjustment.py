@@ -108,18 +108,15 @@ class BundleAdjustment(AbstractArrowProblem[State]):
 
 def _shortened(depth: Float[Array, "h l"], moved: Float[Array, "h l"], segments: int) -> Float[Array, "h l"]:
     """Shorten the step of each segment by one factor, so that all its samples stay positive and on a line."""
-    change, room = moved - depth, depth - _lower_bound(depth)
+    # A landmark already below the bound may stay where it is, but not go farther.
+    lowest = jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
+    change, room = moved - depth, depth - lowest
     too_far = -change > room
     share = jnp.where(too_far, room / jnp.where(too_far, -change, 1.0), 1.0)
     # One factor for all samples of a segment keeps them on a line.
     share = jnp.min(share.reshape(len(depth), segments, -1), 2, keepdims=True)
     share = jnp.broadcast_to(share, (*share.shape[:2], depth.shape[1] // segments)).reshape(depth.shape)
     return jnp.where(share < 1, depth + share * change, moved)
-
-
-def _lower_bound(depth: Float[Array, "h s"]) -> Float[Array, "h s"]:
-    # A landmark already below the bound may stay where it is, but not go farther.
-    return jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
 
 
 def _positive(moved: Float[Array, "h s"]) -> Float[Array, "h s"]:

@@ -14,7 +14,7 @@ Four faults that the energy does not show:
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -34,17 +34,14 @@ from vggtgeo.bundle.terms.node import NodeTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
+from vggtgeo.solvers.arrow import ArrowSystem, dense_gradient
 
+_Tree = TypeVar("_Tree")
 MAJORITY = 0.5
 """Maximum share of a term's observations that may be faulty: the breakdown point of a robust estimate."""
 SIGNIFICANCE = 1e-3
 """Significance level: probability that Gaussian noise of the given weights makes an observation count as rejected, or a
 fixed pose as inconsistent."""
-
-
-def finer_than_precision(weight: Any, squared_slope: Any, squared_distance: Any, eps: float) -> Any:
-    """Return which observations have a standard deviation below the effect of one step of the position."""
-    return weight * squared_slope * squared_distance * eps**2 > 1
 
 
 class Diagnosis(eqx.Module):
@@ -80,11 +77,11 @@ class Diagnosis(eqx.Module):
 
     def sentences(self, failed: bool) -> list[str]:
         """Return the faults as sentences (outside `jit`, for one problem). failed: the solve did not converge."""
-        found = [self._not_finite(k) for k in range(len(self.names))] if failed else []
-        found += [self._unresolved(k) for k in range(len(self.names))]
-        found += [] if failed else [self._rejected(k) for k in range(len(self.names))]
-        found += [] if failed else [self._contradicted(k) for k in range(len(self.names))]
-        return [sentence for sentence in found if sentence]
+        if failed:
+            kinds = [self._not_finite, self._unresolved]
+        else:
+            kinds = [self._unresolved, self._rejected, self._contradicted]
+        return [sentence for kind in kinds for k in range(len(self.names)) if (sentence := kind(k))]
 
     def _not_finite(self, k: int) -> str:
         value, derivative = int(self.value[k]), int(self.derivative[k])
@@ -167,11 +164,9 @@ def diagnosis_like(problem: Problem) -> Diagnosis:
     """Return a diagnosis with the structure of that of `problem` and placeholder values."""
     count, dtype = len(problem.terms), problem.pixels.dtype
     whole, share = jnp.zeros(count, int), jnp.zeros(count, dtype)
-    names, shapes = (
-        tuple(term.name for term in problem.terms),
-        tuple(jnp.shape(term.weight) for term in problem.terms),
-    )
     motion, number = jnp.zeros((count, lie.TANGENT), dtype), jnp.zeros((), dtype)
+    names = tuple(term.name for term in problem.terms)
+    shapes = tuple(jnp.shape(term.weight) for term in problem.terms)
     return Diagnosis(whole, whole, share, share, share, motion, number, jnp.asarray(0), names, shapes)
 
 
@@ -190,6 +185,19 @@ def check_linearisation(problem: Problem, state: State, finite: Any) -> None:
     found = _diagnose_jit(problem, state).sentences(failed=True)
     why = " ".join(found) or "Check for weights or standard deviations that are far too large or too small."
     raise InputError(f"the linearisation of `problem` at `state` must be finite. {why}")
+
+
+def is_finite(system: ArrowSystem) -> Bool[Array, ""]:
+    """Return whether gradient and curvature of every coordinate are finite; this covers all derivatives."""
+    finite = [jnp.all(jnp.isfinite(part)) for part in dense_gradient(system)]
+    landmarks = jnp.all(jnp.isfinite(system.landmark_gradient)) & jnp.all(jnp.isfinite(system.landmark_hessian))
+    return finite[0] & finite[1] & landmarks
+
+
+def nan_unless_finite(finite: Bool[Array, ""], tree: _Tree) -> _Tree:
+    """Return the floats of a pytree, or NaN if its linearisation is not finite: zeros would look like a result."""
+    or_nan = lambda leaf: jnp.where(finite, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
+    return jax.tree.map(or_nan, tree)
 
 
 class Observed(NamedTuple):
@@ -288,29 +296,24 @@ def _unresolved(problem: Problem, term: AbstractTerm, state: State, slopes: _Slo
         depth = state.inverse_depth[row, term.first_slot : term.first_slot + term.weight.shape[1]]
         # The relative pose has the rounding error of the position with the larger step.
         farther = jnp.maximum(away[source], away[target])[:, None]
-        return _share(finer_than_precision(term.weights, (focal * depth) ** 2, farther, eps), term.weights != 0)
+        return _share(term.weights * (focal * depth) ** 2 * farther * eps**2 > 1, term.weights != 0)
     if slopes is not None and isinstance(term, NodeTerm):
         jacobian = slopes.jacobian[0]
         moved: Array = jnp.zeros(len(term.weight), jacobian.dtype)
         for place, index in enumerate(term.touched()):
             by_position = jacobian[:, :, lie.TANGENT * place : lie.TANGENT * place + 3]
             moved = jnp.maximum(moved, jnp.sum(by_position**2, (1, 2)) * away[index])
-        return _share(finer_than_precision(term.weights, moved / jacobian.shape[1], 1.0, eps), term.weights != 0)
+        return _share(term.weights * (moved / jacobian.shape[1]) * eps**2 > 1, term.weights != 0)
     return jnp.zeros(())
 
 
-class _Rigid(NamedTuple):
-    """A term's gradient and Hessian by a rigid motion of all poses, and the diagonal summed over single poses."""
-
-    gradient: Float[Array, "6"]
-    hessian: Float[Array, "6 6"]
-    size: Float[Array, "6"]
-
-
-def _rigid(term: AbstractTerm, carry: Float[Array, "n 6 6"], slopes: _Slopes | None) -> _Rigid:
+def _rigid(
+    term: AbstractTerm, carry: Float[Array, "n 6 6"], slopes: _Slopes | None
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"], Float[Array, "6"]]:
+    """Return a term's gradient and Hessian by a rigid motion of all poses, and the diagonal over single poses."""
     if slopes is None or not isinstance(term, NodeTerm):
         nothing = jnp.zeros((lie.TANGENT, lie.TANGENT), carry.dtype)
-        return _Rigid(nothing[0], nothing, nothing[0])
+        return nothing[0], nothing, nothing[0]
     residual, jacobian = slopes.residual[1], slopes.jacobian[1]
     pull = term.weights * term.kernel.weight(term.weights * jnp.sum(residual**2, 1))
     parts = [
@@ -318,10 +321,10 @@ def _rigid(term: AbstractTerm, carry: Float[Array, "n 6 6"], slopes: _Slopes | N
         for place, index in enumerate(term.touched())
     ]
     along = sum(parts[1:], parts[0])
-    return _Rigid(
-        gradient=jnp.einsum("m,mka,mk->a", pull, along, residual),
-        hessian=jnp.einsum("m,mka,mkb->ab", pull, along, along),
-        size=jnp.asarray(sum(jnp.einsum("m,mka->a", pull, part**2) for part in parts)),
+    return (
+        jnp.einsum("m,mka,mk->a", pull, along, residual),
+        jnp.einsum("m,mka,mkb->ab", pull, along, along),
+        jnp.asarray(sum(jnp.einsum("m,mka->a", pull, part**2) for part in parts)),
     )
 
 

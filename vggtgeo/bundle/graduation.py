@@ -43,8 +43,7 @@ class Graduation(eqx.Module):
         check_whole("iterations", self.iterations, 0)
         factors = real_numbers("factors", self.factors)
         if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
-            must = "a tuple of positive widths, relative to the kernel's own"
-            raise InputError(f"`factors` must be {must}, got {self.factors}")
+            raise InputError(f"`factors` must be a tuple of positive widths, got {self.factors}")
 
     def start(self, problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> State:
         """Return the state after all factors, the widest first; fixed coordinates as in `initial`."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from vggtgeo.bundle.packing_checks import check_fixed, check_range
+from vggtgeo.bundle.checks import check_fixed, check_range
 from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, with_shared_focal
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import real_numbers
@@ -45,63 +45,36 @@ class Intrinsics:
     prior_sigma: np.ndarray | float | None = None
     fixed: np.ndarray | bool = False
 
+    def checked(self, keyframes: int) -> Intrinsics:
+        """Return the same after validation: arrays in place of lists, and `shared_focal` as part of the model.
 
-@dataclass(frozen=True)
-class CheckedIntrinsics:
-    """`Intrinsics` after validation: the model with its shared focal length, all others as arrays."""
+        Raises:
+            InputError: a field is invalid; names it.
 
-    values: np.ndarray
-    model: type[AbstractCamera]
-    camera_of: np.ndarray | None
-    prior_mean: np.ndarray
-    prior_sigma: np.ndarray | None
-    fixed: np.ndarray
-
-    def focal(self, keyframes: int) -> np.ndarray:
-        """Return the first parameter of each keyframe's camera, `[n]`, pixels."""
-        camera = np.zeros(keyframes, int) if self.camera_of is None else self.camera_of
-        focal: np.ndarray = np.atleast_2d(self.values)[camera, 0]
-        return focal
-
-
-def checked_intrinsics(given: Any, keyframes: int) -> CheckedIntrinsics:
-    """Return `Intrinsics`, or parameters of one free pinhole camera, after validation.
-
-    Raises:
-        InputError: a field is invalid; names it.
-
-    """
-    own = given if isinstance(given, Intrinsics) else Intrinsics(real_numbers("intrinsics", given))
-    values = real_numbers("intrinsics", own.values)
-    model: Any = own.model
-    if not (isinstance(model, type) and issubclass(model, AbstractCamera)):
-        raise InputError(
-            f"`model` must be a camera class, such as `vggtgeo.cameras.RadialTangential`, got {model!r:.60}"
-        )
-    model = with_shared_focal(model) if own.shared_focal else model
-    camera_of = None if own.camera_of is None else real_numbers("camera_of", own.camera_of)
-    _check_values(model, values, several=camera_of is not None)
-    if camera_of is not None:
-        check_range("camera_of", camera_of, len(values), "rows of `intrinsics`")
-        if camera_of.shape != (keyframes,):
-            raise InputError(f"`camera_of` must have shape ({keyframes},), one a keyframe, got {camera_of.shape}")
-    mean = values if own.prior_mean is None else real_numbers("prior_mean", own.prior_mean)
-    if mean.shape != values.shape or not np.all(np.isfinite(mean)):
-        raise InputError(f"`prior_mean` must be {' x '.join(map(str, values.shape))} finite numbers, got {mean}")
-    sigma = None if own.prior_sigma is None else real_numbers("prior_sigma", own.prior_sigma)
-    if sigma is not None and not np.all(sigma > 0):
-        raise InputError(f"`prior_sigma` must be positive, or None for no prior, got {sigma}")
-    return CheckedIntrinsics(values, model, camera_of, mean, sigma, check_fixed("fixed", own.fixed, values.shape))
-
-
-def _check_values(model: type[AbstractCamera], values: np.ndarray, *, several: bool) -> None:
-    """Check the number of parameters, and that focal lengths are positive."""
-    names, cameras = ", ".join(model.names), "g, " if several else ""
-    if values.ndim != 1 + several or values.shape[-1] != len(model.names):
-        raise InputError(
-            f"`intrinsics` must have shape ({cameras}{len(model.names)}), got {values.shape}: {names} of a "
-            f"{model.__name__}{', a row a camera' if cameras else ''}"
-        )
-    focal = [name in ("f", "fx", "fy") for name in model.names]
-    if not np.all(np.isfinite(values)) or np.any(values[..., focal] <= 0):
-        raise InputError(f"`intrinsics` must be finite with positive focal lengths, got {values}")
+        """
+        values, model = real_numbers("intrinsics", self.values), cast(Any, self.model)
+        if not (isinstance(model, type) and issubclass(model, AbstractCamera)):
+            must = "a camera class, such as `vggtgeo.cameras.RadialTangential`"
+            raise InputError(f"`model` must be {must}, got {model!r:.60}")
+        model = with_shared_focal(model) if self.shared_focal else model
+        several, count = self.camera_of is not None, len(model.names)
+        if values.ndim != 1 + several or values.shape[-1] != count:
+            shape = f"(g, {count})" if several else f"({count})"
+            raise InputError(
+                f"`intrinsics` must have shape {shape}, {', '.join(model.names)} of each camera, got {values.shape}"
+            )
+        camera_of = None
+        if self.camera_of is not None:
+            camera_of = check_range("camera_of", self.camera_of, len(values), "rows of `intrinsics`")
+            if camera_of.shape != (keyframes,):
+                raise InputError(f"`camera_of` must have shape ({keyframes},), one a keyframe, got {camera_of.shape}")
+        focal = [name in ("f", "fx", "fy") for name in model.names]
+        if not np.all(np.isfinite(values)) or np.any(values[..., focal] <= 0):
+            raise InputError(f"`intrinsics` must be finite with positive focal lengths, got {values}")
+        mean = values if self.prior_mean is None else real_numbers("prior_mean", self.prior_mean)
+        if mean.shape != values.shape or not np.all(np.isfinite(mean)):
+            raise InputError(f"`prior_mean` must be {' x '.join(map(str, values.shape))} finite numbers, got {mean}")
+        sigma = real_numbers("prior_sigma", np.inf if self.prior_sigma is None else self.prior_sigma)
+        if not np.all(sigma > 0):
+            raise InputError(f"`prior_sigma` must be positive, or None for no prior, got {sigma}")
+        return Intrinsics(values, model, False, camera_of, mean, sigma, check_fixed("fixed", self.fixed, values.shape))

@@ -11,17 +11,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, pixel_observations
+from vggtgeo.bundle.objective import Edge, SeenAlong, cameras_of, edge_views, pixel_observations
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, LocalModel, products
+from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, EdgeGraph, NodeFactors, add_shared, join_landmarks
+from vggtgeo.solvers.arrow import (
+    ArrowSystem,
+    ArrowVector,
+    EdgeGraph,
+    NodeFactors,
+    add_shared,
+    gather_factors,
+    join_landmarks,
+)
 
 
 def linearise(
@@ -38,54 +47,17 @@ def linearise(
     see `terms/term.py`. Without `joined`, coupled landmarks (segments, points with free pixels) are not in the basis
     that makes them scalars, so that systems can be added.
     """
-    cameras, (edges, seen_along) = cameras_of(problem, state), edge_views(problem, state)
-    degree, size = problem.edges.of_host.shape[1], lie.TANGENT + cameras.seen
-    apart = cameras.seen - cameras.size  # parameters of the target's camera, if it can differ from the host's
-    # Rows of `cross`: `eta` of each edge, the target's camera of each edge (if several), the host's camera.
-    wide = lie.TANGENT * degree
-    common = wide + apart * degree
-
-    sizes = num_offsets(state) // 2, state.inverse_depth.shape[1]
-
-    def body(carry: tuple[Array, Array | None], edge: Edge) -> tuple[tuple[Array, Array | None], Array]:
-        (cross, blocks), row, index = carry, edge.row, edge.index_at_host
-        gram, coupled, own = (_exact if exact else _reweighted)(seen_along(edge), correction, sizes)
-        zero = jnp.zeros_like(row)
-        for first, part in coupled:
-            column = zero + first
-            cross = jax.lax.dynamic_update_slice(cross, part[None, : lie.TANGENT], (row, lie.TANGENT * index, column))
-            if apart:
-                by_target = part[None, lie.TANGENT : lie.TANGENT + apart]
-                cross = jax.lax.dynamic_update_slice(cross, by_target, (row, wide + apart * index, column))
-            # All edges of a row add to the host camera's rows; those of relative pose and target camera have their own.
-            tail, start = part[None, lie.TANGENT + apart :], (row, zero + common, column)
-            shared = jax.lax.dynamic_slice(cross, start, (1, *tail.shape[1:]))
-            cross = jax.lax.dynamic_update_slice(cross, shared + tail, start)
-        return (cross, blocks if blocks is None or own is None else blocks.at[row].add(own)), gram
-
+    views = edge_views(problem, state)
     by_depth = _depth_terms(problem, state, correction, exact)
     blocks, by_pixel = _pixel_terms(problem, state, correction, exact)
-    (points, slots), rows = sizes, len(state.inverse_depth)
-    cross = jnp.zeros((rows, common + cameras.size + 2, 2 * points + slots), state.inverse_depth.dtype)
-    if problem.edge_terms:
-        (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
-    else:
-        gram = jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
-    # After the edges, in place: XLA would copy cross terms that are not initialised with zeros.
-    if by_pixel is None:
-        cross = cross.at[:, -2:].add(jnp.stack(by_depth, 1))
-    else:
-        # Row by row: XLA does not vectorise a stack that is added to a part of the columns.
-        cross = cross.at[:, -1, 2 * points :].add(by_depth[1]).at[:, -2, 2 * points :].add(by_depth[0])
-        for axis in range(2):
-            of_axis = slice(axis * points, (axis + 1) * points)
-            cross = cross.at[:, -2, of_axis].add(by_pixel[:, axis])
+    cross, blocks, gram = _edge_terms(problem, state, views, blocks, correction, exact)
+    cross = _with_landmark_gradients(cross, by_depth, by_pixel)
     # The last column of the Gram matrix is the gradient, and `eta` comes first.
-    force = gram[:, : lie.TANGENT, size]
+    force = gram[:, : lie.TANGENT, -1]
     hessian, gradient = _dense_terms(problem, state, correction, exact)
     system = ArrowSystem(
         graph=_graph(problem),
-        source_adjoint=lie.adjoint(edges.relative),
+        source_adjoint=lie.adjoint(views[0].relative),
         gram=gram,
         cross=cross,
         lie_curvature=lie_curvature(force)
@@ -105,6 +77,67 @@ def linearise(
     return join_landmarks(system, None if problem.fraction is None else jax.lax.stop_gradient(problem.fraction))
 
 
+def _edge_terms(
+    problem: Problem,
+    state: State,
+    views: tuple[Edge, SeenAlong],
+    blocks: Float[Array, "h 3 p"] | None,
+    correction: Float[Array, ""] | None,
+    exact: bool,
+) -> tuple[Float[Array, "h r t"], Float[Array, "h 3 p"] | None, Float[Array, "e m m"]]:
+    """Return the cross terms and the Gram matrices of all edge terms, and `blocks` with theirs added."""
+    cameras, (edges, seen_along) = cameras_of(problem, state), views
+    degree, size = problem.edges.of_host.shape[1], lie.TANGENT + cameras.seen
+    apart = cameras.seen - cameras.size  # parameters of the target's camera, if it can differ from the host's
+    # Rows of `cross`: `eta` of each edge, the target's camera of each edge (if several), the host's camera.
+    wide = lie.TANGENT * degree
+    common = wide + apart * degree
+    sizes = num_offsets(state) // 2, state.inverse_depth.shape[1]
+
+    def body(carry: tuple[Array, Array | None], edge: Edge) -> tuple[tuple[Array, Array | None], Array]:
+        (cross, blocks), row, index = carry, edge.row, edge.index_at_host
+        gram, coupled, own = _edge_model(seen_along(edge), correction, sizes, exact)
+        zero = jnp.zeros_like(row)
+        for first, part in coupled:
+            column = zero + first
+            cross = jax.lax.dynamic_update_slice(cross, part[None, : lie.TANGENT], (row, lie.TANGENT * index, column))
+            if apart:
+                by_target = part[None, lie.TANGENT : lie.TANGENT + apart]
+                cross = jax.lax.dynamic_update_slice(cross, by_target, (row, wide + apart * index, column))
+            # All edges of a row add to the host camera's rows; those of relative pose and target camera have their own.
+            tail, start = part[None, lie.TANGENT + apart :], (row, zero + common, column)
+            shared = jax.lax.dynamic_slice(cross, start, (1, *tail.shape[1:]))
+            cross = jax.lax.dynamic_update_slice(cross, shared + tail, start)
+        return (cross, blocks if blocks is None or own is None else blocks.at[row].add(own)), gram
+
+    (points, slots), rows = sizes, len(state.inverse_depth)
+    cross = jnp.zeros((rows, common + cameras.size + 2, 2 * points + slots), state.inverse_depth.dtype)
+    if not problem.edge_terms:
+        return cross, blocks, jnp.zeros((len(problem.edges.source), size + 1, size + 1), cross.dtype)
+    (cross, blocks), gram = jax.lax.scan(body, (cross, blocks), edges)
+    return cross, blocks, gram
+
+
+def _with_landmark_gradients(
+    cross: Float[Array, "h r t"],
+    by_depth: tuple[Float[Array, "h s"], Float[Array, "h s"]],
+    by_pixel: Float[Array, "h 2 p"] | None,
+) -> Float[Array, "h r t"]:
+    """Add gradient and curvature of the terms on single landmarks to the last two rows of the cross terms.
+
+    After the edges, in place: XLA would copy cross terms that are not initialised with zeros.
+    """
+    if by_pixel is None:
+        return cross.at[:, -2:].add(jnp.stack(by_depth, 1))
+    points = by_pixel.shape[-1]
+    # Row by row: XLA does not vectorise a stack that is added to a part of the columns.
+    cross = cross.at[:, -1, 2 * points :].add(by_depth[1]).at[:, -2, 2 * points :].add(by_depth[0])
+    for axis in range(2):
+        of_axis = slice(axis * points, (axis + 1) * points)
+        cross = cross.at[:, -2, of_axis].add(by_pixel[:, axis])
+    return cross
+
+
 def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     """Return the gradient by left tangents, camera and inverse depths of a prepared problem, as if all were free.
 
@@ -117,11 +150,12 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
     for term in problem.slot_terms:
         landmarks = landmarks.at[:, first:].add(term.gradient(state.inverse_depth))
     for pixel, offset in pixel_observations(problem, state):
-        landmarks = landmarks.at[:, :first].add(_as_landmarks(pixel.gradient(offset)))
+        landmarks = landmarks.at[:, :first].add(jnp.swapaxes(pixel.gradient(offset), 1, 2).reshape(len(offset), -1))
     dense = _dense_terms(problem, state, None, False)[1]
     factors = _node_factors(problem, state, None, False)
     if factors is not None:
-        dense += _to_nodes(problem, factors)
+        of_dense = problem.num_keyframes, lie.TANGENT, problem.num_parameters
+        dense += gather_factors(_graph(problem), factors, factors.gradient, of_dense)
     if not problem.edge_terms:
         return ArrowVector(dense, landmarks)
 
@@ -190,9 +224,16 @@ def _skew(v: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
 Seen = Sequence[tuple[EdgeTerm, EdgeView]]
 Columns = list[tuple[int, Float[Array, "r _"]]]
 """Blocks of columns, each with its first column."""
-Coupled = tuple[Array, Columns, Array | None]
-"""Gram matrix `[d + 1, d + 1]` of one edge, its cross terms `[d + 2, 2 p + s]`, and the blocks `[3, p]` of landmarks
-with free pixels."""
+
+
+class _TermModel(NamedTuple):
+    """Second-order model of one term along one edge."""
+
+    gram: Float[Array, "d+1 d+1"]
+    coupled: list[Float[Array, "d+2 p"]]
+    """Cross terms by `u`, by `v` (if free), by inverse depth."""
+    pixels: Float[Array, "3 p"] | None
+    """Blocks of landmarks with free pixels."""
 
 
 def num_offsets(state: State) -> int:
@@ -205,59 +246,45 @@ def offsets_of(landmarks: Float[Array, "n t"]) -> Float[Array, "n p 2"]:
     return jnp.swapaxes(landmarks.reshape(len(landmarks), 2, -1), 1, 2)
 
 
-def _as_landmarks(offsets: Float[Array, "n p 2"]) -> Float[Array, "n t"]:
-    return jnp.swapaxes(offsets, 1, 2).reshape(len(offsets), -1)
+def _edge_model(
+    seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int], exact: bool
+) -> tuple[Array, Columns, Array | None]:
+    """Return Gram matrix, cross terms and blocks of landmarks with free pixels of one edge, all terms added up."""
+    models = [_exact(*one) for one in seen] if exact else _reweighted(seen, correction)
+    columns: Columns = []
+    pixels: Columns = []
+    for (term, view), model in zip(seen, models, strict=True):
+        columns += _columns_at_landmarks(term, view, model.coupled, sizes)
+        if model.pixels is not None:
+            pixels.append((term.first_slot, model.pixels[:, : view.free_pixels]))
+    free, slots = sizes
+    joint = jnp.concatenate([part for _, part in _merge_columns(pixels, free)], 1) if pixels else None
+    gram = sum((model.gram for model in models[1:]), models[0].gram)
+    return gram, _merge_columns(columns, 2 * free + slots), joint
 
 
-def _reweighted(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
+def _reweighted(seen: Seen, correction: Float[Array, ""] | None) -> list[_TermModel]:
+    models = []
     # The barrier keeps XLA from forming the columns again in each product.
     parts = jax.lax.optimization_barrier([term.columns(view, correction) for term, view in seen])
-    coupled: list[list[Array]] = []
-    blocks: list[Array | None] = []
     for columns, (_, view) in zip(parts, seen, strict=True):
         slots, depth = len(view.inverse_depth), view.size + 1
         own, pixels = columns[: depth + 1], columns[depth + 1 :]
         # One unknown after the other: XLA does not vectorise a loop over all of them.
-        coupled.append([products(own, by_one, slots) for by_one in (*pixels, own[-1])])
+        coupled = [products(own, by_one, slots) for by_one in (*pixels, own[-1])]
         pairs = [(pixels[a], pixels[b]) for a, b in ((0, 0), (1, 1), (0, 1))] if view.free_pixels else []
-        blocks.append(jnp.stack([products(a, b, slots) for a, b in pairs]) if pairs else None)
-    size = seen[0][1].size
-    # The product of all columns: a slice of the shared coordinates would be copied first.
-    gram = sum((columns @ columns.T)[: size + 1, : size + 1] for columns in parts)
-    return gram, *_cross_terms_and_pixel_blocks(seen, coupled, blocks, sizes)
+        blocks = jnp.stack([products(a, b, slots) for a, b in pairs]) if pairs else None
+        # The product of all columns: a slice of the shared coordinates would be copied first.
+        models.append(_TermModel((columns @ columns.T)[:depth, :depth], coupled, blocks))
+    return models
 
 
-def _exact(seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int]) -> Coupled:
-    models: list[LocalModel] = [term.model(view) for term, view in seen]
-    gram = models[0].gram
-    coupled: list[list[Array]] = []
-    blocks: list[Array | None] = []
-    for model in models[1:]:
-        gram = gram + model.gram
-    for model in models:
-        own = [] if model.pixels is None else [model.pixels.coupled[:, 0], model.pixels.coupled[:, 1]]
-        coupled.append([*own, model.coupled])
-        blocks.append(None if model.pixels is None else model.pixels.blocks)
-    return gram, *_cross_terms_and_pixel_blocks(seen, coupled, blocks, sizes)
-
-
-def _cross_terms_and_pixel_blocks(
-    seen: Seen, coupled: list[list[Array]], blocks: list[Array | None], sizes: tuple[int, int]
-) -> tuple[Columns, Array | None]:
-    """Return the cross terms of all terms at their landmarks, and the blocks of free pixels, added up."""
-    parts = [
-        part
-        for (term, view), own in zip(seen, coupled, strict=True)
-        for part in _columns_at_landmarks(term, view, own, sizes)
-    ]
-    pixels = [
-        (term.first_slot, own[:, : view.free_pixels])
-        for (term, view), own in zip(seen, blocks, strict=True)
-        if own is not None
-    ]
-    free, slots = sizes
-    joint = jnp.concatenate([part for _, part in _merge_columns(pixels, free)], 1) if pixels else None
-    return _merge_columns(parts, 2 * free + slots), joint
+def _exact(term: EdgeTerm, view: EdgeView) -> _TermModel:
+    model = term.model(view)
+    if model.pixels is None:
+        return _TermModel(model.gram, [model.coupled], None)
+    by_pixel = [model.pixels.coupled[:, 0], model.pixels.coupled[:, 1]]
+    return _TermModel(model.gram, [*by_pixel, model.coupled], model.pixels.blocks)
 
 
 def _columns_at_landmarks(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tuple[int, int]) -> Columns:
@@ -342,16 +369,6 @@ def _node_factors(
     if not found:
         return None
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
-
-
-def _to_nodes(problem: Problem, factors: NodeFactors) -> Float[Array, " c"]:
-    block = lie.TANGENT
-    nodes = jnp.zeros((problem.num_keyframes + 1, block), factors.gradient.dtype)
-    nodes = nodes.at[factors.first].add(factors.gradient[:, :block])
-    nodes = nodes.at[factors.second].add(factors.gradient[:, block : 2 * block])
-    parameters = factors.gradient[:, 2 * block :]
-    seen = _graph(problem).seen(factors.first[:, None], parameters.shape[1])
-    return jnp.concatenate([nodes[:-1].reshape(-1), add_shared(parameters, seen, problem.num_parameters)])
 
 
 def _dense_terms(

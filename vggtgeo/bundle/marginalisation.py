@@ -22,22 +22,20 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.diagnosis import check_linearisation
-from vggtgeo.bundle.linearise import linearise
+from vggtgeo.bundle.checks import check_finite, check_pair
+from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_finite
+from vggtgeo.bundle.linearise import free_coordinates, linearise
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm
-from vggtgeo.bundle.terms.host_pixel import HostPixel
+from vggtgeo.bundle.terms.landmark import HostPixel, SlotTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
-from vggtgeo.bundle.terms.slot import SlotTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind, check_whole, real_numbers
-from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 _MAX_KEYFRAMES = 1000
@@ -96,8 +94,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
     leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
     # Known exactly, hence conditioned on; eliminating them would treat them as unknown.
-    held = jnp.concatenate([jnp.repeat(problem.fixed_pose, lie.TANGENT), problem.fixed_intrinsics.reshape(-1)])
-    quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, held)
+    quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, free_coordinates(problem))
     root, offset = nan_unless_finite(finite, square_root(quadratic, gradient))
     return MarginalPrior(
         root=root, offset=offset, poses=point.poses, intrinsics=point.parameters, weight=jnp.ones_like(offset, shape=())
@@ -131,17 +128,13 @@ def permute_prior(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPr
 
 
 def _order_of(given: Any, count: int) -> Int[Array, " n"]:
-    traced = isinstance(given, jax.core.Tracer)
-    order = given if traced else real_numbers("order", given)
-    inside = np.zeros(0, int) if traced else order[order >= 0]
-    if (
-        order.dtype.kind not in "iu"
-        or order.ndim != 1
-        or len(np.unique(inside)) < len(inside)
-        or (inside >= count).any()
-    ):
-        found = f"{order.dtype}{list(order.shape)}" if traced else order.tolist()
-        raise InputError(f"`order` must have distinct whole numbers below {count}, or -1, got {found}")
+    if isinstance(given, jax.core.Tracer):
+        return given
+    order = real_numbers("order", given)
+    known = order[order >= 0]
+    distinct = len(np.unique(known)) == len(known)
+    if order.ndim != 1 or order.dtype.kind not in "iu" or not distinct or known.max(initial=0) >= count:
+        raise InputError(f"`order` must have distinct whole numbers below {count}, or -1, got {order.tolist()}")
     return jnp.asarray(order)
 
 
@@ -187,10 +180,9 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
 
 
 def _eliminate(
-    quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows: Bool[Array, " c"], held: Bool[Array, " c"]
+    quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows: Bool[Array, " c"], free: Bool[Array, " c"]
 ) -> _Quadratic:
     """Condition on fixed coordinates, then eliminate the leaving rows by a Schur complement (pseudo-inverse)."""
-    free = ~held
     quadratic = jnp.where(free[:, None] & free[None, :], quadratic, 0.0)
     gradient = jnp.where(free, gradient, 0.0)
     inner = jnp.where(rows[:, None] & rows[None, :], quadratic, 0.0)

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.bundle.fast import any_camera, pinhole
-from vggtgeo.bundle.pair_checks import check_pair
+from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
+from vggtgeo.bundle.checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
-from vggtgeo.bundle.terms.host_pixel import HostPixel
-from vggtgeo.bundle.terms.node import node_residuals
-from vggtgeo.bundle.terms.term import robust_energy
+from vggtgeo.bundle.terms.landmark import HostPixel, SlotTerm
+from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm, node_residuals
+from vggtgeo.bundle.terms.term import AbstractTerm, robust_energy
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Cameras
 
@@ -88,19 +88,26 @@ def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
 
 
 def _without_edges(problem: Problem, state: State) -> Float[Array, ""]:
-    cameras, poses = cameras_of(problem, state), state.poses.wxyz_xyz
     total = jnp.zeros((), state.inverse_depth.dtype)
-    for slot in problem.slot_terms:
-        total += robust_energy(slot.kernel, slot.weights, slot.residuals(state.inverse_depth))
-    for pixel, offset in pixel_observations(problem, state):
-        total += robust_energy(pixel.kernel, pixel.weights, pixel.residuals(offset))
-    for node in problem.node_terms:
-        total += robust_energy(node.kernel, node.weights, node_residuals(node, poses, cameras))
-    for own in problem.camera_terms:
-        total += robust_energy(own.kernel, own.weights, own.residuals(state.parameters))
-    for dense in problem.dense_terms:
-        total += robust_energy(dense.kernel, dense.weights, dense.residual(state.poses, state.parameters))
+    pixels = [term for term, _ in pixel_observations(problem, state)]
+    for term in (*problem.slot_terms, *pixels, *problem.node_terms, *problem.camera_terms, *problem.dense_terms):
+        total += robust_energy(term.kernel, term.weights, residuals_without_edges(problem, term, state))
     return total
+
+
+def residuals_without_edges(problem: Problem, term: AbstractTerm, state: State) -> Float[Array, "m *observations"]:
+    """Return the residuals of a term on no edge, the residual's own axis first."""
+    if isinstance(term, SlotTerm):
+        return term.residuals(state.inverse_depth)
+    if isinstance(term, HostPixel):
+        assert state.pixel_offset is not None  # ensured by `check_pair`
+        return term.residuals(state.pixel_offset)
+    if isinstance(term, CameraTerm):
+        return term.residuals(state.parameters)
+    if isinstance(term, DenseTerm):
+        return term.residual(state.poses, state.parameters)
+    assert isinstance(term, NodeTerm)
+    return node_residuals(term, state.poses.wxyz_xyz, cameras_of(problem, state))
 
 
 def pixel_observations(problem: Problem, state: State) -> list[tuple[HostPixel, Float[Array, "h p 2"]]]:
@@ -124,7 +131,7 @@ class Hosts(NamedTuple):
     """Data of each row of landmarks for the loops over edges, slots last; computed once for all edges."""
 
     pixels: Float[Array, "h 2 s"]
-    rays: tuple[Float[Array, "h s"], Float[Array, "h s"]] | any_camera.Rays
+    rays: tuple[Float[Array, "h s"], Float[Array, "h s"]] | camera_derivatives.Rays
     """Of a pinhole that all keyframes share; of other cameras with derivatives."""
     inverse_depth: Float[Array, "h s"]
     offset: Float[Array, "h p 2"] | None
@@ -138,7 +145,7 @@ def _hosts_of(problem: Problem, state: State) -> Hosts:
         pixels = pixels.at[:, : state.pixel_offset.shape[1]].add(state.pixel_offset)
     slots_last, known = jnp.swapaxes(pixels, 1, 2), pinhole_parameters(cameras)
     if known is None:
-        rays = any_camera.rays_of(cameras.kind, cameras.of_all(problem.host_of_row), slots_last)
+        rays = camera_derivatives.rays_of(cameras.kind, cameras.of_all(problem.host_of_row), slots_last)
         return Hosts(slots_last, rays, state.inverse_depth, state.pixel_offset)
     fx, fy, cx, cy = known
     rays_x, rays_y = (pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy
@@ -190,10 +197,10 @@ def _view_of(cameras: Cameras, hosts: Hosts, edge: Edge) -> EdgeView:
     free = 0 if hosts.offset is None else hosts.offset.shape[1]
     motions = edge.rotation, edge.translation
     seen = edge.relative, *motions, cameras, edge.ends, own.pixels, own.inverse_depth
-    if isinstance(own.rays, any_camera.Rays):
+    if isinstance(own.rays, camera_derivatives.Rays):
         target = cameras.of(edge.ends[1])
-        return EdgeView(*seen, any_camera.project(target, own.rays, own.inverse_depth, *motions), free)
+        return EdgeView(*seen, camera_derivatives.project(target, own.rays, own.inverse_depth, *motions), free)
     known = pinhole_parameters(cameras)
     assert known is not None
-    one = pinhole.OneEdge(known, *motions)
-    return EdgeView(*seen, (one, pinhole.project(own.rays[0], own.rays[1], own.inverse_depth, one)), free)
+    one = pinhole_derivatives.OneEdge(known, *motions)
+    return EdgeView(*seen, (one, pinhole_derivatives.project(own.rays[0], own.rays[1], own.inverse_depth, one)), free)

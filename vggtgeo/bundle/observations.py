@@ -109,33 +109,21 @@ class Observations:
         if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or len(np.unique(chosen)) < len(chosen):
             raise InputError(f"`keyframes` must be a list of distinct whole numbers, got {chosen.tolist()!r:.60}")
         ends, host = np.asarray(self.edges), np.asarray(self.host)
-        inside = np.all(np.isin(ends, chosen), axis=1)
-        hosted = np.isin(host, chosen)
+        inside, hosted = np.all(np.isin(ends, chosen), axis=1), np.isin(host, chosen)
         place = np.zeros(1 + max(chosen.max(initial=0), ends.max(initial=0), host.max(initial=0)), int)
         place[chosen] = np.arange(len(chosen))
+        kept = {"edges": place[ends[inside]], "host": place[host[hosted]]}
+        for name in ("pixel", "depth_mean", "depth_sigma", "depth_weight", "pixel_sigma", "segment"):
+            if np.ndim(getattr(self, name)):
+                kept[name] = np.asarray(getattr(self, name))[hosted]
         edge, landmark = np.cumsum(inside) - 1, np.cumsum(hosted) - 1
-        points, lines = inside[np.asarray(self.point_edge, int)], inside[np.asarray(self.line_edge, int)]
-        of_landmarks = ("pixel", "depth_mean", "depth_sigma", "depth_weight", "segment")
-        chosen_of = {
-            **dict.fromkeys(of_landmarks, hosted),
-            **dict.fromkeys(("point_target", "point_weight"), points),
-            **dict.fromkeys(("line_coefficients", "line_weight"), lines),
-        }
-        kept = {
-            name: np.asarray(value)[rows]
-            for name, rows in chosen_of.items()
-            if (value := getattr(self, name)) is not None
-        }
-        return dataclasses.replace(
-            self,
-            edges=place[ends[inside]],
-            host=place[host[hosted]],
-            point_edge=edge[np.asarray(self.point_edge, int)[points]],
-            point_landmark=landmark[np.asarray(self.point_landmark, int)[points]],
-            line_edge=edge[np.asarray(self.line_edge, int)[lines]],
-            line_landmark=landmark[np.asarray(self.line_landmark, int)[lines]],
-            **kept,
-        )
+        for kind, data in (("point", "target"), ("line", "coefficients")):
+            rows = inside[np.asarray(getattr(self, f"{kind}_edge"), int)]
+            of_kind = lambda name, kind=kind, rows=rows: np.asarray(getattr(self, f"{kind}_{name}"))[rows]
+            kept |= {f"{kind}_{name}": of_kind(name) for name in (data, "weight")}
+            kept[f"{kind}_edge"] = edge[of_kind("edge").astype(int)]
+            kept[f"{kind}_landmark"] = landmark[of_kind("landmark").astype(int)]
+        return dataclasses.replace(self, **kept)
 
 
 @dataclass(frozen=True)

@@ -19,19 +19,19 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
-from vggtgeo.bundle.intrinsics import CheckedIntrinsics, Intrinsics, checked_intrinsics
-from vggtgeo.bundle.observations import FlatTerm, Observations
-from vggtgeo.bundle.packing_checks import (
-    as_poses,
+from vggtgeo.bundle.checks import (
     check_dtype,
     check_fixed,
     check_kernel,
     check_observations,
+    check_observed,
+    check_poses,
     check_positive,
-    check_resolution,
     check_size,
     check_terms,
 )
+from vggtgeo.bundle.intrinsics import Intrinsics
+from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.padding import (
     COUNTED,
     GivenTerm,
@@ -42,15 +42,11 @@ from vggtgeo.bundle.padding import (
     pad_edges,
     rows_of_keyframes,
 )
-from vggtgeo.bundle.pair_checks import check_observed
 from vggtgeo.bundle.problem import Edges, Problem, State
-from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.edge import EdgeTerm
-from vggtgeo.bundle.terms.host_pixel import HostPixel
 from vggtgeo.bundle.terms.image import LineTerm, PointTerm
-from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.node import DenseTerm
-from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.landmark import DepthPrior, HostPixel, SlotTerm
+from vggtgeo.bundle.terms.node import DenseTerm, IntrinsicsPrior
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.io.errors import InputError
@@ -88,8 +84,8 @@ def pack(
         InputError: an array of a wrong shape, an index out of range, a duplicate match, a landmark with both points
             and lines, an observation along an edge that does not start at the landmark's host, an inverse depth, focal
             length or standard deviation that is not positive, weights that are negative or NaN, lines that are not
-            normalised, a duplicate edge or one from a keyframe to itself, an invalid kernel, a size that is too small,
-            all weights zero, or positions so far from the origin that the precision is too low for most of the matches.
+            normalised, a duplicate edge or one from a keyframe to itself, an invalid kernel, a size that is too
+            small, or all weights zero.
 
     Example:
         >>> import vggtgeo as vg
@@ -104,19 +100,17 @@ def pack(
     check_dtype(dtype)
     check_kind("observations", observations, Observations, "`vggtgeo.Observations`")
     check_kind("size", size, PaddedSize | None, "a `vggtgeo.PaddedSize`")
-    observations, poses = as_arrays(observations), as_poses(poses)
+    observations, poses = _as_arrays(observations), check_poses(poses)
     inverse_depth = real_numbers("inverse_depth", inverse_depth)
-    check_kernel("kernel", observations.kernel)
-    check_observations(observations, poses)
+    check_observations(observations, len(poses))
     check_positive("inverse_depth", inverse_depth, len(observations.host))
-    cameras = checked_intrinsics(intrinsics, len(poses))
+    cameras = intrinsics if isinstance(intrinsics, Intrinsics) else Intrinsics(real_numbers("intrinsics", intrinsics))
+    cameras = cameras.checked(len(poses))
     terms = check_terms(terms, observations, len(poses))
-    check_resolution(observations, poses, cameras.focal(len(poses)), inverse_depth, dtype)
+    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
     size, graph, host, index = _layout(observations, len(poses), size)
     padding, camera_of = size.keyframes - len(poses), cameras.camera_of
-    fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
-    kernel = observations.kernel or Cauchy(jnp.asarray(1.5, dtype))
-    seen = _seen(observations, index, size, kernel, dtype)
+    seen = _seen(observations, index, size, dtype)
     problem = Problem(
         pixels=_per_slot(index, observations.pixel, 0.0, dtype),
         edges=graph,
@@ -127,9 +121,10 @@ def pack(
         host=host,
         camera=cameras.model,
     )
-    problem = _of_type(problem, dtype)
+    # All floats of one strong type, so that `Huber(1.5)` and a kernel from a file share a compilation.
+    cast = lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf
+    problem = jax.tree.map(cast, problem)
     check_observed(problem)
-    offset = jnp.zeros((index.shape[0], size.points, 2), dtype) if problem.pixel_terms else None
     # Empty slots get a positive depth: residuals may divide by it or take its logarithm.
     depths = _per_slot(index, inverse_depth, 1.0, dtype)
     if observations.segment is not None:
@@ -138,15 +133,11 @@ def pack(
     # Padding keyframes are fixed and unobserved, but a quaternion of length zero would be NaN when normalised.
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
     start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
+    offset = jnp.zeros((index.shape[0], size.points, 2), dtype) if problem.pixel_terms else None
     return problem, State(start, jnp.asarray(cameras.values, dtype), depths, offset), index
 
 
-def _of_type(problem: Problem, dtype: DTypeLike) -> Problem:
-    """Cast all floats to one strong type, so that `Huber(1.5)` and a kernel from a file share a compilation."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, problem)
-
-
-def as_arrays(observations: Observations) -> Observations:
+def _as_arrays(observations: Observations) -> Observations:
     """Return the same observations with lists converted to arrays."""
     names = [field.name for field in fields(observations) if field.name not in ("alpha", "kernel")]
     given = {name: getattr(observations, name) for name in names}
@@ -164,25 +155,28 @@ def _layout(
     check_size(size, needed)
     rows = rows_of_keyframes(slots, size)
     order = np.argsort(observations.edges[:, 0], kind="stable")
-    stored = pad_edges(observations.edges[order], size, rows)
+    stored, position, step = pad_edges(observations.edges[order], size, rows)
     # At least 1, since a kind without slots has no landmark to divide for.
     length = np.where(slots.is_line, max(size.lines, 1), max(size.points, 1))
     part, within = (np.zeros_like(slots.within), slots.within) if size.rows is None else np.divmod(slots.within, length)
     slot = np.where(slots.is_line, size.points + within, within)
     row = (np.cumsum(rows) - rows)[observations.host] + part
-    shape = (int(rows.sum()), len(stored.edges.source), size.points + size.lines)
+    shape = (int(rows.sum()), len(stored.source), size.points + size.lines)
     place = np.argsort(order)  # of each edge among the sorted ones
     if size.rows is None:
-        return size, stored.edges, None, SlotIndex(row, slot, stored.position[place], shape)
+        return size, stored, None, SlotIndex(row, slot, position[place], shape)
     host = jnp.asarray(np.repeat(np.arange(size.keyframes), rows), jnp.int32)
-    return size, stored.edges, host, SlotIndex(row, slot, stored.position[place], shape, part, stored.step[place])
+    return size, stored, host, SlotIndex(row, slot, position[place], shape, part, step[place])
 
 
-def _seen(
-    observations: Observations, index: SlotIndex, size: PaddedSize, kernel: AbstractKernel, dtype: DTypeLike
-) -> tuple[AbstractTerm, ...]:
+def _seen(observations: Observations, index: SlotIndex, size: PaddedSize, dtype: DTypeLike) -> tuple[AbstractTerm, ...]:
     """Return the terms of `Observations`: points, lines, depths and host pixels."""
     seen, every = observations, np.arange(len(observations.host))
+    kernel = seen.kernel
+    if kernel is None:
+        kernel = Cauchy(jnp.asarray(1.5, dtype))
+    else:
+        check_kernel("kernel", kernel)
     points = {"target": seen.point_target.astype(float), "weight": seen.point_weight, "kernel": kernel}
     lines = {"coefficients": seen.line_coefficients.astype(float), "weight": seen.line_weight, "kernel": kernel}
     end = size.points + size.lines
@@ -200,10 +194,9 @@ def _seen(
     return (*terms, _placed(pixels, index, (0, size.points), dtype))
 
 
-def _intrinsics_prior(cameras: CheckedIntrinsics, dtype: DTypeLike) -> IntrinsicsPrior:
-    mean, sigma = cameras.prior_mean, cameras.prior_sigma
-    known = 0.0 if sigma is None else _weight_of(sigma)
-    weight = np.broadcast_to(known, mean.shape)
+def _intrinsics_prior(cameras: Intrinsics, dtype: DTypeLike) -> IntrinsicsPrior:
+    mean = np.asarray(cameras.prior_mean)
+    weight = np.broadcast_to(_weight_of(np.asarray(cameras.prior_sigma)), mean.shape)
     return IntrinsicsPrior(
         index=jnp.arange(mean.size), mean=jnp.asarray(mean.ravel(), dtype), weight=jnp.asarray(weight.ravel(), dtype)
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +23,13 @@ from vggtgeo.bundle.problem import Edges
 from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.line_segments import segment_slots
+from vggtgeo.geometry.line_segments import numbered, segment_slots
 from vggtgeo.io.errors import InputError
 
 GivenTerm = AbstractTerm | FlatTerm
 """A term as an argument of `pack`."""
+_Places = tuple[np.ndarray, np.ndarray]
+"""Row and column of each value in a padded array."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,8 @@ class SlotIndex:
     """Positions of flat lists in padded arrays: landmark `i` is at `[host[i], slot[i]]`; for edges see `stored_edge`.
 
     `gather` and `gather_points` read padded arrays in the order of `Observations`. `scatter`, `scatter_points` and
-    `scatter_lines` write values of that order into padded arrays; they are differentiable, so the values may come from
-    a network.
+    `scatter_lines` write values of that order into padded arrays; they are pure and differentiable, so the values may
+    come from a network. An array of a wrong shape is an `InputError`.
 
     Fields:
         host: int [D], row of each landmark: the host keyframe, unless a keyframe has several rows (`Problem.host`).
@@ -137,63 +139,32 @@ class SlotIndex:
             return self.edge[edge]
         return self.edge[edge] + self.part[landmark] * self.step[edge]
 
-    @overload
-    def gather(self, per_slot: np.ndarray) -> np.ndarray: ...
-    @overload
-    def gather(self, per_slot: Array) -> Any: ...
-    def gather(self, per_slot: np.ndarray | Array) -> Any:
+    def _points(self, observations: Observations) -> _Places:
+        """Return stored edge and slot of each point match."""
+        landmark = observations.point_landmark
+        return self.stored_edge(observations.point_edge, landmark), self.slot[landmark]
+
+    def gather(self, per_slot: ArrayLike) -> Any:
         """Return values of the landmarks, `[D, ...]`, from an array `[h, s, ...]`.
 
         The result is a NumPy array, or a JAX array if `per_slot` is traced (`jit`, `vmap`, `grad`).
-
-        Raises:
-            InputError: `per_slot` has another shape.
-
         """
-        found = per_slot if isinstance(per_slot, jax.core.Tracer) else np.asarray(per_slot)
-        rows, _, slots = self.shape
-        if found.shape[:2] != (rows, slots):
-            raise InputError(
-                f"`per_slot` must have shape ({rows}, {slots}, ...), got {found.shape}: a value for each slot of each "
-                "row, such as `state.inverse_depth`"
-            )
-        return found[self.host, self.slot]
+        return _gathered("per_slot", per_slot, (self.host, self.slot), self.shape[0])
 
-    @overload
-    def gather_points(self, per_match: np.ndarray, observations: Observations) -> np.ndarray: ...
-    @overload
-    def gather_points(self, per_match: Array, observations: Observations) -> Any: ...
-    def gather_points(self, per_match: np.ndarray | Array, observations: Observations) -> Any:
+    def gather_points(self, per_match: ArrayLike, observations: Observations) -> Any:
         """Return values of the point matches, `[A, ...]`, in the order of `observations`, from an array `[e, p, ...]`.
 
         Works under `jit` like `gather`.
-
-        Raises:
-            InputError: `per_match` has another shape.
-
         """
-        found = per_match if isinstance(per_match, jax.core.Tracer) else np.asarray(per_match)
-        _, edges, slots = self.shape
-        if found.ndim < 2 or found.shape[0] != edges or found.shape[1] > slots:
-            raise InputError(
-                f"`per_match` must have shape ({edges}, at most {slots}, ...), got {found.shape}: a value for each "
-                "point of each edge, such as `problem.points.weight`"
-            )
-        landmark = observations.point_landmark
-        return found[self.stored_edge(observations.point_edge, landmark), self.slot[landmark]]
+        return _gathered("per_match", per_match, self._points(observations), self.shape[1])
 
     def scatter(self, values: ArrayLike, into: ArrayLike) -> Array:
         """Write values of the landmarks to their slots in `into`: the inverse of `gather`.
-
-        Pure: works under `jit`, `vmap` and `grad`.
 
         Args:
             values: [D, ...], in the order of `Observations.host`.
             into: [n, s, ...], such as `initial.inverse_depth` or `problem.depth.weight`; it determines shape and
                 precision. Empty slots keep its values.
-
-        Raises:
-            InputError: an array has a wrong shape.
 
         """
         return _scattered(values, into, (self.host, self.slot), self.shape[0])
@@ -201,21 +172,14 @@ class SlotIndex:
     def scatter_points(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
         """Write values of the point matches to their slots in `into`: the inverse of `gather_points`.
 
-        Pure: works under `jit`, `vmap` and `grad`.
-
         Args:
             values: [A, ...], in the order of `observations`.
             observations: the packed observations.
             into: [e, p, ...], such as `problem.points.weight` or `problem.points.target`; it determines shape and
                 precision. Slots without a match keep its values, so that a weight of 0 stays 0.
 
-        Raises:
-            InputError: an array has a wrong shape.
-
         """
-        landmark = observations.point_landmark
-        where = (self.stored_edge(observations.point_edge, landmark), self.slot[landmark])
-        return _scattered(values, into, where, self.shape[1])
+        return _scattered(values, into, self._points(observations), self.shape[1])
 
     def scatter_lines(self, values: ArrayLike, observations: Observations, into: ArrayLike) -> Array:
         """Write values of the line samples to their slots in `into`, like `scatter_points`.
@@ -225,9 +189,6 @@ class SlotIndex:
             observations: the packed observations.
             into: [e, l, ...], such as `problem.lines.weight` or `problem.lines.coefficients`.
 
-        Raises:
-            InputError: an array has a wrong shape.
-
         """
         first = self.shape[2] - (np.shape(into)[1] if np.ndim(into) > 1 else 0)  # the slots of lines come last
         landmark = observations.line_landmark
@@ -235,20 +196,29 @@ class SlotIndex:
         return _scattered(values, into, where, self.shape[1])
 
 
-def _scattered(values: ArrayLike, into: ArrayLike, where: tuple[np.ndarray, np.ndarray], rows: int) -> Array:
-    """Return `into` with each value at its row and column."""
-    given, whole, column = jnp.asarray(values), jnp.asarray(into), where[1]
-    room = whole.ndim > 1 and whole.shape[0] == rows
-    if not room or (column.size and not 0 <= column.min() <= column.max() < whole.shape[1]):
+def _check_room(name: str, array: Any, where: _Places, rows: int) -> None:
+    """Check that an array has the rows of a problem, and the columns of all places."""
+    column = where[1]
+    room = array.ndim > 1 and array.shape[0] == rows
+    if not room or (column.size and not 0 <= column.min() <= column.max() < array.shape[1]):
         raise InputError(
-            f"`into` must have shape ({rows}, slots, ...), got {whole.shape}: an array of the problem packed with this "
-            "index, such as the `weight` of the term"
+            f"`{name}` must have shape ({rows}, slots, ...), got {array.shape}: an array of the problem packed with "
+            "this index, such as the `weight` of the term"
         )
-    if given.shape != (len(column), *whole.shape[2:]):
-        raise InputError(
-            f"`values` must have shape {(len(column), *whole.shape[2:])}, got {given.shape}: a row an observation, in "
-            "the order of the arguments of `pack`"
-        )
+
+
+def _gathered(name: str, values: ArrayLike, where: _Places, rows: int) -> Any:
+    found = values if isinstance(values, jax.core.Tracer) else np.asarray(values)
+    _check_room(name, found, where, rows)
+    return found[where]
+
+
+def _scattered(values: ArrayLike, into: ArrayLike, where: _Places, rows: int) -> Array:
+    given, whole = jnp.asarray(values), jnp.asarray(into)
+    _check_room("into", whole, where, rows)
+    wanted = (len(where[1]), *whole.shape[2:])
+    if given.shape != wanted:
+        raise InputError(f"`values` must have shape {wanted}, a row an observation, got {given.shape}")
     # `pack` has checked that landmarks and matches are distinct, so XLA need not order the writes.
     return whole.at[where].set(given.astype(whole.dtype), unique_indices=True)
 
@@ -280,15 +250,15 @@ def count_slots(observations: Observations, keyframes: int, samples: int | None 
         )
     host = np.asarray(observations.host)
     within = np.zeros(len(host), int)
-    within[~is_line], points = _numbered(host[~is_line], keyframes)
+    within[~is_line], within[is_line] = numbered(host[~is_line]), numbered(host[is_line])
+    points, lines = (np.bincount(host[kind], minlength=keyframes) for kind in (~is_line, is_line))
     if observations.segment is None:
-        within[is_line], lines = _numbered(host[is_line], keyframes)
         return Slots(is_line, within, points, lines, None)
-    found = segment_slots(host[is_line], np.asarray(observations.segment)[is_line])
-    samples = max(samples or 0, found.samples, 1)
-    within[is_line] = samples * found.rank + found.position
+    rank, position = segment_slots(host[is_line], np.asarray(observations.segment)[is_line])
+    samples = max(samples or 0, int(position.max(initial=-1)) + 1, 1)
+    within[is_line] = samples * rank + position
     lines = np.zeros(keyframes, int)
-    np.maximum.at(lines, host[is_line], samples * (found.rank + 1))
+    np.maximum.at(lines, host[is_line], samples * (rank + 1))
     return Slots(is_line, within, points, lines, samples)
 
 
@@ -342,25 +312,11 @@ def _shares(count: int) -> list[int]:
     return np.unique(-(-count // np.arange(1, max(count, 1) + 1)))[::-1].tolist()
 
 
-def _numbered(host: np.ndarray, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position of each landmark among those of its host, and the count of each keyframe."""
-    order = np.argsort(host, kind="stable")
-    starts = np.searchsorted(host[order], np.arange(keyframes))
-    within = np.empty(len(host), int)
-    within[order] = np.arange(len(host)) - starts[host[order]]
-    return within, np.bincount(host, minlength=keyframes)
+def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> tuple[Edges, np.ndarray, np.ndarray]:
+    """Store sorted edges once for each row of their hosts; `rows [n]` is the number of rows of each keyframe.
 
-
-class StoredEdges(NamedTuple):
-    """The graph, the position of each sorted edge at the first row of its host, and the step to the next row."""
-
-    edges: Edges
-    position: np.ndarray
-    step: np.ndarray
-
-
-def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEdges:
-    """Store sorted edges once for each row of their hosts; `rows [n]` is the number of rows of each keyframe."""
+    Returns the graph, the position of each sorted edge at the first row of its host, and the step to the next row.
+    """
     source, target = edges[:, 0], edges[:, 1]
     host = np.repeat(np.arange(size.keyframes), rows)
     rank = np.arange(len(edges)) - np.searchsorted(source, np.arange(size.keyframes))[source]
@@ -384,4 +340,4 @@ def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> StoredEd
     of_host[row, index] = np.arange(len(row))
     arrays = (jnp.asarray(array, jnp.int32) for array in (host[row], ends, index, of_host))
     own = None if size.rows is None else jnp.asarray(row, jnp.int32)
-    return StoredEdges(replace(Edges(*arrays), row_of=own), position, step)
+    return replace(Edges(*arrays), row_of=own), position, step

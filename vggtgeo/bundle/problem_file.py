@@ -15,14 +15,15 @@ import jaxlie
 import numpy as np
 from jax.dtypes import canonicalize_dtype
 from jax.typing import DTypeLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.bundle import terms as term_package
+from vggtgeo.bundle.checks import check_dtype, check_kinds
 from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
-from vggtgeo.bundle.packing_checks import check_dtype
 from vggtgeo.bundle.padding import SlotIndex
-from vggtgeo.bundle.pair_checks import check_connected, check_kinds
 from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import camera_models as cameras
@@ -115,8 +116,8 @@ def load_problem(
         kernel = Huber(jnp.asarray(float(arrays["huber"]), dtype))
         seen = dataclasses.replace(observations, kernel=kernel)
         packed = pack(seen, arrays["T_init"], intrinsics, arrays["d_init"], dtype=dtype)
-        check_connected(observations, len(arrays["T_init"]))
-    except InputError as error:
+        _check_connected(observations, len(arrays["T_init"]))
+    except ValueError as error:
         raise InputError(f"`{path}`: {error}") from error
     return packed
 
@@ -248,3 +249,20 @@ def _check_flat(path: Path, found: Mapping[str, ArrayHeader]) -> None:
                 f"array `{name}` of `{path}` must be {words} of shape {expected}, got {header.dtype} {header.shape}; "
                 "see docs/reference/problem-file.md"
             )
+
+
+def _check_connected(observations: Observations, keyframes: int) -> None:
+    """Raise InputError unless matches of positive weight connect all keyframes; others would not be determined."""
+    used = [
+        observations.point_edge[observations.point_weight > 0],
+        observations.line_edge[observations.line_weight > 0],
+    ]
+    pairs = observations.edges[np.unique(np.concatenate(used))]
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(keyframes, keyframes))
+    _, component = connected_components(graph, directed=False)
+    loose = np.flatnonzero(component != component[0])
+    if len(loose):
+        raise InputError(
+            f"keyframe {loose[0]} is not connected to keyframe 0 by matches of positive weight ({len(loose)} of "
+            f"{keyframes} keyframes are not): remove them, or solve each connected component separately"
+        )

@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, prepared
-from vggtgeo.bundle.pair_checks import check_kinds, check_pair
+from vggtgeo.bundle.checks import check_kinds, check_pair
+from vggtgeo.bundle.objective import Edge, edge_views, prepared, residuals_without_edges
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.readable import Readable
-from vggtgeo.bundle.terms.host_pixel import HostPixel
-from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm, node_residuals
-from vggtgeo.bundle.terms.slot import SlotTerm
+from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.node import DenseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.compilation.program_cache import CachedProgram
 
@@ -121,18 +120,8 @@ def _residuals_jit(problem: Problem, state: State) -> dict[str, Float[Array, "..
 
 def term_residuals(problem: Problem, term: AbstractTerm, state: State) -> Float[Array, "m *observations"]:
     """Return the residuals of one term of a prepared problem, the residual's own axis first."""
-    cameras = cameras_of(problem, state)
-    if isinstance(term, SlotTerm):
-        return term.residuals(state.inverse_depth)
-    if isinstance(term, HostPixel):
-        assert state.pixel_offset is not None  # ensured by `check_pair`
-        return term.residuals(state.pixel_offset)
-    if isinstance(term, NodeTerm):
-        return node_residuals(term, state.poses.wxyz_xyz, cameras)
-    if isinstance(term, CameraTerm):
-        return term.residuals(state.parameters)
-    if isinstance(term, DenseTerm):
-        return term.residual(state.poses, state.parameters)
+    if not isinstance(term, EdgeTerm):
+        return residuals_without_edges(problem, term, state)
     alone = problem.with_terms((term,))
     if not alone.edge_terms:
         return jnp.zeros((1, *term.weight.shape), state.inverse_depth.dtype)

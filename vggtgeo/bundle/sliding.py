@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
+from vggtgeo.bundle.checks import check_pair
 from vggtgeo.bundle.marginalisation import marginalise, permute_prior
-from vggtgeo.bundle.pair_checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError
@@ -98,14 +98,9 @@ def _extrapolated(poses: Float[Array, "n 7"]) -> Float[Array, "7"]:
 def _check_alike(problem: Problem, following: Problem) -> None:
     if problem.num_keyframes < 2:
         raise InputError("`problem` must have at least 2 keyframes, got 1")
-    if following.num_keyframes != problem.num_keyframes or following.fixed_intrinsics.shape != (
-        problem.fixed_intrinsics.shape
-    ):
-        found, wanted = (
-            f"{window.num_keyframes} keyframes and parameters of cameras of shape {window.fixed_intrinsics.shape}"
-            for window in (following, problem)
-        )
+    wanted, found = ((window.num_keyframes, window.fixed_intrinsics.shape) for window in (problem, following))
+    if found != wanted:
         raise InputError(
-            f"`next_problem` must have {wanted}, as `problem`, got {found}: "
-            "pack all windows to one shape with `vggtgeo.batches.pack_batch`"
+            f"`next_problem` must have the numbers of keyframes and camera parameters of `problem`, {wanted}, got "
+            f"{found}: pack all windows to one shape with `vggtgeo.batches.pack_batch`"
         )

@@ -12,14 +12,13 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
+from vggtgeo.bundle.checks import check_observed, check_pair
 from vggtgeo.bundle.diagnosis import MAJORITY, Diagnosis, diagnose, diagnosis_like
 from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.pair_checks import check_observed, check_pair
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.readable import Readable
 from vggtgeo.bundle.solver_choice import default_solver
-from vggtgeo.io.errors import InputError
 from vggtgeo.io.given import check_kind
 from vggtgeo.solvers.adjoint import ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import (
@@ -141,8 +140,8 @@ def solve(
             thirds of the time.
 
     Raises:
-        InputError: `initial` has another size or precision; `adjoint` is an `optimistix.ImplicitAdjoint`; or there is
-            no observation (not checked if traced; such a problem converges at the initial state).
+        InputError: `initial` has another size or precision, an argument is of another type, or there is no observation
+            (not checked if traced; such a problem converges at the initial state).
 
     Example:
         >>> import jax, vggtgeo as vg
@@ -154,25 +153,14 @@ def solve(
     """
     check_pair(problem, initial, "initial")
     check_kind("solver", solver, SchurLevenbergMarquardt | None, "a `vggtgeo.SchurLevenbergMarquardt`")
-    check_kind("adjoint", adjoint, optx.AbstractAdjoint | None, "a `vggtgeo.ArrowAdjoint`")
+    kinds = ArrowAdjoint | optx.RecursiveCheckpointAdjoint | None
+    check_kind("adjoint", adjoint, kinds, "`vggtgeo.ArrowAdjoint()` or `optimistix.RecursiveCheckpointAdjoint()`")
     check_kind("graduation", graduation, Graduation | None, "a `vggtgeo.Graduation`")
     check_observed(problem)
     solver = default_solver(problem) if solver is None else solver
-    adjoint = ArrowAdjoint() if adjoint is None else adjoint
-    return _solve_jit(problem, initial, _differentiable_by(adjoint, solver), adjoint, graduation, diagnosis)
-
-
-def _differentiable_by(adjoint: optx.AbstractAdjoint, solver: SchurLevenbergMarquardt) -> SchurLevenbergMarquardt:
-    """Return the solver with the loop that the adjoint needs."""
-    if isinstance(adjoint, optx.ImplicitAdjoint):
-        raise InputError(
-            "`adjoint` must be `vggtgeo.ArrowAdjoint()` (implicit differentiation with the exact Hessian; the default) "
-            "or `optimistix.RecursiveCheckpointAdjoint()` (the iterates), got `optimistix.ImplicitAdjoint`, which "
-            "needs a residual function"
-        )
     if isinstance(adjoint, optx.RecursiveCheckpointAdjoint):
-        return dataclasses.replace(solver, differentiable_loop=True)
-    return solver
+        solver = dataclasses.replace(solver, differentiable_loop=True)
+    return _solve_jit(problem, initial, solver, adjoint or ArrowAdjoint(), graduation, diagnosis)
 
 
 @eqx.filter_jit  # without `jit`, JAX would compile every operation of the derivative separately
@@ -209,6 +197,7 @@ def _solve_jit(
     if faults is not None:
         beyond = jnp.any(faults.unresolved > MAJORITY)
         termination = codes.where(beyond, codes.beyond_precision, termination)
+    alone = fixed[2].inverse_depth[:, : problem.first_segment]
     return Solution(
         state=found.value,
         energy=_energy_at(last.energy, BundleAdjustment(problem), found.value),
@@ -219,7 +208,7 @@ def _solve_jit(
         termination=termination,
         polished=last.polished,
         gradient_residual=last.gradient_residual,
-        at_bound=_at_bound(problem, fixed[2]),
+        at_bound=jnp.sum(alone <= MIN_INVERSE_DEPTH) if problem.positive_depth else jnp.asarray(0),
         diagnosis=faults,
         record=last.record,
     )
@@ -269,9 +258,3 @@ def solution_like(
         diagnosis=diagnosis_like(problem) if diagnosis else None,
         record=IterationRecord(tries, tries, tries, moved) if solver.record_iterations else None,
     )
-
-
-def _at_bound(problem: Problem, state: State) -> Int[Array, ""]:
-    if not problem.positive_depth:
-        return jnp.asarray(0)
-    return jnp.sum(state.inverse_depth[:, : problem.first_segment] <= MIN_INVERSE_DEPTH)

@@ -24,7 +24,7 @@ from vggtgeo.io.given import check_kind
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 DENSE_LIMIT = 40
 """Number of keyframes up to which a dense factor costs no more than the linearisation."""
@@ -124,7 +124,8 @@ def narrow_order(nodes: int, ends: np.ndarray) -> np.ndarray:
 
     """
     graph = _adjacency(nodes, ends)
-    tried = [np.arange(nodes), _cuthill_mckee(graph), *_spectral(graph)]
+    folded = _places(csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True))
+    tried = [np.arange(nodes), folded, *_spectral(graph)]
     # `min` keeps the first of equals, so the order of time stays unless another is narrower.
     return min(tried, key=lambda place: longest(place, ends))
 
@@ -140,10 +141,6 @@ def _adjacency(nodes: int, ends: np.ndarray) -> sp.csr_matrix:
     graph = sp.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(nodes, nodes))
     graph.data[:] = 1.0  # duplicate edges count once
     return graph
-
-
-def _cuthill_mckee(graph: sp.csr_matrix) -> np.ndarray:
-    return _places(csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True))
 
 
 def _spectral(graph: sp.csr_matrix) -> list[np.ndarray]:

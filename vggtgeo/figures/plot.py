@@ -11,7 +11,7 @@ from matplotlib.patches import Ellipse
 
 from vggtgeo.bundle.analysis.covariances import Covariances
 from vggtgeo.bundle.analysis.observability_report import WEAK, Observability, lost_shares
-from vggtgeo.bundle.pair_checks import check_finite
+from vggtgeo.bundle.checks import check_finite
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.solution import Solution
 from vggtgeo.evaluation import TrajectoryReport, associate

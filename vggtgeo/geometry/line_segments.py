@@ -6,7 +6,6 @@ unknowns instead of having one each (see `solvers/segments.py`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,26 +13,23 @@ import numpy as np
 from vggtgeo.io.errors import InputError
 
 
-@dataclass(frozen=True)
-class SegmentSlots:
-    """Slots of the line samples of a problem: `slot = samples * rank + position`."""
-
-    rank: np.ndarray
-    """int `[B]`: number of the sample's segment among those of its host."""
-    position: np.ndarray
-    """int `[B]`: number of the sample on its segment."""
-    segments: int
-    """Most segments of one host."""
-    samples: int
-    """Most samples of one segment."""
+def numbered(group: np.ndarray) -> np.ndarray:
+    """Return the number of each element among those of its group, in the given order."""
+    order = np.argsort(group, kind="stable")
+    number = np.empty(len(group), int)
+    number[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order])
+    return number
 
 
-def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
-    """Number the samples of each segment, and the segments of each host, in the given order.
+def segment_slots(host: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number the segments of each host, and the samples of each segment, in the given order.
 
     Args:
         host: int `[B]`, keyframe of each line sample.
         segment: int `[B]`, its segment; a number belongs to one host.
+
+    Returns:
+        int `[B]`, number of the sample's segment among those of its host, and of the sample on its segment.
 
     Raises:
         InputError: a sample without a segment, or a segment with samples in two keyframes.
@@ -51,17 +47,10 @@ def segment_slots(host: np.ndarray, segment: np.ndarray) -> SegmentSlots:
         raise InputError(
             f"`segment` {segment[wrong][0]} has samples hosted in two keyframes; number segments by keyframe"
         )
-    owner = host[first]
-    rank = np.zeros(len(first), int)
-    order = np.lexsort((first, owner))
-    starts = np.searchsorted(owner[order], owner[order])
-    rank[order] = np.arange(len(first)) - starts
-    by_segment = np.argsort(inverse, kind="stable")
-    begin = np.searchsorted(inverse[by_segment], inverse[by_segment])
-    position = np.empty(len(segment), int)
-    position[by_segment] = np.arange(len(segment)) - begin
-    most = lambda values: int(values.max(initial=-1)) + 1
-    return SegmentSlots(rank[inverse], position, most(rank), most(position))
+    order = np.argsort(first)
+    rank = np.empty(len(first), int)
+    rank[order] = numbered(host[first][order])
+    return rank[inverse], numbered(inverse)
 
 
 def fractions(pixels: np.ndarray, present: np.ndarray) -> np.ndarray:

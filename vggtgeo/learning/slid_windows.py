@@ -21,7 +21,7 @@ from vggtgeo.bundle.marginalisation import empty_prior
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.sliding import slide
 from vggtgeo.bundle.solution import Solution, solve
-from vggtgeo.bundle.terms.baseline import BaselinePrior
+from vggtgeo.bundle.terms.measured_pose import BaselinePrior
 from vggtgeo.learning.tracked_windows import TrackedWindow
 from vggtgeo.learning.training import GAIN, Batch, log_error, stack
 

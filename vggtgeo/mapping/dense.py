@@ -70,14 +70,15 @@ def check_mode(mode: str) -> None:
 def check_dense(mode: str, measured: bool, source: MetricDepth | None = None) -> None:
     """Raise InputError for an unknown `mode`, or one whose depth is missing. source: the depth role, if known."""
     check_mode(mode)
-    if mode == "network" and isinstance(source, SensorDepth | NoDepth):
+    if mode not in ("sensor", "network"):
+        return
+    sensor = isinstance(source, SensorDepth | NoDepth)
+    if source is not None and sensor != (mode == "sensor"):
         raise InputError(
-            "`dense` is 'network', but the depth role is not a network; choose one (`--depth moge2-small`, or a "
-            "preset), or use 'mvs'"
+            f"`dense` is {mode!r}, but the depth role is `{type(source).__name__}`; choose another one "
+            "(`--depth`, or a preset), or use 'mvs'"
         )
-    if mode == "sensor" and source is not None and not isinstance(source, SensorDepth | NoDepth):
-        raise InputError("`dense` is 'sensor', but the depth role is a network; use 'network' or `--depth classical`")
-    if mode in ("sensor", "network") and not measured:
+    if not measured:
         raise InputError(f"`dense` is {mode!r}, but the frames have no depth; give frames with depth, or use 'mvs'")
 
 

@@ -118,8 +118,6 @@ class SurfaceFusion:
 
         """
         check_kind("keyframes", keyframes, Sequence, "a sequence of keyframes, such as `state.adjusted_keyframes`")
-        for keyframe in keyframes:
-            check_kind("keyframes", keyframe, Keyframe, "a sequence of keyframes, such as `state.adjusted_keyframes`")
         maps = [None] * len(keyframes) if depth_maps is None else depth_maps
         stale: set[Block] = set()
         for number in self._fused.keys() - {keyframe.number for keyframe in keyframes}:

@@ -99,12 +99,12 @@ def _search(points: np.ndarray, photo: Photo, others: Sequence[Photo]) -> DepthM
     position, margin = (np.asarray(value) for value in matched)
     step = float(planes[1] - planes[0])
     inverse = (planes[0] + step * position).astype(np.float32)
-    seen = stereo_depth_sigma(photo, others, inverse, step, WINDOW)
-    good = (seen.views >= 1) & (margin > MIN_MARGIN) & (seen.sigma < MAX_SIGMA * inverse)
+    sigma, views = stereo_depth_sigma(photo, others, inverse, step, WINDOW)
+    good = (views >= 1) & (margin > MIN_MARGIN) & (sigma < MAX_SIGMA * inverse)
     nan = np.float32(np.nan)
     return DepthMap(
         np.where(good, 1.0 / inverse, nan).astype(np.float32),
-        np.where(good, seen.sigma / inverse, nan).astype(np.float32),
+        np.where(good, sigma / inverse, nan).astype(np.float32),
         good.astype(np.float32),
     )
 

@@ -59,7 +59,7 @@ def make_tracks(keyframes: Sequence[Keyframe], pairs: Sequence[Pair], intrinsics
     """
     poses = np.array([keyframe.pose for keyframe in keyframes]).reshape(-1, 4, 4)
     track, view, pixel = _connect(keyframes, pairs)
-    points = np.zeros((int(track.max()) + 1 if len(track) else 0, 3))
+    points = np.zeros((0, 3))
     for _ in range(2):  # with all observations, then without the outliers
         track, view, pixel = _renumber(track, view, pixel)
         points = _triangulate(track, view, pixel, poses, intrinsics)
@@ -68,9 +68,9 @@ def make_tracks(keyframes: Sequence[Keyframe], pairs: Sequence[Pair], intrinsics
             good = (error < MAX_ERROR) & _has_parallax(track, view, poses, points)[track]
         track, view, pixel = track[good], view[good], pixel[good]
     kept, first, row = np.unique(track, return_index=True, return_inverse=True)
-    many = np.bincount(row, minlength=len(kept)) > 1 if len(kept) else np.zeros(0, bool)
-    stays = many[row] if len(kept) else np.zeros(0, bool)
-    colours = _colours(keyframes, view[first[many]], pixel[first[many]]) if len(kept) else np.zeros((0, 3), np.uint8)
+    many = np.bincount(row, minlength=len(kept)) > 1
+    stays = many[row]
+    colours = _colours(keyframes, view[first[many]], pixel[first[many]])
     renumbered = np.cumsum(many) - 1
     return Tracks(points[kept[many]], colours, renumbered[row[stays]], view[stays], pixel[stays])
 

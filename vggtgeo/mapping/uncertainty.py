@@ -17,7 +17,6 @@ belong to either side (`JUMP` times the difference), and of the poses (`POSE` pi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -36,20 +35,10 @@ MAX_BEND = 2.0
 """Steps between planes by which noise bends the surface within half a window; more is a depth edge."""
 
 
-@dataclass(frozen=True, eq=False)
-class Support:
-    """sigma: float32 [H, W], standard deviation of the inverse depth, 1/m. views: int [H, W], number of neighbours
-    whose image contains the pixel's point.
-    """
-
-    sigma: np.ndarray
-    views: np.ndarray
-
-
 def stereo_depth_sigma(
     reference: Photo, others: Sequence[Photo], inverse_depth: np.ndarray, step: float, window: int
-) -> Support:
-    """Return the standard deviation and the number of views of each pixel's inverse depth.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the standard deviation of each pixel's inverse depth, 1/m, and how many neighbours see its point, [H, W].
 
     Args:
         reference: image of the inverse depth.
@@ -87,7 +76,7 @@ def stereo_depth_sigma(
     poses = POSE * views / np.maximum(lever, 1e-9)
     jump = JUMP * np.maximum(_bend(inverse_depth, window // 2) - MAX_BEND * step, 0)
     sigma = np.sqrt(photometric + (GRID * step) ** 2 + (POSITION * slope) ** 2 + jump**2 + poses**2)
-    return Support(sigma.astype(np.float32), views.astype(np.int32))
+    return sigma.astype(np.float32), views.astype(np.int32)
 
 
 def _bend(inverse_depth: np.ndarray, reach: int) -> np.ndarray:

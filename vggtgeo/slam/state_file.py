@@ -13,13 +13,11 @@ import jaxlie
 
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Edges, Problem, State
-from vggtgeo.bundle.terms.baseline import BaselinePrior
-from vggtgeo.bundle.terms.depth import DepthPrior
 from vggtgeo.bundle.terms.image import LineTerm, PointTerm
-from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
+from vggtgeo.bundle.terms.landmark import DepthPrior
 from vggtgeo.bundle.terms.marginal import MarginalPrior
-from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment
-from vggtgeo.bundle.terms.rotation import RotationPrior
+from vggtgeo.bundle.terms.measured_pose import BaselinePrior, RelativePose, RotationPrior, SurfaceAlignment
+from vggtgeo.bundle.terms.node import IntrinsicsPrior
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError

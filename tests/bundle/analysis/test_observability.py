@@ -151,7 +151,7 @@ def test_pure_rotation_by_name(observed: Observe) -> None:
     found = observed(*packed(turned, at_truth=True))
     assert rotation_pairs(found) == [(0, 1), (0, 2), (1, 2)]
     assert "pure rotation" in repr(found)
-    assert "pure rotation: no match between any two keyframes has parallax" in str(found)
+    assert "pure rotation between keyframes: 0 and 1; 0 and 2; 1 and 2" in str(found)
     poses = turned.poses.copy()
     poses[2, 4:] = [0.3, 0.0, 0.0]
     moved = without(scene_of(poses, *random_points(), random_segments()), "line", "depth")

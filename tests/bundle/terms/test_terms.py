@@ -27,8 +27,8 @@ import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import Edge, edge_views, prepared
 from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.measured_pose import quadratic
 from vggtgeo.bundle.terms.node import DenseTerm, node_derivatives, node_residuals
-from vggtgeo.bundle.terms.relative_pose import quadratic
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Cameras
 from vggtgeo.slam.sparse_map.factors import (

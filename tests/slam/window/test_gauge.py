@@ -18,7 +18,7 @@ from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import solve
-from vggtgeo.bundle.terms.relative_pose import RelativePose
+from vggtgeo.bundle.terms.measured_pose import RelativePose
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.small_window import SimulatedWindow, simulate_window
 from vggtgeo.slam.settings.groups import WindowSettings

@@ -10,6 +10,7 @@ variance of the M-estimator, Huber 1964, against `1 / E[rho']`).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -18,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.diagnosis import check_linearisation
+from vggtgeo.bundle.checks import check_finite, check_pair, check_range
+from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_finite
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
-from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.readable import Readable
 from vggtgeo.bundle.residuals import count_rows
@@ -30,11 +31,10 @@ from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, real_numbers
-from vggtgeo.solvers.arrow import is_finite, nan_unless_finite
+from vggtgeo.io.given import check_kind
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.flat_directions import flat_stiffness
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600
 """Number of keyframes above which a dense inverse is not advisable: 104 MB and about 10 s (2.5 s for 355)."""
@@ -81,15 +81,9 @@ class Covariances(Readable):
     def scaled(self) -> Covariances:
         """Return the covariances times the variance factor, for weights that are known up to a common factor."""
         times = lambda values: jnp.where(jnp.isfinite(values), values * self.variance_factor, values)
-        return Covariances(
-            times(self.poses),
-            times(self.intrinsics),
-            times(self.inverse_depth),
-            times(self.neighbours),
-            jnp.ones_like(self.variance_factor),
-            self.parameters,
-            self.scale_is_free,
-        )
+        names = ("poses", "intrinsics", "inverse_depth", "neighbours")
+        changed: dict[str, Any] = {name: times(getattr(self, name)) for name in names}
+        return replace(self, **changed, variance_factor=jnp.ones_like(self.variance_factor))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the standard deviations as plain numbers (outside `jit`, for one solution).
@@ -166,7 +160,10 @@ def covariances(
 
 def _rows(problem: Problem, keyframes: Any) -> tuple[Int[Array, " r"], Int[Array, " h"] | None]:
     """Return the rows of landmarks of the requested keyframes, and the first row of each keyframe; None: all."""
-    asked = None if keyframes is None else _keyframe_indices(keyframes, problem.num_keyframes)
+    asked = keyframes
+    if not (keyframes is None or isinstance(keyframes, jax.core.Tracer)):
+        # JAX would clamp an index beyond the end to the last keyframe.
+        asked = jnp.asarray(check_range("keyframes", keyframes, problem.num_keyframes, "keyframes"))
     if problem.host is None:
         return jnp.arange(problem.num_keyframes) if asked is None else asked, None
     if asked is None:
@@ -180,18 +177,6 @@ def _rows(problem: Problem, keyframes: Any) -> tuple[Int[Array, " r"], Int[Array
         each = [np.flatnonzero(np.asarray(problem.host) == keyframe) for keyframe in np.asarray(asked)]
     first = np.cumsum([0, *(len(own) for own in each[:-1])])
     return jnp.asarray(np.concatenate(each)), jnp.asarray(first)
-
-
-def _keyframe_indices(keyframes: Any, count: int) -> Int[Array, " h"]:
-    """Return validated keyframe indices: JAX would clamp an index beyond the end to the last keyframe."""
-    if isinstance(keyframes, jax.core.Tracer):
-        return keyframes
-    found = real_numbers("keyframes", keyframes)
-    if found.ndim != 1 or not len(found) or found.dtype.kind not in "iu" or not ((found >= 0) & (found < count)).all():
-        raise InputError(
-            f"`keyframes` must be a list of at least one whole number from 0 to {count - 1}, got {found.tolist()!r:.60}"
-        )
-    return jnp.asarray(found)
 
 
 @eqx.filter_jit  # without it, JAX compiles each operation by itself, which takes most of a minute

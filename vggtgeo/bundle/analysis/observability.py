@@ -34,10 +34,10 @@ from jaxtyping import Array, Bool, Float
 from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import SHOWN, Observability, Spectra
 from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
-from vggtgeo.bundle.diagnosis import check_linearisation
+from vggtgeo.bundle.checks import check_finite, check_pair
+from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_finite
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.pair_checks import check_finite, check_pair
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import term_residuals, used_slots
 from vggtgeo.geometry import lie
@@ -47,13 +47,17 @@ from vggtgeo.solvers.arrow import (
     couple,
     dense_gradient,
     inverse_landmark_hessian,
-    is_finite,
     join_landmarks,
-    nan_unless_finite,
 )
-from vggtgeo.solvers.block_sparse import SparseLayout, reduced_blocks, sparse_layout
 from vggtgeo.solvers.local_inverse import balance, rank_tolerance
-from vggtgeo.solvers.schur_complement import Blocks, Reduced, dense_schur_complement
+from vggtgeo.solvers.schur_complement import (
+    Blocks,
+    Reduced,
+    SparseLayout,
+    dense_schur_complement,
+    reduced_blocks,
+    sparse_layout,
+)
 
 DENSE_KEYFRAMES = 300
 """Largest number of keyframes for full spectra: `2 k + 1` symmetric eigenvalue problems of 1,800 coordinates."""

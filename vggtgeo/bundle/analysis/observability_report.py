@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.analysis.directions import direction_names
+from vggtgeo.bundle.readable import Readable
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.local_inverse import rank_tolerance
 
@@ -44,7 +45,7 @@ class Spectra(eqx.Module):
     """`d' S d` for each named direction: per m^2, rad^2, pixel^2, or per 100 % of scale or focal length."""
 
 
-class Observability(eqx.Module):
+class Observability(Readable):
     """Which directions are determined, and by which terms; a pytree of arrays, usable under `jit` and `vmap`.
 
     Example (with `problem, initial, index = vg.simulate_window().pack()` and its solution):
@@ -94,13 +95,13 @@ class Observability(eqx.Module):
         free, size = int(np.sum(self.free)), len(self.free)
         values = np.asarray(self.whole.values[0])[:free]
         lost, used = undetermined_landmarks(self)
-        whole = weak_directions(self)
+        whole, pairs = weak_directions(self), [f"{i} and {j}" for i, j in rotation_pairs(self)]
         lines = [
             f"Observability of {self.keyframes} keyframes: {free} coordinates free, {size - free} held",
             f"weakest eigenvalues: {'  '.join(f'{max(value, 0):.1e}' for value in values[:6])}",
             f"weak directions: {_spell(whole, self)}",
             *(line for known in least_known(self) for line in (f"least known: {known}", f"  sigma: {known.sigma()}")),
-            *([f"pure rotation: {_spell_pairs(self)}"] if rotation_pairs(self) else []),
+            *([f"pure rotation between keyframes: {_listed(pairs)}"] if pairs else []),
             f"inverse depths in use: {used}, undetermined even with all else known: {lost}",
         ]
         counts = lambda weak: (len(weak), sum(direction.determined for direction in weak))
@@ -138,18 +139,14 @@ class Observability(eqx.Module):
     def __str__(self) -> str:
         return self.report()
 
-    def __repr__(self) -> str:
-        try:
-            known = self.to_dict()
-        except TypeError:  # inside `jit`, or of a batch
-            return eqx.Module.__repr__(self)
-        if not np.isfinite(np.asarray(self.landmark_information)).all():
-            return "Observability(unknown: the linearisation is not finite)"
-        weak = "; ".join(known["weak"][:3]) + f" and {len(known['weak']) - 3} more" * (len(known["weak"]) > 3)
+    def _line(self) -> str:
+        known, finite = self.to_dict(), np.isfinite(np.asarray(self.landmark_information)).all()
+        weak = "; ".join([*known["weak"][:3], *(["pure rotation"] if known["pure_rotation"] else [])]) or "none"
+        more = f" and {len(known['weak']) - 3} more" if len(known["weak"]) > 3 else ""
         lost, used = known["inverse_depths_undetermined"], known["inverse_depths"]
-        weak = "; ".join([weak or "none", *(["pure rotation"] if known["pure_rotation"] else [])])
         depths = f", {lost} of {used} inverse depths undetermined" if lost else ""
-        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak}{depths})"
+        weak = f"{weak}{more}{depths}" if finite else "unknown, since the linearisation is not finite"
+        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak})"
 
 
 @dataclass(frozen=True)
@@ -233,11 +230,11 @@ class LeastKnown:
         return ", ".join([*moved, f"depths {100 * self.depth:.2g} %"])
 
 
-def least_known(found: Observability, count: int = 3) -> list[LeastKnown]:
-    """Return the `count` determined directions of smallest eigenvalue by all terms, weak or not."""
+def least_known(found: Observability) -> list[LeastKnown]:
+    """Return the three determined directions of smallest eigenvalue by all terms, weak or not."""
     values, free = np.asarray(found.whole.values[0], float), np.asarray(found.free)
     first = int(np.sum(values < undetermined_below(len(free), found.whole.values.dtype)))
-    last = min(first + count, int(np.sum(np.isfinite(values))), len(found.depth_change))
+    last = min(first + 3, int(np.sum(np.isfinite(values))), len(found.depth_change))
     return [_described(found, column) for column in range(first, last)]
 
 
@@ -297,15 +294,6 @@ def rotation_pairs(found: Observability) -> list[tuple[int, int]]:
             pair = (min(i, j), max(i, j))
             parallax[pair] = max(size, parallax.get(pair, 0.0))
     return sorted(pair for pair, size in parallax.items() if size < UNKNOWN)
-
-
-def _spell_pairs(found: Observability) -> str:
-    pairs = rotation_pairs(found)
-    joined = {tuple(sorted(edge)) for edge in np.asarray(found.edges)[np.isfinite(found.edge_parallax)].tolist()}
-    if len(pairs) == len(joined):
-        return "no match between any two keyframes has parallax: depths and baselines are undetermined"
-    listed = ", ".join(f"{i}-{j}" for i, j in pairs[:SHOWN]) + f" and {len(pairs) - SHOWN} more" * (len(pairs) > SHOWN)
-    return f"no match between the keyframes {listed} has parallax"
 
 
 def _undetermined_focal_lengths(
@@ -394,17 +382,12 @@ def _table(found: Observability) -> list[str]:
 
 
 def _spell(weak: list[WeakDirection], found: Observability) -> str:
-    free = int(np.sum(found.free))
-    if not weak:
-        return "none"
-    lost, more_unknown = not any(direction.determined for direction in weak), _more_unknown(weak, found)
-    if len(weak) >= free and lost:
-        return f"everything ({free} directions undetermined)"
-    if lost and more_unknown:  # only a part of a subspace is known, so the names are ambiguous
-        return f"at least {len(weak)} directions undetermined"
-    more = [f"and {len(weak) - SHOWN} more"] if len(weak) > SHOWN else []
-    more += [f"perhaps others: only the {len(weak)} weakest were computed"] if more_unknown else []
-    return "; ".join([*(str(direction) for direction in weak[:SHOWN]), *more])
+    more = f"; perhaps others: only the {len(weak)} weakest were computed" if _more_unknown(weak, found) else ""
+    return (_listed([str(direction) for direction in weak]) or "none") + more
+
+
+def _listed(parts: list[str]) -> str:
+    return "; ".join([*parts[:SHOWN], *([f"and {len(parts) - SHOWN} more"] if len(parts) > SHOWN else [])])
 
 
 def _more_unknown(weak: list[WeakDirection], found: Observability) -> bool:

@@ -13,8 +13,7 @@ import scipy.sparse as sp
 from jaxtyping import Float
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
-from vggtgeo.solvers.block_sparse import SparseLayout
-from vggtgeo.solvers.schur_complement import Blocks
+from vggtgeo.solvers.schur_complement import Blocks, SparseLayout
 
 SHIFT = 1e-9
 """With 1e-12 an eigenvalue of 1e-3 is accurate to two digits, with 1e-9 to nine; null directions stay below 1e-15

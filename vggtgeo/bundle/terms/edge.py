@@ -9,7 +9,7 @@ Local coordinates of one edge `(i, j)`: the left tangent `eta` of the relative p
 independent of the number of other cameras; if both ends have the same camera, the derivative is the sum of both. Slots
 come last in every array, so that each quantity is contiguous: columns are `[6 + c + 2, m p]`, in the order eta,
 cameras, residual, inverse depth, for `m` consecutive residual rows. If the pixels of the slots in their host are also
-unknowns (`terms/host_pixel.py`), two rows follow: by `u`, by `v`.
+unknowns (`HostPixel`), two rows follow: by `u`, by `v`.
 """
 
 from __future__ import annotations
@@ -23,15 +23,59 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from vggtgeo.bundle.fast import any_camera, pinhole
-from vggtgeo.bundle.fast.pinhole import Projection
+from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
+from vggtgeo.bundle.pinhole_derivatives import Gradient, OneEdge, Projection
 from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighted_rows, robust_energy
-from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry import lie
-from vggtgeo.geometry.camera_models import Cameras, Pinhole, with_shared_focal
+from vggtgeo.geometry.camera_models import AbstractCamera, Cameras, Pinhole, with_shared_focal
 
 CENTRE = lie.TANGENT + 2
 """Index of the derivative by the principal point in a row."""
+
+
+class View(eqx.Module):
+    """A landmark of host camera i in target camera j.
+
+    The landmark is scaled by its inverse depth, `R ray + d t`, which stays finite for points at infinity.
+
+    Example: a landmark seen by two cameras at the same pose.
+        >>> import jax.numpy as jnp, jaxlie
+        >>> camera = vg.cameras.Pinhole(jnp.array([500.0, 500.0, 320.0, 240.0]))
+        >>> vg.terms.View(jaxlie.SE3.identity(), camera, jnp.array([100.0, 50.0]), jnp.asarray(0.5)).projected.tolist()
+        [100.0, 50.0]
+
+    """
+
+    relative: jaxlie.SE3
+    """`M = T_j T_i^-1`: host to target camera."""
+    camera: AbstractCamera
+    """Camera of keyframe j."""
+    pixel: Float[Array, "2"]
+    """Pixel in the host."""
+    inverse_depth: Float[Array, ""]
+    """1/m, in the host."""
+    host: AbstractCamera | None = None
+    """Camera of keyframe i if it differs from that of keyframe j."""
+
+    @property
+    def ray(self) -> Float[Array, "3"]:
+        """Viewing ray in the host, `z = 1`."""
+        return (self.camera if self.host is None else self.host).unproject(self.pixel)
+
+    @property
+    def scaled_point(self) -> Float[Array, "3"]:
+        """The landmark in target coordinates times its inverse depth."""
+        return self.relative.rotation().as_matrix() @ self.ray + self.inverse_depth * self.relative.translation()
+
+    @property
+    def point(self) -> Float[Array, "3"]:
+        """The landmark in target coordinates, metres."""
+        return self.scaled_point / self.inverse_depth
+
+    @property
+    def projected(self) -> Float[Array, "2"]:
+        """Pixel of the landmark in the target (equation 5 of the paper)."""
+        return self.camera.project(self.scaled_point)
 
 
 class EdgeView(eqx.Module):
@@ -45,7 +89,7 @@ class EdgeView(eqx.Module):
     """Keyframes `(i, j)`."""
     pixels: Float[Array, "2 p"]
     inverse_depth: Float[Array, " p"]
-    projection: tuple[pinhole.OneEdge, Projection] | any_camera.Seen
+    projection: tuple[OneEdge, Projection] | camera_derivatives.Seen
     """Of one pinhole for all keyframes, or of other cameras."""
     free_pixels: int = eqx.field(static=True, default=0)
     """Number of first slots whose pixel is an unknown."""
@@ -63,7 +107,7 @@ class EdgeView(eqx.Module):
     @property
     def projected(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Pixels of the slots in the target."""
-        if isinstance(self.projection, any_camera.Seen):
+        if isinstance(self.projection, camera_derivatives.Seen):
             return self.projection.u, self.projection.v
         edge, at = self.projection
         fx, fy, cx, cy = edge.intrinsics
@@ -73,13 +117,13 @@ class EdgeView(eqx.Module):
         """Return the derivatives of a row of residuals with image gradient `(a, b)`: by the shared coordinates, by
         inverse depth, and by the pixel in the host, if it is an unknown.
         """
-        if isinstance(self.projection, any_camera.Seen):
-            found = any_camera.row(self.rotation, self.translation, self.projection, a, b)
+        if isinstance(self.projection, camera_derivatives.Seen):
+            found = camera_derivatives.row(self.rotation, self.translation, self.projection, a, b)
             both = zip(found.target, found.host, strict=True)
             one_camera = self.cameras.group is None
             by_cameras = [j + i for j, i in both] if one_camera else [*found.target, *found.host]
             return [*found.motion, *by_cameras], found.depth, found.pixel if self.free_pixels else []
-        *shared, depth = pinhole.row(*self.projection, a, b)
+        *shared, depth = pinhole_derivatives.row(*self.projection, a, b)
         # The centre moves the pixel in the target and, the other way, the ray in the host.
         pixel = [a - shared[CENTRE], b - shared[CENTRE + 1]] if self.free_pixels else []
         return self.tied(shared), depth, pixel
@@ -94,8 +138,8 @@ class EdgeView(eqx.Module):
     def slots(self, first: int, count: int) -> EdgeView:
         """Return the view of some of the slots."""
         part = lambda leaf: leaf[..., first : first + count]
-        of_slots: tuple[pinhole.OneEdge, Projection] | any_camera.Seen
-        if isinstance(self.projection, any_camera.Seen):
+        of_slots: tuple[OneEdge, Projection] | camera_derivatives.Seen
+        if isinstance(self.projection, camera_derivatives.Seen):
             of_slots = jax.tree.map(part, self.projection)
         else:
             of_slots = self.projection[0], jax.tree.map(part, self.projection[1])
@@ -103,17 +147,6 @@ class EdgeView(eqx.Module):
         free = min(max(self.free_pixels - first, 0), count)
         motion = self.relative, self.rotation, self.translation
         return EdgeView(*motion, self.cameras, self.ends, *own, of_slots, free)
-
-
-class Gradient(NamedTuple):
-    """Gradient of one edge's energy."""
-
-    shared: Float[Array, " d"]
-    """By relative pose and camera."""
-    depth: Float[Array, " p"]
-    """By each inverse depth."""
-    pixel: Float[Array, "2 p"] | None
-    """By each pixel in the host, if those are unknowns."""
 
 
 class LocalModel(NamedTuple):

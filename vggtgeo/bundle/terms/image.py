@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.fast import any_camera, pinhole
-from vggtgeo.bundle.terms.edge import CENTRE, EdgeTerm, EdgeView, Gradient, LocalModel, PixelModel
+from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
+from vggtgeo.bundle.pinhole_derivatives import Gradient
+from vggtgeo.bundle.terms.edge import CENTRE, EdgeTerm, EdgeView, LocalModel, PixelModel, View
 from vggtgeo.bundle.terms.term import reweighting, robust_energy, squared_norm
-from vggtgeo.bundle.terms.view import View
 from vggtgeo.geometry.camera_models import Pinhole
 
 Rows = tuple[Float[Array, " p"], ...]
@@ -27,9 +27,9 @@ _WITH_ENTRIES = 3
 class ImageTerm(EdgeTerm):
     """A residual that is an affine function of the landmark's pixel in the target: a match, a line.
 
-    With one pinhole for all keyframes, all derivatives are those of `fast/pinhole.py`, written by hand. With other
-    cameras, first derivatives are those of `fast/any_camera.py`, and exact second ones are automatic. The tests check
-    that all are equal to automatic ones.
+    With one pinhole for all keyframes, all derivatives are those of `pinhole_derivatives.py`, written by hand. With
+    other cameras, first derivatives are those of `camera_derivatives.py`, and exact second ones are automatic. The
+    tests check that all are equal to automatic ones.
 
     Fields:
         weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
@@ -77,15 +77,14 @@ class ImageTerm(EdgeTerm):
         return jnp.concatenate(parts, 1)
 
     def gradient(self, view: EdgeView) -> Gradient:
-        if isinstance(view.projection, any_camera.Seen):
+        if isinstance(view.projection, camera_derivatives.Seen):
             return super().gradient(view)
-        found = pinhole.energy_gradient(*view.projection, *self._force(view))
-        return Gradient(
-            jnp.stack(view.tied(list(found.shared))), found.depth, found.pixel if view.free_pixels else None
-        )
+        found = pinhole_derivatives.energy_gradient(*view.projection, *self._force(view))
+        pixel = found.pixel if view.free_pixels else None
+        return found._replace(shared=jnp.stack(view.tied(list(found.shared))), pixel=pixel)
 
     def model(self, view: EdgeView) -> LocalModel:
-        if isinstance(view.projection, any_camera.Seen):
+        if isinstance(view.projection, camera_derivatives.Seen):
             return super().model(view)
         edge, at = view.projection
         entries, normals = self._image(view)
@@ -95,11 +94,11 @@ class ImageTerm(EdgeTerm):
         # Stacked arrays, not entries as in `columns`: a hundred separate sums take seconds to compile.
         residual = jnp.stack(entries)
         normal = jnp.stack([jnp.stack(of) for of in normals])
-        rows = jnp.stack(pinhole.row(edge, at, *normal), 1)
-        third = jnp.stack(pinhole.row_of_third(edge, at))
+        rows = jnp.stack(pinhole_derivatives.row(edge, at, *normal), 1)
+        third = jnp.stack(pinhole_derivatives.row_of_third(edge, at))
         along = jnp.sum(residual[:, None] * rows, 0)  # the residual times its derivative: `D / (w rho')`
         force = pull * jnp.sum(normal * residual, 1)
-        added, mixed = pinhole.second_order(edge, at, (force[0], force[1]), list(third))
+        added, mixed = pinhole_derivatives.second_order(edge, at, (force[0], force[1]), list(third))
         # Half of the products of these rows with the plain ones is `sum w rho' J'J + 2 w^2 rho'' (J'r)(J'r)' - P D'`.
         bent = bend * along[:-1] - 2 * pull * third[:-1]
         left = jnp.concatenate([pull * rows[:, :-1] + residual[:, None] * bent, (pull * residual)[:, None]], 1)
@@ -122,12 +121,12 @@ class ImageTerm(EdgeTerm):
         weights: tuple[Float[Array, " p"], Float[Array, " p"]],
         third: Float[Array, "11 p"],
     ) -> PixelModel:
-        """Return exact second derivatives by the pixels in the host, see `fast/pinhole.py`.
+        """Return exact second derivatives by the pixels in the host, see `pinhole_derivatives.py`.
 
         derivatives: residuals, their derivatives by the projected pixel, and by shared coordinates and inverse depth.
         weights: `w rho'` and `2 w^2 rho''`. third: `P`.
         """
-        assert not isinstance(view.projection, any_camera.Seen)
+        assert not isinstance(view.projection, camera_derivatives.Seen)
         edge, at = view.projection
         (residual, normal, rows), (pull, bend) = derivatives, weights
         centre = slice(CENTRE, CENTRE + 2)
@@ -137,7 +136,8 @@ class ImageTerm(EdgeTerm):
         force, gradient = pull * jnp.sum(normal * residual, 1), pull * of_pixel
         drawn = (pull * along).at[centre].add(-force)
         extra = [
-            pinhole.second_order_of_pixel(edge, at, (force[0], force[1]), gradient[axis], axis) for axis in range(2)
+            pinhole_derivatives.second_order_of_pixel(edge, at, (force[0], force[1]), gradient[axis], axis)
+            for axis in range(2)
         ]
         mixed = (
             pull * jnp.einsum("amp,mkp->kap", pixel, rows)

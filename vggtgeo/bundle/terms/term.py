@@ -19,25 +19,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import real_numbers
-from vggtgeo.solvers.kernels import AbstractKernel, Barron, Square
+from vggtgeo.io.given import check_kind, real_numbers
+from vggtgeo.solvers.kernels import AbstractKernel, Square
 
 Local = Callable[[Array], Array]
 """A residual as a function of local coordinates."""
-
-
-def check_width(name: str, kernel: Any) -> None:
-    """Raise InputError unless `kernel` is a kernel object of positive width; a traced width is not checked."""
-    if not isinstance(kernel, AbstractKernel):
-        raise InputError(f"`{name}` must be a kernel object, such as `vggtgeo.kernels.Huber(1.5)`, got {kernel!r}")
-    width = getattr(kernel, "delta", None)
-    known = isinstance(width, jax.Array | np.ndarray | float | int) and not isinstance(width, jax.core.Tracer)
-    if known and not np.all(np.asarray(width) > 0):
-        raise InputError(f"the width of `{name}` must be positive, got {width}")
-    shape = getattr(kernel, "alpha", None) if isinstance(kernel, Barron) else None
-    known = isinstance(shape, jax.Array) and not isinstance(shape, jax.core.Tracer)
-    if known and not ((np.asarray(shape) < 2) & (np.asarray(shape) != 0)).all():
-        raise InputError(f"the shape of `{name}` must be below 2 and not 0 (use `Cauchy` for 0), got {shape}")
 
 
 def _weights(given: Any) -> Array:
@@ -123,8 +109,7 @@ class AbstractTerm(eqx.Module):
     """Fields that are not data of an observation: indices, and the fields of this class."""
 
     def __check_init__(self) -> None:
-        """Raise InputError for an invalid kernel."""
-        check_width(f"{self.name}.kernel", self.kernel)
+        check_kind(f"{self.name}.kernel", self.kernel, AbstractKernel, "a kernel, such as `vggtgeo.kernels.Huber(1.5)`")
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.intrinsics import IntrinsicsPrior
-from vggtgeo.bundle.terms.node import CameraTerm
+from vggtgeo.bundle.terms.node import CameraTerm, IntrinsicsPrior
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.slam.camera.camera_gain import gain
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vggtgeo.bundle.terms.relative_pose import SurfaceAlignment
+from vggtgeo.bundle.terms.measured_pose import SurfaceAlignment
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.perception.rgbd_view import surface_normals
 from vggtgeo.slam.sparse_map.factors import surface_term

@@ -19,7 +19,7 @@ from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.factors import Factor, MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.window.sliding_window import TOLERANCE, window_size
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced import DenseCholesky
+from vggtgeo.solvers.reduced_solvers import DenseCholesky
 
 SMALL = (16, 64)
 """Keyframes of the smallest shapes; larger ones: 96, 128, 192, 256, ..."""

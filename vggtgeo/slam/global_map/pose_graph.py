@@ -34,7 +34,7 @@ from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
-from vggtgeo.bundle.terms.relative_pose import RelativePose
+from vggtgeo.bundle.terms.measured_pose import RelativePose
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import POSE_GATE
@@ -43,7 +43,7 @@ from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, rel
 from vggtgeo.slam.tracking.evidence import STEP_GROWTH, tangent
 from vggtgeo.solvers.kernels import Cauchy
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced import DenseCholesky
+from vggtgeo.solvers.reduced_solvers import DenseCholesky
 
 LOOP_GATE = POSE_GATE
 """Squared Mahalanobis distance above which a loop is false: one true loop in 10,000 is lost."""

@@ -26,9 +26,9 @@ from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.submaps import submaps_by_size
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
-from vggtgeo.solvers.block_sparse import reduced_blocks, sparse_layout
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
-from vggtgeo.solvers.reduced import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.schur_complement import reduced_blocks, sparse_layout
 
 DEPTH_SCALE = 0.01
 """Standard deviation of a depth camera's scale factor, which a run cannot observe: root mean square 1.1 % on clips with

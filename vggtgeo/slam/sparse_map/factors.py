@@ -12,9 +12,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
-from vggtgeo.bundle.terms.baseline import BaselinePrior
-from vggtgeo.bundle.terms.relative_pose import RelativePose, SurfaceAlignment, quadratic
-from vggtgeo.bundle.terms.rotation import RotationPrior
+from vggtgeo.bundle.terms.measured_pose import BaselinePrior, RelativePose, RotationPrior, SurfaceAlignment, quadratic
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
 from vggtgeo.solvers.kernels import Cauchy

@@ -98,18 +98,22 @@ def row(edge: OneEdge, at: Projection, a: Array, b: Array) -> list[Array]:
     ]
 
 
-class EnergyGradient(NamedTuple):
-    """Gradient of one edge's energy, by the force `(a, b) = w rho' r` on each projected pixel."""
+class Gradient(NamedTuple):
+    """Gradient of one edge's energy."""
 
-    shared: Float[Array, "10"]
-    """By relative pose and intrinsics, summed over slots."""
+    shared: Float[Array, " d"]
+    """By relative pose and cameras, summed over slots."""
     depth: Float[Array, " p"]
-    pixel: Float[Array, "2 p"]
-    """By each pixel in the host."""
+    """By each inverse depth."""
+    pixel: Float[Array, "2 p"] | None
+    """By each pixel in the host, if those are unknowns."""
 
 
-def energy_gradient(edge: OneEdge, at: Projection, a: Array, b: Array) -> EnergyGradient:
-    """Return the sum over slots of `row`, as one product of moments: this compiles much faster than ten sums."""
+def energy_gradient(edge: OneEdge, at: Projection, a: Array, b: Array) -> Gradient:
+    """Return the gradient by the force `(a, b) = w rho' r` on each projected pixel.
+
+    The sum over slots of `row` is one product of moments, which compiles much faster than ten sums.
+    """
     intrinsics, rotation = edge.intrinsics, edge.rotation
     g0, g1 = a * intrinsics[0] * at.inverse_z, b * intrinsics[1] * at.inverse_z
     g = jnp.stack([g0, g1, -(g0 * at.x + g1 * at.y) * at.in_front])
@@ -122,7 +126,7 @@ def energy_gradient(edge: OneEdge, at: Projection, a: Array, b: Array) -> Energy
     focal = jnp.stack([moments[3, 6], moments[4, 7]]) - jnp.stack([by_ray[0, 4], by_ray[1, 5]]) / intrinsics[:2]
     centre = moments[3:, 8] - by_ray[:, 8] / intrinsics[:2]
     shared = jnp.concatenate([moments[:3, 3], turn, focal, centre])
-    return EnergyGradient(shared, edge.translation @ g, rotation[:, :2].T @ g / intrinsics[:2, None])
+    return Gradient(shared, edge.translation @ g, rotation[:, :2].T @ g / intrinsics[:2, None])
 
 
 def row_of_third(edge: OneEdge, at: Projection) -> list[Array]:

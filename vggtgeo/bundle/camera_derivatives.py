@@ -12,7 +12,7 @@ camera `c dray/dp_i`, inverse depth `G . t`, pixel in the host `c dray/du_i`.
 Rays and their derivatives are computed once for each row of landmarks, not for each of its edges: to undo a distortion
 takes Newton's method.
 
-Layout as in `pinhole.py`: slots last, contiguous.
+Layout as in `pinhole_derivatives.py`: slots last, contiguous.
 """
 
 from __future__ import annotations

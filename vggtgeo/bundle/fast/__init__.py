@@ -1,1 +1,0 @@
-"""Hand-written derivatives that override automatic ones where speed matters; the tests check that both are equal."""
