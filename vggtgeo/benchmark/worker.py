@@ -20,7 +20,7 @@ from vggtgeo.benchmark.measure import measure, truth_of_run
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.io.errors import InputError, collected_warnings
 from vggtgeo.io.files import write_json
-from vggtgeo.io.process import peak_memory_gb, return_freed_memory
+from vggtgeo.io.process import peak_memory_gb, share_heaps
 from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -122,6 +122,6 @@ def end_with_parent(parent: int) -> None:
 
 
 if __name__ == "__main__":  # python -m vggtgeo.benchmark.worker FOLDER SCRATCH PARENT, the latter a process id
-    return_freed_memory()
+    share_heaps()
     end_with_parent(int(sys.argv[3]))
     run_job(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -28,7 +28,7 @@ from vggtgeo.cli.solve import solve
 from vggtgeo.cli.view import export, view
 from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one_line
-from vggtgeo.io.process import end_on_signals, ignore_signals, return_freed_memory
+from vggtgeo.io.process import end_on_signals, ignore_signals, share_heaps
 
 GC_THRESHOLD = 50_000
 """New objects between two garbage collections: with Python's default of 700 they take some per cent of a run."""
@@ -233,7 +233,7 @@ def set_jax_flags() -> None:
 
 def main() -> None:
     """Run the program."""
-    return_freed_memory()
+    share_heaps()
     gc.set_threshold(GC_THRESHOLD)
     set_jax_flags()
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; an unknown backend in the environment would end a run

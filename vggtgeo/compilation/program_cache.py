@@ -28,6 +28,7 @@ import jax.export
 import numpy as np
 
 from vggtgeo.io.files import atomic_open
+from vggtgeo.io.process import return_freed_memory
 
 _Result = TypeVar("_Result")
 
@@ -86,6 +87,7 @@ class CachedProgram(Generic[_Result]):
             return None
         # Not `jit`, which would compile again for arrays that such a program returned: they name their device.
         run = jax.jit(exported.call).lower(*arrays).compile()
+        return_freed_memory()  # hundreds of MB after a compilation
 
         def call(*given: Any) -> _Result:
             here = [leaf for leaf in jax.tree.leaves(given) if _is_array(leaf)]

@@ -12,17 +12,18 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
-_HEAP = {
+_HEAPS = {
     "MALLOC_ARENA_MAX": (-8, 2),
-    "MALLOC_MMAP_THRESHOLD_": (-3, 1_000_000),
-    "MALLOC_TRIM_THRESHOLD_": (-1, 1_000_000),
+    "MALLOC_MMAP_THRESHOLD_": (-3, 8_000_000),
+    "MALLOC_TRIM_THRESHOLD_": (-1, 32_000_000),
 }
-"""glibc's settings: environment variable, number in `malloc.h`, value (heaps; bytes)."""
+"""glibc's settings: environment variable, number in `malloc.h`, value: heaps; bytes from which a block lies in none, and
+that a heap keeps. Smaller limits save no memory, and system calls for each image cost a tenth of a run."""
 
 
 class Interruption:
@@ -101,18 +102,27 @@ def _signals() -> list[signal.Signals]:
 
 
 def return_freed_memory() -> None:
-    """Let glibc give freed memory back to the system; nothing elsewhere. For a program's entry, before its threads.
+    """Give freed memory back to the system, with glibc; nothing elsewhere.
 
-    Otherwise each thread keeps freed blocks in a heap of its own, up to a third of a run's memory
-    (`benchmarks/stage_times.py`): so all share two heaps, and larger blocks lie in none. Variables of the user
-    (`MALLOC_ARENA_MAX` and others, see mallopt(3)) take precedence.
+    Compilation and threads leave free blocks between others, up to half of a run's memory (`benchmarks/memory.py`).
     """
-    if not sys.platform.startswith("linux"):
-        return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries have none
-    for name, (parameter, value) in _HEAP.items():
-        if mallopt is not None and name not in os.environ:
-            mallopt(parameter, value)
+    if trim := _of_c_library("malloc_trim"):
+        trim(0)
+
+
+def share_heaps() -> None:
+    """Make all threads allocate from two heaps of glibc, from which freed memory is returned.
+
+    For a program's entry, before its threads. Variables of the user (see mallopt(3)) take precedence.
+    """
+    if mallopt := _of_c_library("mallopt"):
+        for name, (parameter, value) in _HEAPS.items():
+            if name not in os.environ:
+                mallopt(parameter, value)
+
+
+def _of_c_library(name: str) -> Callable[..., int] | None:
+    return getattr(ctypes.CDLL(None), name, None) if sys.platform.startswith("linux") else None
 
 
 def peak_memory_gb() -> float:

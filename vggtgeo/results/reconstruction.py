@@ -16,7 +16,7 @@ from vggtgeo.datasets.frame import check_range
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, InputWarning, collected_warnings, warn
 from vggtgeo.io.given import check_kind, check_plain, check_whole
-from vggtgeo.io.process import Interruption, interruption
+from vggtgeo.io.process import Interruption, interruption, return_freed_memory
 from vggtgeo.mapping.dense import check_dense, check_mode, dense_map
 from vggtgeo.report import RunRecord
 from vggtgeo.results.checkpoints import Checkpoints, digest_of_map, load_checkpoint, run_identity
@@ -235,6 +235,7 @@ def _conclude(
             return judge_or_report(slam, evidence.frames, check_input(warned, len(slam.frames)) + of_images)
 
     hooks.each("on_stage", "dense map and verdict")
+    return_freed_memory()
     with ThreadPoolExecutor(1, thread_name_prefix="verdict") as pool:
         judging = pool.submit(judge)
         with clock.measure("dense map"):
@@ -351,6 +352,7 @@ def _finish(
 ) -> tuple[Slam, bool]:
     """Run the last adjustment; return the state, and whether Ctrl-C ended it."""
     hooks.each("on_stage", "last adjustment")
+    return_freed_memory()
     try:
         with stop.at_once():
             return finish(slam, roles, settings, hooks.clock), False
