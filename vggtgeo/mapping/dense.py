@@ -21,8 +21,7 @@ from vggtgeo.models.classical import NoDepth, SensorDepth
 from vggtgeo.models.roles import MetricDepth
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.keyframe_images import array_of
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.threads import map_in_threads
 
 DenseMode = Literal["auto", "mvs", "sensor", "network", "none"]

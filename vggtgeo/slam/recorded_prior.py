@@ -24,8 +24,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePo
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.sparse_map.units import longer
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.tracking.recorded_motion import (
     Comparison,
     carried,

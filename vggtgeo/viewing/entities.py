@@ -11,13 +11,12 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.slam.callback import WindowRecord
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import loop_edges, submap_of
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import lost_stretches
-from vggtgeo.slam.window_recorder import WindowRecord
+from vggtgeo.slam.state import Slam, lost_stretches
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 RADIUS = 0.011

@@ -10,7 +10,7 @@ from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.output_checks import check_can_be_shown
 from vggtgeo.viewing.entities import Entities

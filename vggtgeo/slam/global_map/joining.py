@@ -30,8 +30,7 @@ from vggtgeo.slam.sparse_map.units import (
     scaled_keyframe,
     scaled_motion,
 )
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.tracking.relocalisation import relocalise
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput
 from vggtgeo.slam.tracking.tracker import scaled_record

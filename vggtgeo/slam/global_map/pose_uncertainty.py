@@ -23,8 +23,7 @@ from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
