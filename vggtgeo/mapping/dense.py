@@ -19,8 +19,7 @@ from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
 from vggtgeo.models.classical import NoDepth, SensorDepth
 from vggtgeo.models.roles import MetricDepth
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.keyframe_images import array_of
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, array_of
 from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.threads import map_in_threads
 

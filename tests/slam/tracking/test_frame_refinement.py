@@ -14,7 +14,7 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.sparse_map.units import scaled_keyframe
+from vggtgeo.slam.sparse_map.map import scaled_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import (
     against_nearest,

@@ -36,8 +36,7 @@ from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.camera.camera_gain import gain, match_energies
 from vggtgeo.slam.camera.pixel_shifts import Shifts, carried, pinhole_of, shifted_problem
 from vggtgeo.slam.sparse_map.covisibility import Pair
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, KeyframeImages
 from vggtgeo.slam.sparse_map.map import Map
 
 RADIAL = 0.3

@@ -21,14 +21,14 @@ from vggtgeo.slam.global_map.loops import verified_loops
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.map import submap_of
-from vggtgeo.slam.sparse_map.units import (
+from vggtgeo.slam.sparse_map.map import (
     MAX_SCALE_ERROR,
     longer,
     measured_ratio,
     scaled_factor,
     scaled_keyframe,
     scaled_motion,
+    submap_of,
 )
 from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.tracking.relocalisation import relocalise
