@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.analysis.directions import direction_names
+from vggtgeo.bundle.analysis.weak_directions import direction_names
 from vggtgeo.bundle.readable import Readable
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.local_inverse import rank_tolerance

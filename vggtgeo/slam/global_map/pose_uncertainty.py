@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.bundle.analysis.covariances import DENSE_KEYFRAMES, covariances, variance_factor
-from vggtgeo.bundle.analysis.weakest import definite_factor, sparse_matrix
+from vggtgeo.bundle.analysis.weak_directions import definite_factor, sparse_matrix
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
