@@ -9,7 +9,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields, check_image
-from vggtgeo.models.classical.nearest import mutual_nearest, unit
+from vggtgeo.models.classical.pixel_matcher import mutual_nearest, unit
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
 
 from vggtgeo.geometry import pinhole, rigid

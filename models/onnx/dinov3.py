@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.lines import match_segments
-from vggtgeo.models.classical.nearest import unit
+from vggtgeo.models.classical.pixel_matcher import unit
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import DINOV3
 from vggtgeo.models.onnx.fit import Fit, vectors_at

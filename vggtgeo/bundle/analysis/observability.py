@@ -48,12 +48,13 @@ from vggtgeo.solvers.arrow import (
     inverse_landmark_hessian,
     join_landmarks,
 )
-from vggtgeo.solvers.local_inverse import balance, rank_tolerance
 from vggtgeo.solvers.schur_complement import (
     Blocks,
     Reduced,
     SparseLayout,
+    balance,
     dense_schur_complement,
+    rank_tolerance,
     reduced_blocks,
     sparse_layout,
 )
