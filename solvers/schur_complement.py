@@ -30,7 +30,7 @@ from vggtgeo.solvers.arrow import (
     seen_by_hosts,
     sum_corners,
 )
-from vggtgeo.solvers.triples import TripleLandmarks, restricted_parts, split_triples
+from vggtgeo.solvers.landmark_basis import TripleLandmarks, restricted_parts, split_triples
 
 
 class AbstractLayout(eqx.Module):
