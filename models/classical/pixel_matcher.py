@@ -12,10 +12,11 @@ from functools import cache, cached_property
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
-from vggtgeo.models.checks import check_fields, check_image
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
 from vggtgeo.models.roles import Features, PointMatches
+
+from vggtgeo.io.argument_checks import check_fields, check_image
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie
+from vggtgeo.io.argument_checks import check_kind, check_whole, real_numbers
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 _MAX_KEYFRAMES = 1000

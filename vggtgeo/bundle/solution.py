@@ -25,8 +25,8 @@ from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.readable import Readable
 from vggtgeo.bundle.solver_choice import default_solver
+from vggtgeo.io.argument_checks import check_kind, check_whole, real_numbers
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.solvers.adjoint import ArrowAdjoint
 from vggtgeo.solvers.levenberg_marquardt import (
     CONVERGED,

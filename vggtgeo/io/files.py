@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 from filelock import FileLock, Timeout
 
+from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import path_of
 
 
 def whole_path(path: Path) -> Path:

@@ -13,8 +13,8 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
+from vggtgeo.mapping.depth_fusion import fused_mesh, measured_depth
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.mapping.fusion import fused_mesh, measured_depth
 from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
 from vggtgeo.models.classical import NoDepth, SensorDepth

@@ -22,8 +22,8 @@ import numpy as np
 
 from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.io.argument_checks import check_real, path_of
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
-from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.output_checks import EVERY

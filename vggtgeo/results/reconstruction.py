@@ -14,8 +14,8 @@ from vggtgeo.compilation.process_settings import in_double_precision, program_se
 from vggtgeo.datasets import Sequence
 from vggtgeo.datasets.frame import check_range
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.argument_checks import check_kind, check_plain, check_whole
 from vggtgeo.io.errors import InputError, InputWarning, collected_warnings, warn
-from vggtgeo.io.given import check_kind, check_plain, check_whole
 from vggtgeo.io.process import Interruption, interruption
 from vggtgeo.mapping.dense import check_dense, check_mode, dense_map
 from vggtgeo.report import RunRecord

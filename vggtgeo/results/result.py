@@ -19,9 +19,9 @@ from vggtgeo.figures.plots import NotebookFigure, trajectory_figure
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_kind, check_plain, path_of
 from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import atomic_path, write_json
-from vggtgeo.io.given import check_kind, check_plain, path_of
 from vggtgeo.mapping.dense import dense_map
 from vggtgeo.report import (
     MAX_POINTS,

@@ -16,8 +16,8 @@ import numpy as np
 
 from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher

@@ -18,8 +18,8 @@ from vggtgeo.datasets.views import FrameStream, frame_stream, reduced
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_kind, check_whole
 from vggtgeo.io.errors import LeftOutWarning
-from vggtgeo.io.given import check_kind, check_whole
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
