@@ -330,6 +330,8 @@ class _Unpickler(pickle.Unpickler):
 MOVED = {
     ("vggtgeo.geometry.cameras", "Camera"): "vggtgeo.geometry.camera",
     ("vggtgeo.geometry.cameras", "Pinhole"): "vggtgeo.geometry.camera_models",
+    ("vggtgeo.slam.sparse_map.keyframe_images", "CompressedImage"): "vggtgeo.slam.sparse_map.keyframe",
+    ("vggtgeo.slam.sparse_map.keyframe_images", "KeyframeImages"): "vggtgeo.slam.sparse_map.keyframe",
 }
 
 
