@@ -35,7 +35,7 @@ from vggtgeo.evaluation.pose_errors import absolute_error
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import submaps_by_size
 
 NEIGHBOURS, ALIKE = 10, 10
 """Frames before and after one, and others, that it is matched with."""

@@ -31,7 +31,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import submaps_by_size
 
 DRIFT, TURN, SCALE = 0.02, np.deg2rad(1.0) / 60.0, 1.05
 

@@ -22,8 +22,7 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.run import finish, frame_trajectory, run_frames
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 
 
 def main() -> None:

@@ -39,7 +39,7 @@ from verdict_faults import FAULTS, HEALTHY, OF_DEPTH, OF_STREAM, WITHOUT_DEPTH, 
 
 import vggtgeo as vg
 from vggtgeo.benchmark.inputs import RenderedWalk
-from vggtgeo.compilation.process_settings import program_settings
+from vggtgeo.compilation.process_settings import in_double_precision, program_settings
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.geometry.trajectory import Trajectory
@@ -47,7 +47,6 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.results import reconstruction
 from vggtgeo.simulation import WORLDS
 from vggtgeo.simulation.degradations import Recording, without_depth
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
 
@@ -331,6 +330,8 @@ class _Unpickler(pickle.Unpickler):
 MOVED = {
     ("vggtgeo.geometry.cameras", "Camera"): "vggtgeo.geometry.camera",
     ("vggtgeo.geometry.cameras", "Pinhole"): "vggtgeo.geometry.camera_models",
+    ("vggtgeo.slam.sparse_map.keyframe_images", "CompressedImage"): "vggtgeo.slam.sparse_map.keyframe",
+    ("vggtgeo.slam.sparse_map.keyframe_images", "KeyframeImages"): "vggtgeo.slam.sparse_map.keyframe",
 }
 
 

@@ -23,11 +23,10 @@ from typing import Any
 import numpy as np
 from verdict_bank import read
 
-from vggtgeo.compilation.process_settings import program_settings
+from vggtgeo.compilation.process_settings import in_double_precision, program_settings
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.verdict.alternatives import START, explain, scores, with_own_noise
 from vggtgeo.slam.verdict.claim import KNOTS, Claim, Tracks, extent, tracks_of_windows
 from vggtgeo.slam.verdict.corner_adjustment import (

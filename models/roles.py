@@ -25,7 +25,8 @@ from enum import IntEnum
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from vggtgeo.models.checks import check_array, check_confidence, check_index, check_pose
+
+from vggtgeo.io.argument_checks import check_array, check_confidence, check_index, check_pose
 
 # --- point matches -----------------------------------------------------------------------------------------------
 

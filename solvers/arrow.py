@@ -45,14 +45,18 @@ Levenberg-Marquardt damping multiplies the diagonal: `V (1 + l)`, `H + l diag(H)
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
-from vggtgeo.solvers import segments, triples
-from vggtgeo.solvers.segments import SegmentLandmarks
-from vggtgeo.solvers.triples import TripleLandmarks, restrict_triples
+from vggtgeo.solvers.landmark_basis import (
+    LandmarkBasis,
+    SegmentLandmarks,
+    TripleLandmarks,
+    expand_triples,
+    factor_triples,
+    join_segments,
+    restrict_triples,
+)
 
 
 class EdgeGraph(eqx.Module):
@@ -91,35 +95,6 @@ class ArrowVector(eqx.Module):
 
     dense: Float[Array, " c"]
     landmarks: Float[Array, "h s"]
-
-
-class LandmarkBasis(NamedTuple):
-    """Change of basis between the landmarks of a problem and the independent scalar landmarks of a system.
-
-    Two changes for disjoint landmarks: those of three unknowns (`triples.py`), the first of a host, and those on
-    straight segments (`segments.py`), the last.
-    """
-
-    segments: SegmentLandmarks | None
-    triples: TripleLandmarks | None
-
-    def expand(self, landmarks: Float[Array, "n *rows s"]) -> Float[Array, "n *rows z"]:
-        """Return a step of the system's landmarks as one of the problem's."""
-        if self.segments is not None:
-            landmarks = segments.expand_segments(self.segments, landmarks)
-        return landmarks if self.triples is None else triples.expand_triples(self.triples, landmarks)
-
-    def expand_variance(self, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
-        """Return variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
-        if self.segments is not None:
-            variance = segments.expand_segments_variance(self.segments, variance)
-        return variance if self.triples is None else triples.expand_triples_variance(self.triples, variance)
-
-    def restrict(self, gradient: Float[Array, "n z"]) -> Float[Array, "n s"]:
-        """Return the transpose of `expand`: a gradient by the problem's landmarks as one by the system's."""
-        if self.segments is not None:
-            gradient = segments.restrict_segments(self.segments, gradient)
-        return gradient if self.triples is None else triples.restrict_triples(self.triples, gradient)
 
 
 class NodeFactors(eqx.Module):
@@ -230,11 +205,11 @@ def join_landmarks(system: ArrowSystem, fraction: Float[Array, "n m q"] | None) 
     """Return the system with scalar landmarks only: triples and, if `fraction` is given, segments in their basis."""
     is_none = lambda leaf: leaf is None
     if system.blocks is not None:
-        factors = triples.factor_triples(system.blocks, system.cross[:, -1])
+        factors = factor_triples(system.blocks, system.cross[:, -1])
         system = eqx.tree_at(lambda s: (s.triples, s.blocks), system, (factors, None), is_leaf=is_none)
     if fraction is None:
         return system
-    changed = segments.join_segments(system.cross, system.held, fraction)
+    changed = join_segments(system.cross, system.held, fraction)
     return eqx.tree_at(lambda s: (s.cross, s.segments, s.held), system, changed, is_leaf=is_none)
 
 
@@ -349,7 +324,7 @@ def seen_by_factors(system: ArrowSystem, factors: NodeFactors) -> Int[Array, "m 
 def carry_to_nodes(system: ArrowSystem, landmarks: Float[Array, "h s"]) -> Float[Array, " c"]:
     """Return `W z`: landmark values transformed to the dense coordinates."""
     if system.triples is not None:
-        landmarks = triples.expand_triples(system.triples, landmarks)
+        landmarks = expand_triples(system.triples, landmarks)
     return from_relative(system, jnp.einsum("nrs,ns->nr", system.cross, landmarks)[:, :-2])
 
 

@@ -21,7 +21,8 @@ from vggtgeo.solvers.block_elimination import (
     solve_eliminated,
 )
 from vggtgeo.solvers.flat_directions import free_gauge, pinned_update, solve_pinned
-from vggtgeo.solvers.local_inverse import (
+from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, predicted_decrease
+from vggtgeo.solvers.schur_complement import (
     LocalInverse,
     balance,
     local_coordinates,
@@ -29,7 +30,6 @@ from vggtgeo.solvers.local_inverse import (
     rank_tolerance,
     visible,
 )
-from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, predicted_decrease
 
 
 class BandElimination(AbstractFactor):

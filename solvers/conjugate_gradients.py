@@ -30,10 +30,16 @@ from vggtgeo.solvers.arrow import (
 )
 from vggtgeo.solvers.block_band import Bands, band_layout, band_solver, prepare_bands
 from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, free_gauge
-from vggtgeo.solvers.local_inverse import LocalInverse, local_coordinates
 from vggtgeo.solvers.minres import minres
 from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, predicted_decrease
-from vggtgeo.solvers.schur_complement import AbstractLayout, Blocks, assemble, schur_products_of_hosts
+from vggtgeo.solvers.schur_complement import (
+    AbstractLayout,
+    Blocks,
+    LocalInverse,
+    assemble,
+    local_coordinates,
+    schur_products_of_hosts,
+)
 
 Apply = Callable[[Float[Array, " c"]], Float[Array, " c"]]
 Prepared = TypeVar("Prepared")

@@ -2,7 +2,7 @@
 
 With `S = H - W V^-1 W'` and residuals of unit variance, the inverse of the whole matrix has the blocks
 
-    dense       S^-1                                    around each host: `local_inverse.py`
+    dense       S^-1                                    around each host: `LocalInverse`
     landmarks   V^-1 + V^-1 W' S^-1 W V^-1              the diagonal only: [n, s]
 
 and the second needs, per host, the covariance of its relative coordinates `(eta of each edge, shared)`, which is
@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, inverse_landmark_hessian, moving_landmarks, restricted
-from vggtgeo.solvers.local_inverse import LocalInverse, to_relative, visible
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
+from vggtgeo.solvers.schur_complement import LocalInverse, to_relative, visible
 
 
 class ArrowCovariance(eqx.Module):

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from vggtgeo.solvers.arrow import ArrowSystem, couple, dense_gradient, hessian_times, inverse_landmark_hessian
-from vggtgeo.solvers.local_inverse import rank_tolerance
-from vggtgeo.solvers.schur_complement import Reduced
+from vggtgeo.solvers.schur_complement import Reduced, rank_tolerance
 
 MIN_DIAGONAL = 1e-6
 """Minimum curvature of a coordinate for damping and scaling, if the largest curvature is 1 or more."""

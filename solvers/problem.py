@@ -47,7 +47,7 @@ class AbstractArrowProblem(eqx.Module, Generic[Point]):
         """
 
     def fractions(self) -> Float[Array, "n g q"] | None:
-        """Return the position of each landmark along its segment, if there are segments: see `segments.py`."""
+        """Return the position of each landmark along its segment, if there are segments: see `landmark_basis.py`."""
         return None
 
     def recorded(self, point: Point) -> PyTree:

@@ -13,8 +13,15 @@ import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, back_substitute
 from vggtgeo.solvers.flat_directions import at_least, free_gauge, gauge_stiffness
-from vggtgeo.solvers.local_inverse import LocalInverse, balance, local_coordinates, rank_tolerance, visible
-from vggtgeo.solvers.schur_complement import Reduced, dense_schur_complement
+from vggtgeo.solvers.schur_complement import (
+    LocalInverse,
+    Reduced,
+    balance,
+    dense_schur_complement,
+    local_coordinates,
+    rank_tolerance,
+    visible,
+)
 
 Prepared = TypeVar("Prepared", bound=eqx.Module)
 

@@ -146,5 +146,5 @@ def healthy() -> Any:
 def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of frames that start no window, or hardly one: nothing is compiled beforehand."""
     monkeypatch.setattr("vggtgeo.results.tracking_loop.warm_up", lambda settings, metric: ())
-    monkeypatch.setattr("vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up", lambda self: None)
+    monkeypatch.setattr("vggtgeo.slam.callback.WindowRecorder.on_warm_up", lambda self: None)
     monkeypatch.setattr("vggtgeo.slam.callback.Callback.on_warm_up", lambda self: None)

@@ -29,14 +29,13 @@ STAIR = (
 """Packages of `vggtgeo`, the lowest first: each imports of those below it; those of one step nothing of each other."""
 STEP = {package: step for step, packages in enumerate(STAIR) for package in packages}
 SLAM_STAIR = (
-    ("clock", "precision", "threads"),
+    ("clock", "threads"),
     ("perception",),
     ("settings",),
     ("sparse_map",),
     ("camera", "tracking", "window"),
     ("state",),
-    ("callback", "keyframe_decision", "submaps", "window_steps"),
-    ("window_recorder",),
+    ("callback", "keyframe_decision", "window_steps"),
     ("global_map",),
     ("manhattan", "recorded_prior", "start"),
     ("pipeline",),

@@ -21,10 +21,10 @@ def denied(*arguments, **options):
 
 socket.socket.connect = socket.socket.connect_ex = socket.socket.bind = denied
 socket.create_connection = socket.getaddrinfo = denied
-import vggtgeo.results.tracking_loop, vggtgeo.slam.window_recorder
+import vggtgeo.results.tracking_loop, vggtgeo.slam.callback
 import vggtgeo.slam.callback, vggtgeo.viewing.callback
 vggtgeo.results.tracking_loop.warm_up = lambda settings, metric: ()
-vggtgeo.slam.window_recorder.WindowRecorder.on_warm_up = lambda self: None
+vggtgeo.slam.callback.WindowRecorder.on_warm_up = lambda self: None
 vggtgeo.slam.callback.Callback.on_warm_up = lambda self: None
 vggtgeo.viewing.callback.RerunCallback.on_warm_up = lambda self: None
 from vggtgeo.cli.main import make_app, set_jax_flags

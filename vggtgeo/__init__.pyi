@@ -12,10 +12,10 @@ from . import terms as terms
 from .benchmark.runner import bench as bench
 from .bundle.analysis.covariances import covariances as covariances
 from .bundle.analysis.observability import observability as observability
-from .bundle.graduation import Graduation as Graduation
 from .bundle.marginalisation import empty_prior as empty_prior
 from .bundle.marginalisation import marginalise as marginalise
 from .bundle.marginalisation import permute_prior as permute_prior
+from .bundle.marginalisation import slide as slide
 from .bundle.objective import energy as energy
 from .bundle.observations import Observations as Observations
 from .bundle.packing import pack as pack
@@ -26,7 +26,7 @@ from .bundle.problem import State as State
 from .bundle.problem_file import load_problem as load_problem
 from .bundle.problem_file import save_problem as save_problem
 from .bundle.residuals import residuals_at as residuals_at
-from .bundle.sliding import slide as slide
+from .bundle.solution import Graduation as Graduation
 from .bundle.solution import Solution as Solution
 from .bundle.solution import solve as solve
 from .bundle.solver_choice import choose_reduced_solver as choose_reduced_solver

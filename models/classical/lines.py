@@ -8,11 +8,11 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields, check_image
-from vggtgeo.models.classical.nearest import mutual_nearest, unit
+from vggtgeo.models.classical.pixel_matcher import mutual_nearest, unit
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
 
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.io.argument_checks import check_fields, check_image
 
 
 @dataclass(frozen=True)

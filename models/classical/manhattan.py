@@ -14,7 +14,7 @@ from itertools import permutations, product
 
 import cv2
 import numpy as np
-from vggtgeo.models.classical.nearest import unit
+from vggtgeo.models.classical.pixel_matcher import unit
 
 from vggtgeo.geometry import pinhole
 

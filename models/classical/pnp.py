@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.two_view import TwoViewStart
 from vggtgeo.models.classical.verification import SampleOrder
 from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery, StartGuess
@@ -15,6 +14,7 @@ from vggtgeo.models.roles import GeometryResult, PoseGuess, PoseQuery, StartGues
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.gauss_newton import damped_step, gauss_newton
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.io.argument_checks import check_fields
 
 
 @dataclass(frozen=True)

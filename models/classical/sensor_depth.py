@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_array, check_fields
 from vggtgeo.models.roles import DepthEstimate
+
+from vggtgeo.io.argument_checks import check_array, check_fields
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields, check_image
+
+from vggtgeo.io.argument_checks import check_fields, check_image
 
 
 @dataclass(frozen=True)

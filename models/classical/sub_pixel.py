@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields
+
+from vggtgeo.io.argument_checks import check_fields
 
 
 @dataclass(frozen=True)

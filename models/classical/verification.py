@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields
 
 from vggtgeo.geometry import pinhole
+from vggtgeo.io.argument_checks import check_fields
 
 Role = TypeVar("Role")
 

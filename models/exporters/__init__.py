@@ -8,7 +8,7 @@ part of this package; torch and onnx are imported only while exporting (extra `e
 |---|---|
 | `recipes` | one entry for each network: its code, sizes, variants |
 | `vggt`, `dinov3`, `moge2`, `line_detectors`, `point_matchers` | building a network, its changes |
-| `request`, `weights` | importing from a checkout; loading a checkpoint, or random weights |
+| `network` | importing from a checkout; loading a checkpoint, or random weights |
 | `attention` | changes that several of them need |
 | `export` | writing, checking and comparing the file |
 """

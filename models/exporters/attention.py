@@ -18,7 +18,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from vggtgeo.models.exporters.request import load
+from vggtgeo.models.exporters.network import load
 
 
 @contextmanager

@@ -14,8 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from vggtgeo.models.exporters.attention import attention_replaced, halve_blocks
-from vggtgeo.models.exporters.request import Graph, Request, as_module, load
-from vggtgeo.models.exporters.weights import fill
+from vggtgeo.models.exporters.network import Graph, Request, as_module, fill_weights, load
 
 PREFIX = 5
 """The class token and four registers."""
@@ -28,7 +27,7 @@ def build(request: Request) -> Graph:
     torch = load("torch")
     with request.code() as imported:
         network = getattr(imported("dinov3.hub.backbones"), f"dinov3_{request.variant}")(pretrained=False)
-    fill(network, request, f"DINOv3 {request.variant}")
+    fill_weights(network, request, f"DINOv3 {request.variant}")
     image = request.random_images(-_DEVIATIONS, _DEVIATIONS)
     recorded: list[tuple[Any, Any]] = []
 

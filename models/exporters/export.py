@@ -25,9 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from vggtgeo.models.exporters.network import Graph, Request, checkpoint_identity, evaluate, load, read_checkpoint
 from vggtgeo.models.exporters.recipes import Recipe
-from vggtgeo.models.exporters.request import Graph, Request, evaluate, load
-from vggtgeo.models.exporters.weights import identity, read_checkpoint
 from vggtgeo.models.onnx.contracts import (
     CONTRACTS,
     HALF_TOLERANCE,
@@ -89,7 +88,7 @@ def export(
         load(package)
     if request.checkpoint is not None:
         read_checkpoint(request.checkpoint)  # before a network of gigabytes is built
-    weights = identity(request.checkpoint)
+    weights = checkpoint_identity(request.checkpoint)
     tolerance = tolerance or (HALF_TOLERANCE if request.half else TOLERANCE)
     output.parent.mkdir(parents=True, exist_ok=True)
     # On the same file system, so that moving its files out is one step each.

@@ -16,8 +16,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from vggtgeo.models.exporters.request import Graph, Request, as_module, load
-from vggtgeo.models.exporters.weights import fill
+from vggtgeo.models.exporters.network import Graph, Request, as_module, fill_weights, load
 
 _FOURTH_CHANNEL = 1 / 127.5 - 1
 """An image of ones, scaled as the colours are (M-LSD)."""
@@ -40,7 +39,7 @@ def build_letr(request: Request) -> Graph:
         options = imported("args").get_args_parser().parse_args(_arguments(request, backbone))
         network = code.build(options)[0]
         nested = imported("util.misc").NestedTensor
-    fill(network, request, f"LETR {request.variant}, both stages")
+    fill_weights(network, request, f"LETR {request.variant}, both stages")
     image = torch.from_numpy(request.random_images(-2.0, 2.0))
     mask = torch.zeros(1, request.height, request.width, dtype=torch.bool)
     with torch.inference_mode():
@@ -76,7 +75,7 @@ def build_mlsd(request: Request) -> Graph:
     """Return the network for its one size, 512 x 512: maps of segment centres and displacements."""
     with request.code() as imported:
         network = imported("models.mbv2_mlsd_tiny").MobileV2_MLSD_Tiny()
-    fill(network, request, "M-LSD tiny")
+    fill_weights(network, request, "M-LSD tiny")
     colours = request.random_images(-1.0, 1.0)
     image = np.concatenate([colours, np.full_like(colours[:, :1], _FOURTH_CHANNEL)], axis=1)
     return Graph.unchanged(network, lambda network, image: network(image), {"image": image}, ("maps",))

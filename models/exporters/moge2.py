@@ -20,8 +20,7 @@ from typing import Any
 from unittest import mock
 
 from vggtgeo.models.exporters.attention import halve_blocks
-from vggtgeo.models.exporters.request import Graph, Request, as_module, load
-from vggtgeo.models.exporters.weights import fill, read_checkpoint
+from vggtgeo.models.exporters.network import Graph, Request, as_module, fill_weights, load, read_checkpoint
 
 from vggtgeo.io.errors import InputError
 
@@ -39,7 +38,7 @@ def build(request: Request) -> Graph:
     sys.modules.setdefault("utils3d", ModuleType("utils3d"))
     with request.code() as imported, without_xformers:
         network = imported("moge.model.v2").MoGeModel(**configuration)
-    fill(network, request, f"MoGe-2 {configuration['encoder']['backbone']}")
+    fill_weights(network, request, f"MoGe-2 {configuration['encoder']['backbone']}")
     image = request.random_images(0.0, 1.0)
     with torch.inference_mode():
         outputs = network(torch.from_numpy(image), request.tokens)

@@ -18,8 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 from vggtgeo.models.exporters.attention import fix_positions, grid, halve_blocks
-from vggtgeo.models.exporters.request import Graph, Request, as_module, load
-from vggtgeo.models.exporters.weights import fill
+from vggtgeo.models.exporters.network import Graph, Request, as_module, fill_weights, load
 
 PATCH = 16
 _BASE = 100.0
@@ -100,7 +99,7 @@ def _network(request: Request) -> Any:
         small = _SMALL if request.variant == "test" else {}
         network = imported("mast3r.model").AsymmetricMASt3R(**_METRIC | small)
     torch.backends.cuda.matmul.allow_tf32 = allowed
-    fill(network, request, "MASt3R ViT-L metric")
+    fill_weights(network, request, "MASt3R ViT-L metric")
     return network
 
 
@@ -139,7 +138,7 @@ def build_alike(request: Request) -> Graph:
     torch = load("torch")
     with request.code() as imported:
         network = imported("alnet").ALNet(*_ALIKE_SIZES[request.variant], single_head=request.variant != "large")
-    fill(network, request, f"ALIKE {request.variant}")
+    fill_weights(network, request, f"ALIKE {request.variant}")
 
     def forward(network: Any, image: Any) -> tuple[Any, Any]:
         scores, descriptors = network(image)
@@ -157,7 +156,7 @@ def build_xfeat(request: Request) -> Graph:
     functional = load("torch").nn.functional
     with request.code() as imported:
         network = imported("modules.model").XFeatModel()
-    fill(network, request, "XFeat")
+    fill_weights(network, request, "XFeat")
 
     def forward(network: Any, image: Any) -> tuple[Any, Any]:
         features, logits, reliability = network(image)

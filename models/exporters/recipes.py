@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vggtgeo.models.exporters import dinov3, line_detectors, moge2, point_matchers, vggt
-from vggtgeo.models.exporters.request import Checkout, Graph, Request
+from vggtgeo.models.exporters.network import Checkout, Graph, Request
 
 from vggtgeo.io.errors import InputError
 

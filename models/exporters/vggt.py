@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 from vggtgeo.models.exporters.attention import attention_replaced, fix_positions, grid, halve_blocks, in_parts
-from vggtgeo.models.exporters.request import Graph, Request, as_module, load
-from vggtgeo.models.exporters.weights import fill
+from vggtgeo.models.exporters.network import Graph, Request, as_module, fill_weights, load
 
 PATCH = 14
 
@@ -33,7 +32,7 @@ def build(request: Request) -> Graph:
     with request.code() as imported:
         code = imported("vggt.models.vggt")
         network = _small(code) if request.variant == "test" else code.VGGT()
-    fill(network, request, "VGGT-1B")
+    fill_weights(network, request, "VGGT-1B")
     network.point_head = network.track_head = None
     images = request.random_images(0.0, 1.0, request.views)
     with torch.inference_mode(), request.checkout.importable(request.source):

@@ -6,14 +6,15 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.lines import match_segments
-from vggtgeo.models.classical.nearest import unit
+from vggtgeo.models.classical.pixel_matcher import unit
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.contracts import DINOV3
 from vggtgeo.models.onnx.fit import Fit, vectors_at
 from vggtgeo.models.onnx.session import NetworkValueError, Session
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
+
+from vggtgeo.io.argument_checks import check_fields
 
 PREFIX = 5
 """Tokens before the patches: the class token and four registers."""

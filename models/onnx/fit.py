@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from vggtgeo.models.classical.nearest import unit
+from vggtgeo.models.classical.pixel_matcher import unit
 
 _MAX_STRETCH = 1.05
 _BORDER = (127, 127, 127)

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import least_squares
-from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.sensor_depth import no_depth
 from vggtgeo.models.onnx.cache import MemoryCache, OutputCache, Outputs
 from vggtgeo.models.onnx.fit import Fit
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import DepthEstimate
+
+from vggtgeo.io.argument_checks import check_fields
 
 _GRID = 64
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from vggtgeo.models.checks import check_fields
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors, PixelMatcher, spread, verified
 from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
@@ -19,6 +18,8 @@ from vggtgeo.models.onnx.contracts import NetworkFileError
 from vggtgeo.models.onnx.fit import Fit, vectors_at
 from vggtgeo.models.onnx.session import Session
 from vggtgeo.models.roles import Features, PointMatches
+
+from vggtgeo.io.argument_checks import check_fields
 
 _WANTED = ("descriptors_1", "descriptors_2", "descriptor_confidence_1", "descriptor_confidence_2")
 

@@ -17,7 +17,6 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import onnxruntime
-from vggtgeo.models.checks import check_image
 from vggtgeo.models.onnx.contracts import (
     CONTRACTS,
     METADATA_NETWORK,
@@ -34,6 +33,7 @@ from vggtgeo.models.onnx.contracts import (
 )
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 
+from vggtgeo.io.argument_checks import check_image
 from vggtgeo.io.errors import InputError, install_hint, put_back_hint
 
 _log = logging.getLogger(__name__)

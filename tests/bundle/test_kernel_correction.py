@@ -16,9 +16,8 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
-from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.solution import Graduation, solve
 
 SCENE = make_scene(noise=0.7, outliers=0.2, depth_error=0.1, seed=1)
 FAR = make_scene(4, points=20, lines=1, samples=3, noise=0.5, outliers=0.1, start_error=20.0, seed=3)

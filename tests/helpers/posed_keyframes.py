@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from vggtgeo.models.roles import Features, LineFeatures, Segments
 
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, KeyframeImages, Slots
 
 SIZE = (120, 160)
 INTRINSICS = np.array([160.0, 160.0, 79.5, 59.5])

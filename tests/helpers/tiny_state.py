@@ -10,8 +10,7 @@ from vggtgeo.models.roles import Features, LineFeatures, LineMatches, PointMatch
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, KeyframeImages, Slots
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 

@@ -24,8 +24,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.known_map import as_map, entered, save_map
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.window_steps import merge_pending_window
 
 FRAMES, HALF = 14, 7

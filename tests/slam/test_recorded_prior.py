@@ -23,8 +23,7 @@ from vggtgeo.slam.recorded_prior import prior_summary, with_recorded_ties
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.map import Map, submap_of
-from vggtgeo.slam.sparse_map.units import longer, scaled_factor, scaled_keyframe
+from vggtgeo.slam.sparse_map.map import Map, longer, scaled_factor, scaled_keyframe, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.recorded_motion import SIGNIFICANT, compare
 from vggtgeo.slam.tracking.tracker import FramePose, Tracker

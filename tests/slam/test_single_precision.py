@@ -10,7 +10,7 @@ import pytest
 import rerun as rr
 
 import vggtgeo as vg
-from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.viewing.callback import RerunCallback
 

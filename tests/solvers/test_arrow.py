@@ -18,7 +18,7 @@ from vggtgeo.solvers.covariance import ArrowCovariance, covariance
 from vggtgeo.solvers.reduced_solvers import DenseCholesky
 from vggtgeo.solvers.schur_complement import dense_schur_complement, reduced_blocks, sparse_layout
 
-from vggtgeo.bundle.analysis.weakest import sparse_matrix
+from vggtgeo.bundle.analysis.weak_directions import sparse_matrix
 
 
 def flat(vector: ArrowVector) -> np.ndarray:

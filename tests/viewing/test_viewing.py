@@ -66,7 +66,7 @@ def test_the_recording_of_an_earlier_run_is_not_shown(tmp_path: Path, target: st
     """Of the recordings in a folder, `view` takes the one that the folder's settings name, and none that another run
     or `view` left; without settings, as after a kill, the newest. Oracle: what was put there.
     """
-    from vggtgeo.viewing.folder import recording_of
+    from vggtgeo.viewing.target import recording_of
 
     for age, name in enumerate(("view.rrd", "run.rrd", "kept.rrd")):
         (tmp_path / name).write_bytes(b"")

@@ -18,8 +18,7 @@ from vggtgeo.benchmark.suite import PROTOCOLS, SequenceTable, SettingTable, Suit
 from vggtgeo.benchmark.worker import JOB, ROW, identity
 from vggtgeo.datasets.opening import is_readable
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import write_json
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text, write_json
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import changed, updated
 

@@ -29,9 +29,9 @@ from vggtgeo.evaluation import evaluate_trajectory, followed
 from vggtgeo.figures.plot import plot
 from vggtgeo.figures.plots import NotebookFigure
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import locked_folder, write_text
-from vggtgeo.io.given import path_of
 
 OUTPUTS = ("report.html", "tables.md", "runs.csv", "runs.parquet")
 """Files of a suite in its folder; the last one only with PyArrow."""

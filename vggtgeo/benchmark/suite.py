@@ -20,7 +20,7 @@ from typing import Any, Self
 from vggtgeo.datasets.opening import KINDS
 from vggtgeo.evaluation.alignment import AXES
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 from vggtgeo.simulation.degradations import DEGRADATIONS
 from vggtgeo.simulation.sequence import check_walk
 from vggtgeo.slam.settings.slam_settings import SlamSettings

@@ -18,8 +18,8 @@ from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import GivenTerm, PaddedSize, SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solve
+from vggtgeo.io.argument_checks import check_kind, check_whole
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, check_whole
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
 Window = (

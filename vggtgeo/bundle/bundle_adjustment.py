@@ -12,8 +12,8 @@ from vggtgeo.bundle.objective import prepared, prepared_energy
 from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
+from vggtgeo.solvers.landmark_basis import slopes
 from vggtgeo.solvers.problem import AbstractArrowProblem
-from vggtgeo.solvers.segments import slopes
 
 MIN_SHRINK = 0.1
 """Smallest factor by which the depths of a segment shrink in one step, so that all stay positive."""

@@ -23,8 +23,8 @@ from vggtgeo.bundle.terms.landmark import DepthPrior, SlotTerm
 from vggtgeo.bundle.terms.measured_pose import UNIT
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, IntrinsicsPrior, NodeTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.io.argument_checks import check_kind, real_numbers
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel
 
 _OWN = tuple(kind.name for kind in (PointTerm, LineTerm, DepthPrior, IntrinsicsPrior))

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
-from vggtgeo.bundle.analysis.directions import rigid_motions
+from vggtgeo.bundle.analysis.weak_directions import rigid_motions
 from vggtgeo.bundle.linearise import free_coordinates
 from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, prepared, prepared_energy
 from vggtgeo.bundle.problem import Problem, State

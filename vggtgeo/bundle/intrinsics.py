@@ -9,8 +9,8 @@ import numpy as np
 
 from vggtgeo.bundle.checks import check_fixed, check_range
 from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, with_shared_focal
+from vggtgeo.io.argument_checks import real_numbers
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import real_numbers
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,16 @@ from which the landmarks and then the leaving pose are eliminated by Schur compl
 the new prior `1/2 |R x + r0|^2`. States that are already under a prior keep their linearisation point (first-estimates
 Jacobians): two linearisations of one state would add spurious information along the gauge. Cost: one linearisation, one
 symmetric eigenvalue problem of size `6 n + 4`.
+
+`slide` is one step of a sliding window, with static shapes: a solved window of `n` keyframes loses one, which is
+marginalised, the others move up, and a new one takes the last position. The observations of the new window are packed
+beforehand. The old window contributes the prior, the remaining poses, the cameras' parameters, and the flags of fixed
+poses.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -34,8 +40,8 @@ from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie
+from vggtgeo.io.argument_checks import check_kind, check_whole, real_numbers
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, check_whole, real_numbers
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 _MAX_KEYFRAMES = 1000
@@ -254,3 +260,88 @@ def _marginal_term(problem: Problem) -> MarginalPrior:
 
 
 marginalise_jit = CachedProgram(marginalise, lambda problem, state, leaving: _marginal_term(problem))
+
+
+def slide(
+    problem: Problem,
+    state: State,
+    next_problem: Problem,
+    next_initial: State,
+    *,
+    leaving: Int[Array, ""] | int = 0,
+    constant_velocity: bool = False,
+) -> tuple[Problem, State]:
+    """Marginalise keyframe `leaving` of a solved window, and prepare the next window for `solve`.
+
+    Pure, of static shapes and differentiable: the body of a `jax.lax.scan` together with `solve`, under `jit`, `vmap`
+    and `grad`. Keyframes of the next window: the remaining ones in their order, and a new one in the last position.
+
+    Args:
+        problem: the solved window, `n >= 2` keyframes, with a `marginal` term (`empty_prior(n)` in the first).
+        state: its solution.
+        next_problem: the observations of the next window, in the same shapes. The prior is added, and fixed poses stay
+            fixed; its own `fixed_pose` is used for the new keyframe only.
+        next_initial: its initial inverse depths (1/m), pixel offsets, and the new keyframe's pose (world -> camera, the
+            last). The other poses and the cameras' parameters are those of `state`.
+        leaving: index of the keyframe that leaves; 0 is the oldest. May be traced.
+        constant_velocity: initialise the new pose by constant velocity from the last two keyframes of `state`, instead
+            of from `next_initial`.
+
+    Returns:
+        The next window's problem and initial state, the arguments of `solve`.
+
+    Raises:
+        InputError: windows of different shapes or cameras, fewer than two keyframes, or `leaving` out of range.
+        ValueError: `problem` has no `marginal` term.
+
+    Example:
+        >>> import jax, vggtgeo as vg
+        >>> long = vg.simulate_window(keyframes=4, points=8, lines=0)
+        >>> parts = [long.observations.within([k, k + 1, k + 2]) for k in (0, 1)]
+        >>> known = vg.cameras.Intrinsics(long.intrinsics, fixed=True)
+        >>> windows = [(seen, long.start[k : k + 3], known, seen.depth_mean) for k, seen in enumerate(parts)]
+        >>> (first, second), (start, guess) = (
+        ...     [jax.tree.map(lambda leaf: leaf[k], tree) for k in (0, 1)]
+        ...     for tree in vg.batches.pack_batch(windows, terms=[vg.empty_prior(3)])[:2]
+        ... )
+        >>> problem, initial = vg.slide(first, vg.solve(first, start).state, second, guess)
+        >>> bool(vg.solve(problem, initial).converged), problem.fixed_pose.tolist()
+        (True, [False, False, False])
+
+    """
+    check_pair(problem, state)
+    check_pair(next_problem, next_initial, "next_initial")
+    _check_alike(problem, next_problem)
+    place = jnp.arange(problem.num_keyframes - 1)
+    staying = place + (place >= leaving)
+    # The last position is the new keyframe, about which the prior knows nothing.
+    prior = permute_prior(marginalise(problem, state, leaving), jnp.append(staying, -1))
+    poses = state.poses.wxyz_xyz
+    newest = _extrapolated(poses) if constant_velocity else next_initial.poses.wxyz_xyz[-1]
+    fixed = jnp.append(problem.fixed_pose[staying], next_problem.fixed_pose[-1])
+    return (
+        eqx.tree_at(lambda following: following.fixed_pose, next_problem.with_term(prior), fixed),
+        replace(
+            next_initial,
+            poses=jaxlie.SE3(jnp.concatenate([poses[staying], newest[None]])),
+            intrinsics=state.intrinsics,
+        ),
+    )
+
+
+def _extrapolated(poses: Float[Array, "n 7"]) -> Float[Array, "7"]:
+    last = jaxlie.SE3(poses[-1])
+    moved = lie.relative(jaxlie.SE3(poses[-2]), last) @ last
+    # Rounding moves products of unit quaternions away from unit length, and a scan repeats this many times.
+    return lie.cast(moved.normalize(), poses.dtype).wxyz_xyz
+
+
+def _check_alike(problem: Problem, following: Problem) -> None:
+    if problem.num_keyframes < 2:
+        raise InputError("`problem` must have at least 2 keyframes, got 1")
+    wanted, found = ((window.num_keyframes, window.fixed_intrinsics.shape) for window in (problem, following))
+    if found != wanted:
+        raise InputError(
+            f"`next_problem` must have the numbers of keyframes and camera parameters of `problem`, {wanted}, got "
+            f"{found}: pack all windows to one shape with `vggtgeo.batches.pack_batch`"
+        )

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.io.argument_checks import real_numbers
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel
 
 

@@ -49,8 +49,8 @@ from vggtgeo.bundle.terms.landmark import DepthPrior, HostPixel, SlotTerm
 from vggtgeo.bundle.terms.node import DenseTerm, IntrinsicsPrior
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry.line_segments import fractions, straightened
+from vggtgeo.io.argument_checks import check_kind, real_numbers
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
 

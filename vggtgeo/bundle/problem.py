@@ -24,8 +24,8 @@ from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, IntrinsicsPrior, No
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, SharedFocal
+from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind
 
 MIN_INVERSE_DEPTH = 1e-6
 """Lower bound of positive inverse depths, 1/m (1000 km)."""

@@ -28,9 +28,9 @@ from vggtgeo.bundle.problem import Edges, Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import camera_models as cameras
 from vggtgeo.io.archives import Archive, ArrayHeader, open_archive
+from vggtgeo.io.argument_checks import check_kind, path_of
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
-from vggtgeo.io.given import check_kind, path_of
 from vggtgeo.io.persistence import DATA, HEADER, Format, by_name
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 

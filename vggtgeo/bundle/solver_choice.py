@@ -20,7 +20,7 @@ from scipy.sparse.linalg import eigsh
 
 from vggtgeo.bundle.problem import Problem
 from vggtgeo.bundle.terms.node import PairTerm
-from vggtgeo.io.given import check_kind
+from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.solvers.band_cholesky import BandCholesky
 from vggtgeo.solvers.conjugate_gradients import BandPreconditioner, BlockJacobi, ConjugateGradients
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt

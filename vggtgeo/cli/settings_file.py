@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 if TYPE_CHECKING:
     from vggtgeo.slam.settings.slam_settings import SlamSettings

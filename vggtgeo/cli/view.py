@@ -27,8 +27,8 @@ def view(
     if page:
         _open_page(folder, as_json)
         return
-    from vggtgeo.viewing.folder import log_folder, recording_of
-    from vggtgeo.viewing.target import flush, has_screen, open_target
+    from vggtgeo.viewing.entities import log_folder
+    from vggtgeo.viewing.target import flush, has_screen, open_target, recording_of
 
     recording = recording_of(folder) if rerun in ("spawn", "serve") else None
     if recording is None:

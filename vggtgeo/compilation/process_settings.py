@@ -1,10 +1,14 @@
-"""Settings of JAX and BLAS during one call of the library, as environment variables set them for the program."""
+"""Settings of JAX and BLAS during one call, independent of the caller's own: those that environment variables set for
+the program (`jax_environment.py`), and double precision.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
@@ -60,3 +64,31 @@ def _set_cache(folder: str | None, shortest: float) -> None:
     jax.config.update(FOLDER, folder)
     jax.config.update(SHORTEST, shortest)
     compilation_cache.reset_cache()  # JAX decides once whether there is a cache, and with which folder
+
+
+_Given = ParamSpec("_Given")
+_Result = TypeVar("_Result")
+
+
+def in_double_precision(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """Run `function` with JAX's 64-bit types enabled; the caller's setting is restored.
+
+    The prior of marginalised keyframes is a product of many solves. In single precision its weakest directions (scale,
+    drift) are lost in the rounding errors of its strongest.
+
+    The caller's debugging options are disabled as well: here NaN means unknown, compiled programs cannot run line by
+    line, and types are mixed.
+    """
+
+    @wraps(function)
+    def wrapped(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
+        with (
+            jax.enable_x64(True),
+            jax.numpy_dtype_promotion("standard"),
+            jax.debug_nans(False),
+            jax.debug_infs(False),
+            jax.disable_jit(False),
+        ):
+            return function(*args, **kwargs)
+
+    return wrapped

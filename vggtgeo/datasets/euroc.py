@@ -17,7 +17,7 @@ from vggtgeo.datasets.pose_files import check_size, parsing, poses_of, read_matr
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning, warn
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 _MODEL = re.compile(r"^\s*distortion_model\s*:\s*['\"]?([\w-]+)", re.MULTILINE)
 

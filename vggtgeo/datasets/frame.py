@@ -10,8 +10,8 @@ from jaxtyping import Float, UInt8
 
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import MAX_TIME, Trajectory
+from vggtgeo.io.argument_checks import check_whole
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_whole
 
 MAX_DELAY = 0.02
 """Maximum seconds between an image and its depth."""

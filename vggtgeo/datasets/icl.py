@@ -28,7 +28,7 @@ from vggtgeo.datasets.tum import head_of, read_pairs
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 _CAMERA, _SIZE = (481.20, 480.00, 319.50, 239.50), (640, 480)
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

@@ -21,7 +21,7 @@ from PIL import Image, UnidentifiedImageError
 
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError, install_hint
-from vggtgeo.io.text_files import content_of
+from vggtgeo.io.files import content_of
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 OTHER_PICTURES = frozenset({".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".dng", ".raw", ".cr2", ".nef", ".arw"})

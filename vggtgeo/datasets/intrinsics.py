@@ -11,7 +11,7 @@ import numpy as np
 from vggtgeo.datasets.pose_files import check_size, parsing, read_json, same_size
 from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, warn
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 NARROWEST, WIDEST = 1.0, 170.0
 """Minimum and maximum field of view of a pinhole camera, degrees."""

@@ -18,7 +18,7 @@ from vggtgeo.datasets.pose_files import parsing, poses_of_rows, read_matrices, t
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning, warn
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 RATE = 10.0
 _FOLDERS = ("image_2", "image_0", "image_02/data", "image_00/data")

@@ -23,8 +23,8 @@ from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.datasets.tum import TumRgbd
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.datasets.views import with_rate
+from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.given import path_of
 
 
 class FolderReader(Protocol):

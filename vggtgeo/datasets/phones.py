@@ -46,7 +46,7 @@ from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, warn
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 LARGEST = 960
 """Maximum pixels of the longer side: the depth has 256, and images of 1920 cost four times as much."""

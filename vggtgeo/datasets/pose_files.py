@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry.trajectory import MAX_COORDINATE, MAX_QUATERNION, MAX_TIME, MIN_QUATERNION, Trajectory, rising
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning, warn
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 _KITTI, _EUROC = 12, 17
 """Columns of their trajectory files."""

@@ -34,8 +34,8 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError, install_hint, warn
-from vggtgeo.io.text_files import MAX_BYTES as MAX_TEXT
-from vggtgeo.io.text_files import content_of
+from vggtgeo.io.files import MAX_BYTES as MAX_TEXT
+from vggtgeo.io.files import content_of
 
 SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"

@@ -34,7 +34,7 @@ from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 _COLOUR = frozenset({".jpg", ".jpeg", ".png"})
 

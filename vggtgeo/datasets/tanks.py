@@ -17,7 +17,7 @@ from vggtgeo.datasets.pose_files import have_rotations, parsing, read_json, read
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 _LOG = "_COLMAP_SfM.log"
 _LINES = 5

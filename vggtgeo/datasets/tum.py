@@ -17,7 +17,7 @@ from vggtgeo.datasets.images import FRAMES_PER_SECOND, partners_in_time
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, LeftOutWarning, warn
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 
 _MAX_LETTERS = 200
 _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")

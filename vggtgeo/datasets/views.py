@@ -29,8 +29,8 @@ from vggtgeo.datasets.nerfstudio import Nerfstudio
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_positive, check_within
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.given import check_positive, check_within
 
 MIN_UNITS, MAX_UNITS = 1e-3, 1e6
 """Units a metre of depth files."""

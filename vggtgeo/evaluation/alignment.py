@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import real_array
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import real_array
 
 Alignment = Literal["none", "se3", "sim3", "yaw"]
 Axis = Literal["x", "y", "z"]

@@ -6,8 +6,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_real
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real
 
 MAX_TIME_DIFFERENCE = 0.01
 """Largest time difference of a match, seconds; evo's default."""

@@ -25,8 +25,8 @@ from vggtgeo.evaluation.alignment import VERTICAL, Alignment, Similarity, align
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, nearest_in_time
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_real
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_real
 
 Unit = Literal["poses", "seconds", "metres"]
 UNITS: tuple[Unit, ...] = get_args(Unit)

@@ -17,10 +17,9 @@ from vggtgeo.export.colmap import copy_pictures, write_colmap
 from vggtgeo.export.surfaces import cloud_of, write_glb, write_las, write_ply
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.files import atomic_path, not_written, whole_path, write_json, write_picture, write_text
-from vggtgeo.io.given import path_of
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import atomic_path, not_written, whole_path, whole_text, write_json, write_picture, write_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.output_checks import EXPORTS, check_is_run
 from vggtgeo.results.scene import Scene

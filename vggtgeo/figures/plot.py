@@ -26,8 +26,8 @@ from vggtgeo.figures.plots import (
 )
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_kind, check_positive, real_array
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, check_positive, real_array
 
 _FACTORS = (1, 3, 10, 30, 100, 300, 1000)
 """Standard deviations to choose from for the ellipses."""

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vggtgeo.geometry import pinhole
+from vggtgeo.io.argument_checks import check_whole, real_array
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_whole, real_array
 
 GUESSED_FIELD_OF_VIEW = math.radians(60.0)
 """Field of view of the longer image side: between phones (about 70 deg) and narrower depth and headset cameras (57

@@ -1,7 +1,7 @@
 """Line segments before packing: positions of samples along their segment, and inverse depths affine along it.
 
 Along the image of a 3D line, inverse depth is an affine function of the pixel. So the samples of a segment share two
-unknowns instead of having one each (see `solvers/segments.py`).
+unknowns instead of having one each (see `solvers/landmark_basis.py`).
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from vggtgeo.geometry.point_cloud import COLOUR, NORMAL, UNREADABLE, bytes_of_colours, columns_of, write_ply
+from vggtgeo.io.argument_checks import path_of, real_array
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import path_of, real_array
 
 
 @dataclass(frozen=True, eq=False)

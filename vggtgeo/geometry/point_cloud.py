@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from vggtgeo.io.argument_checks import path_of, real_array
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
-from vggtgeo.io.given import path_of, real_array
 
 UNREADABLE = (OSError, KeyError, ValueError, TypeError, MemoryError, OverflowError, PlyParseError)
 """Errors of the parser for files that are invalid, or declare more than they contain."""

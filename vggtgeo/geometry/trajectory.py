@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from vggtgeo.io.argument_checks import path_of, real_array
 from vggtgeo.io.errors import InputError, InputWarning
-from vggtgeo.io.files import write_text
-from vggtgeo.io.given import path_of, real_array
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text, write_text
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
 MIN_QUATERNION, MAX_QUATERNION = 0.5, 2.0

@@ -1,12 +1,14 @@
-"""Atomic writes: a reader of a file sees the old content or the new, never a part; and locks.
+"""Read text files of any origin, write files atomically, lock files and folders.
 
-The content is written to a temporary file in the same folder (so that `os.replace` stays within one file system),
-flushed to the disk, and renamed in one step. After an exception or Ctrl-C the temporary file is removed, and the old
-file is unchanged. Locks of files and folders are released by the system when the process ends.
+Atomic: a reader of a file sees the old content or the new, never a part. The content is written to a temporary file in
+the same folder (so that `os.replace` stays within one file system), flushed to the disk, and renamed in one step. After
+an exception or Ctrl-C the temporary file is removed, and the old file is unchanged. Locks of files and folders are
+released by the system when the process ends.
 """
 
 from __future__ import annotations
 
+import codecs
 import errno
 import json
 import os
@@ -20,8 +22,8 @@ import cv2
 import numpy as np
 from filelock import FileLock, Timeout
 
+from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import path_of
 
 
 def whole_path(path: Path) -> Path:
@@ -132,3 +134,30 @@ def not_written(folder: Path, error: OSError, reserve: int = 0) -> InputError:
     """Return the error for a folder that is not writable. reserve: bytes that a run needs there."""
     room = f"; a run needs {reserve // 2**20} MB" if reserve else ""
     return InputError(f"`{folder}` cannot be written: {error.strerror or error}{room}: give another folder with `-o`")
+
+
+MAX_BYTES = 64 * 2**20
+"""Maximum size of a text file: 600,000 poses, five hours of frames; parsed, it takes ten times as much memory."""
+
+
+def content_of(file: Path, max_bytes: int) -> bytes:
+    """Return the bytes of a regular file; raise InputError if it is larger, or cannot be read."""
+    try:
+        if file.exists() and not file.is_file():  # a pipe has no end
+            raise InputError(f"`{file}` is not a regular file")
+        size = file.stat().st_size
+        if size > max_bytes:
+            raise InputError(f"`{file}` has {size} bytes; at most {max_bytes} are read")
+        return file.read_bytes()
+    except OSError as error:
+        raise InputError(f"`{file}` cannot be read: {error.strerror or error}") from None
+
+
+def whole_text(file: Path, errors: str = "replace") -> str:
+    """Return the text of a file of at most `MAX_BYTES` bytes, UTF-8 or UTF-16, without a byte order mark; raise
+    InputError if it is larger, or cannot be read.
+    """
+    content = content_of(file, MAX_BYTES)
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = content.decode("utf-16" if wide else "utf-8-sig", errors)
+    return text.replace("\r\n", "\n").replace("\r", "\n")  # as Python reads a text

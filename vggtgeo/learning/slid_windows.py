@@ -17,9 +17,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from vggtgeo.bundle.marginalisation import empty_prior
+from vggtgeo.bundle.marginalisation import empty_prior, slide
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.sliding import slide
 from vggtgeo.bundle.solution import Solution, solve
 from vggtgeo.bundle.terms.measured_pose import BaselinePrior
 from vggtgeo.learning.tracked_windows import TrackedWindow

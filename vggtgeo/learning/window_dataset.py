@@ -25,11 +25,10 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_arrays, save_problem
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.datasets.image_files import is_there
+from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import write_json
-from vggtgeo.io.given import path_of
+from vggtgeo.io.files import whole_text, write_json
 from vggtgeo.io.persistence import Format
-from vggtgeo.io.text_files import whole_text
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
 

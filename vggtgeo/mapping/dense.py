@@ -13,16 +13,14 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
+from vggtgeo.mapping.depth_fusion import fused_mesh, measured_depth
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.mapping.fusion import fused_mesh, measured_depth
 from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
 from vggtgeo.models.classical import NoDepth, SensorDepth
 from vggtgeo.models.roles import MetricDepth
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.keyframe_images import array_of
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, array_of
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.threads import map_in_threads
 
 DenseMode = Literal["auto", "mvs", "sensor", "network", "none"]

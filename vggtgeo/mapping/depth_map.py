@@ -12,7 +12,7 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole
 from vggtgeo.io.errors import InputError
-from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
+from vggtgeo.slam.sparse_map.keyframe import CompressedImage, array_of
 
 COMPRESS_FROM = 200
 """Number of keyframes from which depth maps are compressed in memory. At 640 x 480: 0.4 MB in place of 3.7 MB, 20 ms to

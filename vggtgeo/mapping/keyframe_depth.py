@@ -18,8 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.mapping.depth_map import COMPRESS_FROM
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
+from vggtgeo.slam.sparse_map.keyframe import CompressedImage, Keyframe, array_of
 from vggtgeo.slam.threads import map_in_threads
 
 CELL = 24.0

@@ -27,7 +27,7 @@ from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import cell_numbers
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, array_of
+from vggtgeo.slam.sparse_map.keyframe import CompressedImage, array_of
 
 Block = tuple[int, int, int]
 """Corner of a block of voxels, in blocks."""

@@ -25,7 +25,7 @@ from vggtgeo.figures.plots import (
     line_colour,
     style,
 )
-from vggtgeo.slam.window_recorder import WindowRecord
+from vggtgeo.slam.callback import WindowRecord
 
 COLOURS = {
     BLUE: "var(--blue)",

@@ -19,11 +19,11 @@ from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
 from vggtgeo.report.map_scene import spread
 from vggtgeo.report.viewer import INSTALL, style, template
+from vggtgeo.slam.callback import WindowRecord
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.finding import Verdict
-from vggtgeo.slam.window_recorder import WindowRecord
 
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""

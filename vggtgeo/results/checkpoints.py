@@ -20,19 +20,19 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.datasets.frame import Frame
+from vggtgeo.io.argument_checks import check_real, path_of
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
-from vggtgeo.io.given import check_real, path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.results.output_checks import EVERY
 from vggtgeo.results.summary import versions
-from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.callback import WindowRecord
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
-from vggtgeo.slam.window_recorder import WindowRecord
 
 SHARE = 0.025
 """Maximum share of a run's time for checkpoints."""

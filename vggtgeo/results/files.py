@@ -14,8 +14,7 @@ from vggtgeo.io.files import write_picture, write_text
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 
 DEPTH_UNIT = 5000.0
 """Counts per metre in the 16-bit depth images, as in the TUM RGB-D format."""

@@ -11,9 +11,9 @@ from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import TrajectoryReport, evaluate_trajectory
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_kind, path_of
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.given import check_kind, path_of
-from vggtgeo.io.text_files import whole_text
+from vggtgeo.io.files import whole_text
 from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.result import Result
 

@@ -10,12 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from vggtgeo.compilation.process_settings import program_settings
+from vggtgeo.compilation.process_settings import in_double_precision, program_settings
 from vggtgeo.datasets import Sequence
 from vggtgeo.datasets.frame import check_range
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.argument_checks import check_kind, check_plain, check_whole
 from vggtgeo.io.errors import InputError, InputWarning, collected_warnings, warn
-from vggtgeo.io.given import check_kind, check_plain, check_whole
 from vggtgeo.io.process import Interruption, interruption, return_freed_memory
 from vggtgeo.mapping.dense import check_dense, check_mode, dense_map
 from vggtgeo.report import RunRecord
@@ -31,12 +31,11 @@ from vggtgeo.results.source import (
 )
 from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import RunCallbacks, TrackingLoop
-from vggtgeo.slam.callback import Callback
+from vggtgeo.slam.callback import Callback, WindowRecorder
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import prior_summary
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
 from vggtgeo.slam.self_calibration import CALIBRATION_FRAMES, MAX_PASSES, self_calibrate
@@ -47,7 +46,6 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import check_input, check_refusals, judge_or_report
-from vggtgeo.slam.window_recorder import WindowRecorder
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from vggtgeo.figures.plots import NotebookFigure, trajectory_figure
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_kind, check_plain, path_of
 from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import atomic_path, write_json
-from vggtgeo.io.given import check_kind, check_plain, path_of
 from vggtgeo.mapping.dense import dense_map
 from vggtgeo.report import (
     MAX_POINTS,
@@ -44,8 +44,7 @@ from vggtgeo.results.summary import add_writing_time, compare_with_truth, read_s
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge

@@ -27,8 +27,7 @@ from vggtgeo.mapping.tracks import Tracks, make_tracks
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.threads import map_in_threads
 
 MASK = "image-mask.png"

@@ -22,8 +22,8 @@ from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.datasets.views import FrameStream, frame_stream, reduced
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning, warn
-from vggtgeo.io.given import check_kind
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.summary import lens_parameters
 from vggtgeo.simulation.sequence import SyntheticSequence

@@ -17,13 +17,12 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import RadialTangential
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, warn
+from vggtgeo.io.files import whole_text
 from vggtgeo.io.process import peak_memory_gb
-from vggtgeo.io.text_files import whole_text
 from vggtgeo.results.files import submap_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.verdict.finding import Verdict
 
 

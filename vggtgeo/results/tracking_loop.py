@@ -11,8 +11,8 @@ from typing import Any
 
 from vggtgeo.datasets import Frame
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind
 from vggtgeo.io.process import Interruption
 from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, RunSoFar, check_same_frame, notice_of
 from vggtgeo.results.source import Source

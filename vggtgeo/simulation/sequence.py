@@ -15,9 +15,9 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_kind, check_whole, check_within, real_array
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import write_picture, write_text
-from vggtgeo.io.given import check_kind, check_whole, check_within, real_array
 from vggtgeo.simulation.corridors import (
     BUILDING_WALK,
     CORRIDOR_WALK,

@@ -20,7 +20,7 @@ from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import pinhole
-from vggtgeo.io.given import check_whole, check_within
+from vggtgeo.io.argument_checks import check_whole, check_within
 from vggtgeo.solvers.kernels import AbstractKernel
 
 SIZE = (320, 240)

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import path_of
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
 from vggtgeo.slam.window_steps import merge_pending_window

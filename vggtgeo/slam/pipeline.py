@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
@@ -17,7 +18,6 @@ from vggtgeo.slam.keyframe_decision import becomes_keyframe, track_by_old_keyfra
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import RecordedPrior, recorded_prior
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import without_matches

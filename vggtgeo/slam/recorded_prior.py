@@ -22,10 +22,8 @@ from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.map import submap_of
-from vggtgeo.slam.sparse_map.units import longer
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.sparse_map.map import longer, submap_of
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.tracking.recorded_motion import (
     Comparison,
     carried,

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.datasets.frame import Frame, Sequence, check_frame
 from vggtgeo.datasets.views import FrameStream, frame_stream, reduced
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.io.argument_checks import check_kind, check_whole
 from vggtgeo.io.errors import LeftOutWarning
-from vggtgeo.io.given import check_kind, check_whole
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.clock import Clock
@@ -31,11 +32,9 @@ from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.recorded_prior import with_recorded_ties
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.threads import made_ahead
 from vggtgeo.slam.tracking.frame_refinement import against_nearest
 from vggtgeo.slam.window_steps import merge_pending_window

@@ -13,7 +13,7 @@ from vggtgeo.models.roles import Features, GeometryResult, PointMatches, StartGu
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
-from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH, longer
+from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH, longer
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import record_of
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track

@@ -29,8 +29,7 @@ from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.perception.rgbd_view import Points, RgbdView
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, KeyframeImages
+from vggtgeo.slam.sparse_map.keyframe import CompressedImage, Keyframe, KeyframeImages, Slots
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.tracking.evidence import Evidence

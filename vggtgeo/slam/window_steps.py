@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.models.classical import can_search
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe

@@ -16,17 +16,16 @@ import numpy as np
 
 from vggtgeo.bundle.analysis.covariances import covariances
 from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import warn
-from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.precision import in_double_precision
+from vggtgeo.slam.callback import Callback, WindowRecorder
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window_recorder import WindowRecorder
 from vggtgeo.viewing.entities import Entities
 from vggtgeo.viewing.target import flush
 

@@ -1,23 +1,27 @@
-"""The entities of a recording."""
+"""The entities of a recording, and those of a finished run by its folder."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from vggtgeo.datasets.image_files import read_codes
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.mesh import Mesh
+from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.results.files import DEPTH_UNIT
+from vggtgeo.results.output_checks import check_can_be_shown
+from vggtgeo.slam.callback import WindowRecord
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import loop_edges, submap_of
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import lost_stretches
-from vggtgeo.slam.window_recorder import WindowRecord
+from vggtgeo.slam.state import Slam, lost_stretches
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 RADIUS = 0.011
@@ -231,3 +235,28 @@ def ellipsoid(pose: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.
 def _centres(poses: Any) -> np.ndarray:
     """Return the camera centres, [n, 3], of poses world -> camera, [n, 7]."""
     return rigid.invert(rigid.to_matrix(np.asarray(poses, np.float64)))[:, :3, 3]
+
+
+def log_folder(stream: Any, folder: Path) -> None:
+    """Log path, keyframes, map and mesh, and each keyframe's saved depth and confidence.
+
+    Raises:
+        InputError: `trajectory.txt`, `keyframes.txt` or `map.ply` is missing in `folder`.
+
+    """
+    check_can_be_shown(folder)
+    entities = Entities(stream)
+    entities.axes()
+    stream.set_time("frame", sequence=0)
+    entities.path(*(Trajectory.load_tum(folder / name) for name in ("trajectory.txt", "keyframes.txt")))
+    cloud = PointCloud.load_ply(folder / "map.ply")
+    entities.cloud("world/map", cloud.points, cloud.colours)
+    if (folder / "mesh.ply").is_file():
+        entities.mesh(Mesh.load_ply(folder / "mesh.ply"))
+    for file in sorted(folder.glob("depth/*.depth.png")):
+        if (number := file.name.split(".")[0]).isdecimal():
+            stream.set_time("frame", sequence=int(number))
+            entities.depth(read_codes(file), DEPTH_UNIT)
+            confidence = file.with_name(f"{number}.confidence.png")
+            if confidence.is_file():
+                entities.confidence(read_codes(confidence))

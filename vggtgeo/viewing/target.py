@@ -1,4 +1,4 @@
-"""The target of a recording: a file, a viewer on this machine, or a web server; and its blueprint."""
+"""The target of a recording (a file, a local viewer, a web server), its blueprint, and the recording of a past run."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import sys
 import sysconfig
 import tempfile
 import time
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from vggtgeo.io.errors import InputError, warn
+from vggtgeo.io.files import whole_text
 
 APPLICATION = "vggtgeo"
 STAND_IN = "run.rrd"
@@ -78,6 +80,22 @@ def open_target(target: str, name: str, instead: Path) -> Opened:
         file = _save(stream, Path(target))
     stream.send_recording_name(name)
     return Opened(stream, url, file)
+
+
+def recording_of(folder: Path) -> Path | None:
+    """Return the recording that the run in `folder` made there, or None.
+
+    It is named in the run's settings, which excludes recordings of earlier runs. A killed run has no settings: then the
+    newest recording in the folder.
+    """
+    try:
+        target = tomllib.loads(whole_text(folder / "settings.toml", errors="strict")).get("rerun")
+    except (ValueError, RecursionError):
+        return max(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, default=None)
+    if target is None:
+        return None
+    file = folder / (STAND_IN if target == "spawn" else Path(str(target)).name)
+    return file if file.suffix == ".rrd" and file.is_file() else None
 
 
 def flush(stream: Any, file: Path | None = None) -> str:

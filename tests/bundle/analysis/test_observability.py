@@ -27,7 +27,6 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.solvers.arrow import ArrowVector
 
 from vggtgeo.bundle.analysis.covariances import covariances
-from vggtgeo.bundle.analysis.directions import MOTIONS, common_directions, direction_names
 from vggtgeo.bundle.analysis.observability import observability
 from vggtgeo.bundle.analysis.observability_report import (
     WEAK,
@@ -37,6 +36,7 @@ from vggtgeo.bundle.analysis.observability_report import (
     undetermined_landmarks,
     weak_directions,
 )
+from vggtgeo.bundle.analysis.weak_directions import MOTIONS, common_directions, direction_names
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import energy
 from vggtgeo.bundle.problem import Problem, State

@@ -5,8 +5,7 @@ import plane_views as views
 import pytest
 from vggtgeo.models import roles
 from vggtgeo.models.classical import EpipolarVerifier, OrbMatcher, PatchAlignment, PatchFlow, SiftMatcher
-from vggtgeo.models.classical.nearest import exclude_far, mutual_nearest
-from vggtgeo.models.classical.pixel_matcher import spread
+from vggtgeo.models.classical.pixel_matcher import exclude_far, mutual_nearest, spread
 
 MATCHERS = {"sift": SiftMatcher(count=500), "orb": OrbMatcher(count=500)}
 MOTION = views.pose((3.0, -4.0, 6.0), (0.15, -0.1, 0.1))

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from invoked import invoke
 from reported import raises
-from vggtgeo.models.exporters import request
 from vggtgeo.models.exporters.attention import angle_tables, grid
+from vggtgeo.models.exporters.network import Checkout, load
 from vggtgeo.models.exporters.recipes import RECIPES, recipe_of
-from vggtgeo.models.exporters.request import Checkout
 from vggtgeo.models.onnx.contracts import CONTRACTS, relative_difference
 
 RANDOM = ("--random-weights", "-o", "file.onnx", "--source", "nowhere")
@@ -31,7 +30,7 @@ def test_a_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.M
     assert "`torch`" in result.output
     assert "pip install -e '.[export]'" in result.output
     with raises("no_such_package"):
-        request.load("no_such_package")
+        load("no_such_package")
 
 
 def test_every_contract_can_be_exported() -> None:

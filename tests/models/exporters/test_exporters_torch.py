@@ -15,10 +15,10 @@ import onnx
 import onnxruntime
 import pytest
 from reported import raises
-from vggtgeo.models.exporters import point_matchers, vggt, weights
+from vggtgeo.models.exporters import point_matchers, vggt
 from vggtgeo.models.exporters.export import Report, export
+from vggtgeo.models.exporters.network import Request, checkpoint_identity
 from vggtgeo.models.exporters.recipes import recipe_of
-from vggtgeo.models.exporters.request import Request
 from vggtgeo.models.onnx.contracts import CONTRACTS, HALF_TOLERANCE, relative_difference
 
 pytestmark = [
@@ -128,7 +128,7 @@ def test_a_checkpoint_is_loaded_in_full(checkouts: Path, tmp_path: Path) -> None
     saved = tmp_path / "saved.pth"
     torch.save({"model": recipe.build(other).module.network.state_dict(), "args": argparse.Namespace(lr=1)}, saved)
     from_file = export(recipe, request_of("dinov3", checkouts, saved), tmp_path / "saved.onnx")
-    assert from_file.weights == weights.identity(saved)
+    assert from_file.weights == checkpoint_identity(saved)
     assert from_file.weights.startswith("sha256:")
     random = export(recipe, request_of("dinov3", checkouts), tmp_path / "random.onnx")
     gaps = []

@@ -17,9 +17,9 @@ from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.degradations import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE
+from vggtgeo.slam.camera.camera_comparison import carried
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.camera.given_camera import keyframe_pairs
-from vggtgeo.slam.camera.pixel_shifts import carried
 from vggtgeo.slam.camera.rolling_shutter import (
     find_readout,
     image_shift,

@@ -18,8 +18,8 @@ from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import loop_edges
-from vggtgeo.slam.tracking.fusion import with_systematic
 from vggtgeo.slam.tracking.odometry import Odometry
+from vggtgeo.slam.tracking.pose_fusion import with_systematic
 from vggtgeo.slam.window_steps import merge_pending_window
 
 corridor = benchmark("repeated_corridor")

@@ -14,14 +14,14 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
-from vggtgeo.slam.sparse_map.units import scaled_keyframe
+from vggtgeo.slam.sparse_map.map import scaled_keyframe
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import (
     against_nearest,
     against_reference,
     squared_distance,
 )
-from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
+from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE
 from vggtgeo.slam.tracking.tracker import FramePose, scaled_record
 
 AWAY = np.array([0.006, -0.005, 0.004, 0.002, -0.003, 0.001])

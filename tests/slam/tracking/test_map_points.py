@@ -19,8 +19,8 @@ from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.tracking.evidence import tangent
-from vggtgeo.slam.tracking.fusion import with_systematic
 from vggtgeo.slam.tracking.map_points import Refined, refine_by_map
+from vggtgeo.slam.tracking.pose_fusion import with_systematic
 from vggtgeo.slam.tracking.track import (
     PIXEL_SIGMA,
     SEARCH_RADIUS,

@@ -8,7 +8,7 @@ import numpy as np
 from changed import changed
 
 import vggtgeo as vg
-from vggtgeo.slam.submaps import stretches
+from vggtgeo.slam.state import stretches
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.finding import Finding, conclude
 

@@ -30,8 +30,8 @@ from vggtgeo.bundle.terms.node import CameraTerm, NodeTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Pinhole
+from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind
 from vggtgeo.solvers.covariance import covariance
 from vggtgeo.solvers.flat_directions import flat_stiffness
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky

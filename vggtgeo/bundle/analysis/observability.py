@@ -16,7 +16,7 @@ most 1,800).
 
 Cost: one linearisation a term, and for `k` terms `2 k + 1` Schur complements and symmetric eigenvalue problems of size
 `c`. Above `DENSE_KEYFRAMES` the Schur complements are sparse and only their smallest eigenvalues are computed
-(`weakest.py`): time and memory then grow with the number of edges.
+(`weak_directions.py`): time and memory then grow with the number of edges.
 """
 
 from __future__ import annotations
@@ -31,9 +31,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.analysis.directions import common_directions
 from vggtgeo.bundle.analysis.observability_report import SHOWN, Observability, Spectra
-from vggtgeo.bundle.analysis.weakest import sparse_matrix, weakest
+from vggtgeo.bundle.analysis.weak_directions import common_directions, sparse_matrix, weakest
 from vggtgeo.bundle.checks import check_finite, check_pair
 from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_finite
 from vggtgeo.bundle.linearise import linearise, num_offsets
@@ -49,12 +48,13 @@ from vggtgeo.solvers.arrow import (
     inverse_landmark_hessian,
     join_landmarks,
 )
-from vggtgeo.solvers.local_inverse import balance, rank_tolerance
 from vggtgeo.solvers.schur_complement import (
     Blocks,
     Reduced,
     SparseLayout,
+    balance,
     dense_schur_complement,
+    rank_tolerance,
     reduced_blocks,
     sparse_layout,
 )

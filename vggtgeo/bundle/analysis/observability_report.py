@@ -9,10 +9,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.analysis.directions import direction_names
+from vggtgeo.bundle.analysis.weak_directions import direction_names
 from vggtgeo.bundle.readable import Readable
 from vggtgeo.geometry import lie
-from vggtgeo.solvers.local_inverse import rank_tolerance
+from vggtgeo.solvers.schur_complement import rank_tolerance
 
 WEAK = 1e-6
 """Eigenvalue below which a direction is weak: its standard deviation is 1000 times that with all else known. Well-posed

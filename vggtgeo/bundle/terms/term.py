@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from vggtgeo.io.argument_checks import check_kind, real_numbers
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, real_numbers
 from vggtgeo.solvers.kernels import AbstractKernel, Square
 
 Local = Callable[[Array], Array]

@@ -30,8 +30,8 @@ from scipy.stats import chi2 as chi_square
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_comparison import CHANCE, gain
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.camera.camera_gain import CHANCE, gain
 from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair, PairwiseIntrinsics, pairwise_intrinsics
 from vggtgeo.slam.camera.rolling_shutter import pair_to_global_shutter
 from vggtgeo.slam.sparse_map.covisibility import Directed

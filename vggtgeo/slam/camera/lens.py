@@ -33,11 +33,9 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera, Undistorter
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatches
-from vggtgeo.slam.camera.camera_gain import gain, match_energies
-from vggtgeo.slam.camera.pixel_shifts import Shifts, carried, pinhole_of, shifted_problem
+from vggtgeo.slam.camera.camera_comparison import Shifts, carried, gain, match_energies, pinhole_of, shifted_problem
 from vggtgeo.slam.sparse_map.covisibility import Pair
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.keyframe_images import KeyframeImages
+from vggtgeo.slam.sparse_map.keyframe import Keyframe, KeyframeImages
 from vggtgeo.slam.sparse_map.map import Map
 
 RADIAL = 0.3

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.node import CameraTerm, IntrinsicsPrior
 from vggtgeo.geometry.camera_models import Pinhole
-from vggtgeo.slam.camera.camera_gain import gain
+from vggtgeo.slam.camera.camera_comparison import gain
 
 MIN_STRETCH = 0.03
 """Logarithm of `f_x / f_y`. Images that are reduced to whole pixels differ by 0.005 at most, and pixels of tapes by at

@@ -23,9 +23,17 @@ from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.camera.camera_comparison import (
+    MIN_HOSTS,
+    Shifts,
+    carried,
+    gain,
+    match_energies,
+    pinhole_of,
+    rays,
+    shifted_problem,
+)
 from vggtgeo.slam.camera.camera_estimate import Readout
-from vggtgeo.slam.camera.camera_gain import MIN_HOSTS, gain, match_energies
-from vggtgeo.slam.camera.pixel_shifts import Shifts, carried, pinhole_of, rays, shifted_problem
 from vggtgeo.slam.threads import map_in_threads
 
 FIRST_SHIFT, SETTLED = 1.0, 0.05

@@ -9,7 +9,7 @@ from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import by_both
-from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE
+from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE
 from vggtgeo.slam.tracking.tracker import FramePose
 
 GROSS = SHARED_ERRORS * AGREEMENT_GATE

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.callback import Callback
@@ -24,7 +25,6 @@ from vggtgeo.slam.global_map.global_shape import (
 )
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.factors import factor_terms
 from vggtgeo.slam.state import Slam

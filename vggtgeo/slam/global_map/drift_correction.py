@@ -23,8 +23,7 @@ from vggtgeo.slam.global_map.pose_graph import (
 )
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.map import submap_of
-from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion
+from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.tracker import scaled_record

@@ -31,8 +31,7 @@ from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.factors import Factor, factor_terms
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import stretches
+from vggtgeo.slam.state import Slam, stretches
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import Adjustment, CameraPrior, build, write_back
 from vggtgeo.slam.window.gauge import gauge_notes, with_one_gauge

@@ -21,17 +21,16 @@ from vggtgeo.slam.global_map.loops import verified_loops
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.map import submap_of
-from vggtgeo.slam.sparse_map.units import (
+from vggtgeo.slam.sparse_map.map import (
     MAX_SCALE_ERROR,
     longer,
     measured_ratio,
     scaled_factor,
     scaled_keyframe,
     scaled_motion,
+    submap_of,
 )
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.tracking.relocalisation import relocalise
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput
 from vggtgeo.slam.tracking.tracker import scaled_record

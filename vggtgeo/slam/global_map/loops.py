@@ -17,8 +17,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import NO_LINES, Pair, overlap, some_points
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.map import submap_of
-from vggtgeo.slam.sparse_map.units import measured_ratio
+from vggtgeo.slam.sparse_map.map import measured_ratio, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.track import PIXEL_SIGMA

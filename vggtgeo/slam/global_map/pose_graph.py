@@ -10,7 +10,7 @@ Odometry factors are a tree: only loops contradict them, so they have no robust 
 is estimated from the loops: the median over loops of the squared Mahalanobis distance between the loop and the odometry
 between its ends, over the median of chi-square (a variance component, robust against up to half of the loops being
 false). So drift is distributed over the way; a single wrong motion (a slip) is distributed too. Loops have a Cauchy
-kernel, widened at first (`vggtgeo/bundle/graduation.py`): after metres of drift true loops have residuals as large as
+kernel, widened at first (`vggtgeo.Graduation`): after metres of drift true loops have residuals as large as
 false ones.
 """
 
@@ -27,12 +27,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 from scipy.stats import chi2 as chi_square
 
-from vggtgeo.bundle.graduation import Graduation
 from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.solution import Solution, solution_like, solve
+from vggtgeo.bundle.solution import Graduation, Solution, solution_like, solve
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.measured_pose import RelativePose
 from vggtgeo.compilation.program_cache import CachedProgram

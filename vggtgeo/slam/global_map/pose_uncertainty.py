@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.bundle.analysis.covariances import DENSE_KEYFRAMES, covariances, variance_factor
-from vggtgeo.bundle.analysis.weakest import definite_factor, sparse_matrix
+from vggtgeo.bundle.analysis.weak_directions import definite_factor, sparse_matrix
 from vggtgeo.bundle.linearise import linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
@@ -23,8 +23,7 @@ from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
 from vggtgeo.solvers.conjugate_gradients import ConjugateGradients
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky

@@ -22,12 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
 from vggtgeo.slam.perception.rgbd_view import LEVELS, Points, RgbdView
-from vggtgeo.slam.precision import in_double_precision
 
 MAX_DISTANCE = 0.15
 """Largest distance of a point from its surface, metres."""

@@ -17,8 +17,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
+from vggtgeo.io.argument_checks import check_kind, check_positive, path_of
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind, check_positive, path_of
 from vggtgeo.io.network_files import networks_folder
 from vggtgeo.models.classical import ConstantVelocity, OrbMatcher
 from vggtgeo.models.onnx.bounds import (

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.given import check_kind
 from vggtgeo.models.classical import (
     BandLineMatcher,
     LsdDetector,

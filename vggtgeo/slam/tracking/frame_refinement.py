@@ -24,8 +24,8 @@ from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.evidence import MIN_CORRELATION, MIN_OVERLAP, MIN_SURFACE, Evidence
-from vggtgeo.slam.tracking.fusion import AGREEMENT_GATE, with_systematic
 from vggtgeo.slam.tracking.map_points import in_view
+from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE, with_systematic
 from vggtgeo.slam.tracking.relocalisation import view_of
 from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, Tracker, frame_pose
 

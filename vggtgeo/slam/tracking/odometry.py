@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.tracking.fusion import with_systematic
+from vggtgeo.slam.tracking.pose_fusion import with_systematic
 
 
 class Way(NamedTuple):

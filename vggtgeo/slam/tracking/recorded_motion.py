@@ -27,8 +27,7 @@ from vggtgeo.models.roles import GeometryResult
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.map import Map, submap_of
-from vggtgeo.slam.sparse_map.units import longer
+from vggtgeo.slam.sparse_map.map import Map, longer, submap_of
 from vggtgeo.slam.tracking.evidence import Evidence, worst_sigma
 from vggtgeo.slam.tracking.track import Track
 from vggtgeo.slam.tracking.tracker import FramePose

@@ -28,7 +28,8 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.evidence import Evidence, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.tracking.following import Located, located_by_flow
-from vggtgeo.slam.tracking.fusion import (
+from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
+from vggtgeo.slam.tracking.pose_fusion import (
     Motion,
     agreed,
     fused_with_prior,
@@ -37,7 +38,6 @@ from vggtgeo.slam.tracking.fusion import (
     with_lines,
     with_systematic,
 )
-from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
 from vggtgeo.slam.tracking.tracker import SeenPoints
 from vggtgeo.slam.tracking.two_view_motion import explains_more, may_explain_more, two_view_motion
 

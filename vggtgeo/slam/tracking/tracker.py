@@ -9,8 +9,7 @@ import numpy as np
 
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.perception.rgbd_view import RgbdView
-from vggtgeo.slam.sparse_map.map import Map
-from vggtgeo.slam.sparse_map.units import longer, scaled_information
+from vggtgeo.slam.sparse_map.map import Map, longer, scaled_information
 from vggtgeo.slam.tracking.evidence import Evidence
 
 MAX_UNPLACED = 90

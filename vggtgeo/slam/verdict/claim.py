@@ -12,8 +12,7 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import MIN_KEYFRAMES_FOR_CAMERA, Readout
 from vggtgeo.slam.global_map.frame_poses import frame_poses
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import submaps_by_size
+from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 from vggtgeo.slam.verdict.thresholds import MAX_PLACE_ERROR, MAX_PLACE_ERROR_SHARE, MIN_COMMON, MIN_VIEWS
 

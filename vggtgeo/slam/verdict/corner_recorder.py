@@ -16,7 +16,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.io.given import check_kind
+from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.perception.followed_corners import WIDTH, FollowedCorners, small_grey, small_mask
 from vggtgeo.slam.state import Slam

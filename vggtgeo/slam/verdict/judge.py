@@ -14,8 +14,7 @@ from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.models.onnx.bounds import Refusals
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.perception.static_overlay import StaticOverlay
-from vggtgeo.slam.state import Slam
-from vggtgeo.slam.submaps import stretches
+from vggtgeo.slam.state import Slam, stretches
 from vggtgeo.slam.verdict import thresholds
 from vggtgeo.slam.verdict.alternatives import explain
 from vggtgeo.slam.verdict.claim import Claim, extent, max_place_error, tracks_of_windows

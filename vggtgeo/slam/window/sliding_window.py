@@ -19,9 +19,9 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Solution, solution_like, solve
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.precision import in_double_precision
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose, MeasuredRotation, factor_terms

@@ -15,8 +15,8 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
+from vggtgeo.mapping.depth_fusion import SurfaceFusion, fused_mesh
 from vggtgeo.mapping.depth_map import DepthMap
-from vggtgeo.mapping.fusion import SurfaceFusion, fused_mesh
 from vggtgeo.mapping.tsdf import merge_meshes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 

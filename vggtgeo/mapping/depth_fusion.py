@@ -11,7 +11,7 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.camera import check_intrinsics
 from vggtgeo.geometry.mesh import Mesh
-from vggtgeo.io.given import check_kind, check_positive, check_real, check_whole, real_array
+from vggtgeo.io.argument_checks import check_kind, check_positive, check_real, check_whole, real_array
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.tsdf import (
     BATCH,

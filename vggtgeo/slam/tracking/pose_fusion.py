@@ -15,7 +15,7 @@ from vggtgeo.geometry.robust import POSE_GATE, REGULARISER, inverse_information
 from vggtgeo.models.roles import LineFeatures, LineMatcher
 from vggtgeo.slam.perception.rgbd_alignment import Aligned
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.sparse_map.units import NOMINAL_DEPTH
+from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH
 from vggtgeo.slam.tracking.evidence import Evidence, tangent
 from vggtgeo.slam.tracking.line_alignment import align_lines
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from vggtgeo.slam.sparse_map.keyframe_images import CompressedImage, KeyframeImages, array_of
+from vggtgeo.slam.sparse_map.keyframe import CompressedImage, KeyframeImages, array_of
 
 
 def _bytes(images: KeyframeImages) -> int:
