@@ -22,9 +22,8 @@ _HEAPS = {
     "MALLOC_MMAP_THRESHOLD_": (-3, 8_000_000),
     "MALLOC_TRIM_THRESHOLD_": (-1, 32_000_000),
 }
-"""glibc's settings: environment variable, number in `malloc.h`, value. Number of heaps; bytes from which a block lies in
-none; free bytes that a heap keeps. Smaller limits save no memory, and system calls for each image cost a tenth of a
-run."""
+"""glibc's settings: environment variable, number in `malloc.h`, value. Number of heaps; bytes from which a block lies
+in none; free bytes that a heap keeps. Smaller limits save no memory, and system calls for images cost a tenth of a run."""
 
 
 class Interruption:
@@ -105,7 +104,8 @@ def _signals() -> list[signal.Signals]:
 def return_freed_memory() -> None:
     """Give freed memory back to the system, with glibc; nothing elsewhere.
 
-    Compilation and threads leave free blocks between others, up to half of a run's memory (memory in `benchmarks/stage_times.py`).
+    Compilation and threads leave free blocks between others, up to half of a run's memory
+    (`benchmarks/stage_times.py` prints the peak).
     """
     if trim := _of_c_library("malloc_trim"):
         trim(0)
