@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 from checked_page import CheckedPage
-from recorded_run import FRAMES, RecordedRun, recorded_run
+from recorded_run import FRAMES, RecordedRun
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
 
@@ -73,11 +73,6 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
 
 def _deep(slam: Slam) -> bool:
     return any(np.isfinite(keyframe.depth).any() for keyframe in slam.keyframes)
-
-
-@pytest.fixture(scope="module")
-def run() -> RecordedRun:
-    return recorded_run()
 
 
 def test_a_run_that_was_found_nowhere_in_a_known_map_has_a_page(run: RecordedRun, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from recorded_run import ROLES, SETTINGS, black, room, run_over
+from recorded_run import ROLES, SETTINGS, black, run_over
 from scipy.spatial.transform import Rotation
 from vggtgeo.models.classical import NoDepth, SiftMatcher
 from vggtgeo.models.roles import Features, PointMatches
@@ -38,11 +38,6 @@ from vggtgeo.slam.window_steps import adjust_window, camera_prior
 
 SIZE = (320, 240)
 Room = tuple[list[Frame], Camera, Trajectory]
-
-
-@pytest.fixture(scope="module", name="room")
-def _room() -> Room:
-    return room()
 
 
 @pytest.fixture(scope="module")
