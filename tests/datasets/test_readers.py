@@ -216,13 +216,7 @@ def test_the_guess_of_a_video_has_its_pixels(tmp_path: Path, aspect: Fraction, a
 
 def _video(path: Path, levels: list[Any]) -> Path:
     """A video of images of one grey level, or one colour (BGR)."""
-    size = (tiny.WIDTH, tiny.HEIGHT)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size)
-    assert writer.isOpened()
-    for level in levels:
-        writer.write(np.full((*size[::-1], 3), level, np.uint8))
-    writer.release()
-    return path
+    return tiny.video(path, [np.full((tiny.HEIGHT, tiny.WIDTH, 3), level, np.uint8) for level in levels])
 
 
 @pytest.mark.parametrize("selection", [(0, None, 1), (1, None, 1), (0, 4, 2), (1, 100, 3), (4, 5, 1)])

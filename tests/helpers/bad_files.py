@@ -53,11 +53,7 @@ def every_depth(image: np.ndarray) -> Callable[[Path], Path]:
 
 def video(path: Path, count: int = 12) -> Path:
     """A video that can be read: pictures that have nothing in common."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
-    for row in range(count):
-        writer.write(picture(row))
-    writer.release()
-    return path
+    return tiny.video(path, map(picture, range(count)), "mp4v")
 
 
 def problem(**changes: np.ndarray) -> Callable[[Path], Path]:

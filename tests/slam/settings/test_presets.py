@@ -1,4 +1,4 @@
-"""`--preset`: networks behind every role of a whole run, from tiny files; and real exports where there are any."""
+"""`--preset`: networks behind every role of a whole run, from tiny files."""
 
 import importlib
 import json
@@ -154,28 +154,23 @@ def test_the_preset_builds_the_roles_it_documents(files: Path) -> None:
     assert paper.geometry.judge is classical.geometry
 
 
-def _whole_run(folder: Path, models: Path, size: tuple[int, int]) -> dict:
-    """The program on ten simulated frames with the paper's preset; its summary."""
-    walk, output = folder / "walk", folder / "run"
-    for _ in write_tum_folder(simulate("room", 10, 0, size, rate=10.0), walk):
+@pytest.mark.slow
+def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
+    # Proves that `vggtgeo run --preset paper` writes every output, and the warning into its summary and its page.
+    folder, output = tmp_path / "walk", tmp_path / "run"
+    for _ in write_tum_folder(simulate("room", 10, 0, SIZE[::-1], rate=10.0), folder):
         pass
-    arguments = ["run", walk, "-o", output, "--quiet", "--preset", "paper", "--models", models]
+    arguments = ["run", folder, "-o", output, "--quiet", "--preset", "paper", "--models", files]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         result = CliRunner().invoke(make_app(), [str(argument) for argument in arguments])
     assert result.exit_code == 0, result.output
     assert np.isfinite(np.loadtxt(output / "trajectory.txt")).all()
-    return json.loads((output / "summary.json").read_text())
-
-
-@pytest.mark.slow
-def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
-    # Proves that `vggtgeo run --preset paper` writes every output, and the warning into its summary and its page.
-    summary = _whole_run(tmp_path, files, SIZE[::-1])
+    summary = json.loads((output / "summary.json").read_text())
     assert summary["frames"] == 10
     assert all(network["calls"] > 0 for network in summary["networks"].values()), summary["networks"]
     assert "this result means nothing" in summary["meaningless"]
-    assert "this result means nothing" in (tmp_path / "run" / "report.html").read_text()
+    assert "this result means nothing" in (output / "report.html").read_text()
 
 
 def test_a_role_takes_networks_of_its_kind_alone(files: Path) -> None:
