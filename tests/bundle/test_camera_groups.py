@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arrow_systems import check_exact_hessian
+from own_terms import Sighting
 from scenes import make_scene, matrix
 from scipy.optimize import least_squares
 
@@ -170,23 +171,13 @@ def test_two_cameras_are_adjusted_and_judged_as_by_dense_algebra() -> None:
     assert "aspect ratio of camera 1" in names
 
 
-class Seen(vg.terms.PoseTerm):
-    """A known place and where it was seen: a term on a pose and the camera that took it."""
-
-    place: jax.Array
-    pixel: jax.Array
-
-    def residual(self, pose, camera):
-        return camera.project(pose @ self.place) - self.pixel
-
-
 @pytest.mark.slow
 def test_second_derivatives_with_several_cameras() -> None:
     # Proves gradient and exact Hessian with two distorting cameras and a term on a pose and its camera. Oracle:
     # automatic differentiation of the energy after a step.
     made = rig((tuple(BENT), tuple(BENT * 0.95)), noise=0.5, points=2)
     poses, depth = start_of(made)
-    place = Seen(
+    place = Sighting(
         keyframe=[1, 2], place=jnp.array([[0.1, 0.2, 2.0]] * 2), pixel=jnp.full((2, 2), 150.0), weight=[0.3, 1]
     )
     cameras = vg.cameras.Intrinsics(made.cameras, vg.cameras.RadialTangential, camera_of=GROUP)

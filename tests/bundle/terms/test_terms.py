@@ -17,6 +17,7 @@ import pytest
 from arrow_systems import multiply, zero_step
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
+from own_terms import PositionFix, Sighting
 from priors import prior_on
 from reported import raises
 from scenes import make_scene
@@ -174,16 +175,6 @@ class SquarePixels(vg.terms.CameraTerm):
         return jnp.log(parameters[0] / parameters[1]) * 50
 
 
-class Sighting(vg.terms.PoseTerm):
-    """A term on a pose and the camera: a known place and where it was seen."""
-
-    place: Float[Array, "m 3"]
-    pixel: Float[Array, "m 2"]
-
-    def residual(self, pose: jaxlie.SE3, camera: vg.cameras.AbstractCamera) -> Float[Array, "2"]:
-        return camera.project(pose @ self.place) - self.pixel
-
-
 def turn(*vector: float) -> np.ndarray:
     return Rotation.from_rotvec(vector).as_matrix()
 
@@ -302,17 +293,8 @@ def test_a_quadratic_becomes_a_measured_pose() -> None:
     assert np.abs(jax.grad(energy)(jnp.zeros(6)) - gradient).max() < 1e-3 * np.abs(gradient).max()
 
 
-class Fix(vg.terms.PoseTerm):
-    """Position of a camera."""
-
-    position: jax.Array
-
-    def residual(self, pose: jaxlie.SE3, camera: vg.cameras.AbstractCamera) -> jax.Array:
-        return pose.inverse().translation() - self.position
-
-
-class SecondFix(Fix):
-    """The same of another receiver."""
+class SecondFix(PositionFix):
+    """A position of another receiver."""
 
     name = "second_fix"
 
@@ -322,20 +304,22 @@ def test_a_second_list_of_one_class_does_not_take_the_place_of_the_first() -> No
     works: the energy of both lists is their sum. Oracle: the energies of each alone.
     """
     problem, initial, _ = SCENE.pack()
-    first, second = (Fix(keyframe=[1], position=jnp.full((1, 3), at), weight=jnp.ones(1)) for at in (1.0, 2.0))
+    first, second = (PositionFix(keyframe=[1], position=jnp.full((1, 3), at), weight=jnp.ones(1)) for at in (1.0, 2.0))
     one = problem.with_term(first)
-    with raises("`term`", "`fix`", "replace=True", "`name`"):
+    with raises("`term`", "`position_fix`", "replace=True", "`name`"):
         one.with_term(second)
-    with raises("`terms`", "`fix`", "`name`"):
+    with raises("`terms`", "`position_fix`", "`name`"):
         SCENE.pack(terms=[first, second])
-    size = lambda problem, name: float(vg.analysis.energy_terms(problem, initial)[name])
+    size = lambda problem, name="position_fix": float(vg.analysis.energy_terms(problem, initial)[name])
     replaced = one.with_term(second, replace=True)
     assert len(replaced.terms) == len(one.terms)
-    assert size(replaced, "fix") != size(one, "fix")
+    assert size(replaced) != size(one)
     both = one.with_term(SecondFix(**vars(second)))
-    assert size(both, "fix") + size(both, "second_fix") == pytest.approx(size(one, "fix") + size(replaced, "fix"))
-    joined = Fix(keyframe=[1, 1], position=jnp.concatenate([first.position, second.position]), weight=jnp.ones(2))
-    assert size(problem.with_term(joined), "fix") == pytest.approx(size(one, "fix") + size(replaced, "fix"))
+    assert size(both) + size(both, "second_fix") == pytest.approx(size(one) + size(replaced))
+    joined = PositionFix(
+        keyframe=[1, 1], position=jnp.concatenate([first.position, second.position]), weight=jnp.ones(2)
+    )
+    assert size(problem.with_term(joined)) == pytest.approx(size(one) + size(replaced))
 
 
 def test_names_and_replacement() -> None:
