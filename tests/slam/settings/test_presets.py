@@ -20,7 +20,7 @@ from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.cli.main import make_app
 from vggtgeo.cli.models import FLAGS
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.simulation.sequence import SyntheticSequence, simulate, write_tum_folder
+from vggtgeo.simulation.sequence import simulate, write_tum_folder
 from vggtgeo.slam.run import frame_trajectory, run
 from vggtgeo.slam.settings.groups import GlobalMapSettings
 from vggtgeo.slam.settings.presets import CHOICES, NEEDED, Perception, perception
@@ -50,12 +50,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def walk() -> SyntheticSequence:
-    """Eight simulated frames that move enough for three keyframes."""
-    return simulate("room", 8, 0, SIZE[::-1], rate=5.0)
-
-
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     """How often each file ran, by its name, once it was warm."""
@@ -72,12 +66,11 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 
 @pytest.mark.long
-def test_a_run_asks_every_network_and_from_a_cache_none(
-    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
-) -> None:
+def test_a_run_asks_every_network_and_from_a_cache_none(files: Path, tmp_path: Path, counted: dict[str, int]) -> None:
     # Proves that a whole run goes through every network of the preset and no other, that its result is finite, and
     # that a second run with the same cache asks none and gives the same. Oracle: a count, and the first trajectory.
     settings = SlamSettings(refinement=GlobalMapSettings(global_adjustment=False))
+    walk = simulate("room", 8, 0, SIZE[::-1], rate=5.0)  # enough for three keyframes
     poses = []
     for expected in (set(NEEDED["paper"]), set()):
         found = perception("paper", Roles(), files, tmp_path / "cache")
