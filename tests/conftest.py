@@ -135,6 +135,22 @@ def shared_cases() -> Path:
 
 
 @pytest.fixture(scope="session")
+def run() -> Any:
+    """A short simulated run: its frames, its states, and what a recorder noted (`RecordedRun`)."""
+    from recorded_run import recorded_run  # after the hook above
+
+    return recorded_run()
+
+
+@pytest.fixture(scope="session")
+def room() -> Any:
+    """24 frames of a walk through a room, their camera and the true poses."""
+    from recorded_run import room  # after the hook above
+
+    return room()
+
+
+@pytest.fixture(scope="session")
 def healthy() -> Any:
     """A synthetic walk in which the verdict finds nothing."""
     from corner_walk import walk  # after the hook above

@@ -14,15 +14,6 @@ def citation() -> dict[str, Any]:
     return yaml.safe_load((ROOT / "CITATION.cff").read_text())
 
 
-def test_it_has_the_keys_that_the_format_asks_for(citation: dict[str, Any]) -> None:
-    """Software and paper can be cited. Oracle: the required keys of the Citation File Format 1.2.0."""
-    assert citation["cff-version"] == "1.2.0"
-    for entry, required in ((citation, ("message",)), *((paper, ("type",)) for paper in citation["references"])):
-        for key in (*required, "title", "authors"):
-            assert entry[key], f"`{key}` is missing"
-        assert all("name" in author or "family-names" in author for author in entry["authors"])
-
-
 def test_it_agrees_with_the_package(citation: dict[str, Any]) -> None:
     """Version, licence, keywords and the paper's DOI are those of the package. Oracle: pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

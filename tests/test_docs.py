@@ -44,12 +44,6 @@ def _sentences(text: str) -> list[int]:
     return [length for length in map(_words, parts) if length]
 
 
-def test_sentences_are_counted() -> None:
-    # Proves the count below. Oracle: a text whose sentences were counted by hand.
-    text = "# A heading\n\nOne `two words` three.\nFour (five).\n\n| a | b |\n|---|---|\n\n- Six\n- x [eight](9.md)\n"
-    assert _sentences(text) == [3, 2, 1, 2]
-
-
 def test_all_pages_together_can_be_read() -> None:
     # Proves the bound of CONTRIBUTING.md on all pages. Oracle: their words, code included.
     words = {page.name: _words(page.read_text()) for page in (ROOT / "docs").rglob("*.md")}

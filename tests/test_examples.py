@@ -65,8 +65,3 @@ def test_outside_jit_a_call_compiles_one_program(session: dict[str, Any]) -> Non
         jax.monitoring.clear_event_listeners()
     # Besides: a few operations of the checks of arguments.
     assert len(compiled) < 30
-
-
-def test_the_exceptions_are_public() -> None:
-    """The lists of names hold no name that is gone."""
-    assert SHORT.keys() >= LONG

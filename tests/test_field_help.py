@@ -31,8 +31,3 @@ def test_help_explains_every_field(name: str) -> None:
     assert not missing, f"the docstring of `{name}` does not explain {missing}"
     for line in docstring.strip().splitlines():
         assert line.strip() in shown
-
-
-def test_the_classes_of_bundle_adjustment_are_among_them() -> None:
-    """The list above is not empty by mistake. Oracle: the classes that a researcher asked for help of."""
-    assert {"Observations", "SchurLevenbergMarquardt", "PaddedSize", "DepthPrior", "Huber", "FlatTerm"} <= set(NAMES)

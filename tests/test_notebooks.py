@@ -21,6 +21,7 @@ SMALL_WINDOW = (
     "size=4, point_slots=96, line_slots=48), refinement=vg.settings.GlobalMapSettings(global_adjustment=False)"
 )
 QUICK = ("solve",)
+MARKS = {True: pytest.mark.long, False: pytest.mark.slow}
 # What the shorter run replaces in the long ones: fewer frames, smaller windows, fewer runs and steps.
 SHORTER: dict[str, dict[str, str]] = {
     "own_video": {"frames=45": "frames=16", WINDOW: SMALL_WINDOW},
@@ -53,11 +54,20 @@ def _run(path: Path, changes: dict[str, str]) -> None:
     assert not unused, f"`{path.name}` no longer holds {unused}"
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("path", [path for path in NOTEBOOKS if path.stem in QUICK], ids=lambda path: path.stem)
-def test_notebook_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+RUNS = [
+    *(pytest.param(path, {}, marks=MARKS[path.stem in QUICK], id=path.stem) for path in NOTEBOOKS),
+    *(
+        pytest.param(path, SHORTER[path.stem], marks=pytest.mark.slow, id=f"{path.stem} on less data")
+        for path in NOTEBOOKS
+        if path.stem in SHORTER
+    ),
+]
+
+
+@pytest.mark.parametrize(("path", "changes"), RUNS)
+def test_notebook_runs(path: Path, changes: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     """Every cell runs, in order, without an error or a warning, and prints something."""
-    _run(path, {})
+    _run(path, changes)
     assert capsys.readouterr().out, f"`{path.name}` printed nothing"
 
 
@@ -77,22 +87,6 @@ def test_solve_starts_from_a_recording_where_there_is_one(tmp_path: Path, capsys
     true = np.linalg.inv(namespace["truth"].poses[0]) @ namespace["truth"].poses[9]
     np.testing.assert_allclose(namespace["centre"], true[:3, 3], atol=0.02)
     assert "true [cm]" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", [path for path in NOTEBOOKS if path.stem not in QUICK], ids=lambda path: path.stem)
-def test_notebook_runs_on_less_data(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The same of the long ones, on less data."""
-    _run(path, SHORTER.get(path.stem, {}))
-    assert capsys.readouterr().out, f"`{path.name}` printed nothing"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", [path for path in NOTEBOOKS if path.stem in SHORTER], ids=lambda path: path.stem)
-def test_notebook_runs_as_it_stands(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The same with all its data."""
-    _run(path, {})
-    assert capsys.readouterr().out, f"`{path.name}` printed nothing"
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -1,7 +1,6 @@
 """Runs in processes of their own: limits, crashes, killed workers, a killed driver, resuming."""
 
 import json
-import os
 import sys
 import time
 from collections import Counter
@@ -13,7 +12,7 @@ import tiny_suites as tiny
 
 from vggtgeo.benchmark import inputs
 from vggtgeo.benchmark.jobs import Store
-from vggtgeo.benchmark.processes import Limits, run_limited, shares
+from vggtgeo.benchmark.processes import Limits, run_limited
 from vggtgeo.benchmark.provenance import provenance
 from vggtgeo.benchmark.runner import all_rows
 from vggtgeo.io.errors import InputError
@@ -71,13 +70,6 @@ def _runs(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().split()[2] != "Z"
     except OSError:
         return False
-
-
-def test_processors_are_shared_out() -> None:
-    # Proves that workers get even shares without overlap, and none is given where there are too few.
-    there = sorted(os.sched_getaffinity(0))
-    assert shares(1) == [tuple(there)]
-    assert shares(2 * len(there)) == [()] * 2 * len(there)
 
 
 def test_every_run_leaves_a_row_whatever_becomes_of_it(tmp_path: Path) -> None:

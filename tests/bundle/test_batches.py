@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.bundle.batches import Window, pack_batch, solve_batch
 from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.solution import solve
+from vggtgeo.bundle.solution import Solution, solve
 from vggtgeo.geometry.camera_models import RadialTangential
 
 SOLVER = SchurLevenbergMarquardt(max_iterations=40, rtol=1e-12)
@@ -64,15 +65,8 @@ def solve_alone(problem: Problem, state: State):
 def test_gradients_of_a_batch_are_those_of_its_windows(at_once: int) -> None:
     # Proves `solve_batch`, and `grad` through it, mapped and vmapped. Oracle: `solve` and its `grad`, one by one.
     problems, states, _ = batch()
-
-    def loss(weight: jax.Array, problem: Problem, run) -> tuple[jax.Array, jax.Array]:
-        changed = eqx.tree_at(lambda p: p.points.weight, problem, weight)
-        solution = run(changed)
-        return jnp.sum(solution.state.poses.wxyz_xyz**3), solution.energy
-
     together = lambda problem: solve_batch(problem, states, solver=SOLVER, at_once=at_once)
-    run = jax.jit(jax.grad(lambda weight: loss(weight, problems, together), has_aux=True))
-    found, energy = run(problems.points.weight)
+    found, energy = gradient(problems, together)
     for number in range(len(SCENES)):
         problem, state = jax.tree.map(lambda leaf, n=number: leaf[n], (problems, states))
         expected, alone = gradient_alone(problem, state)
@@ -81,13 +75,19 @@ def test_gradients_of_a_batch_are_those_of_its_windows(at_once: int) -> None:
 
 
 @eqx.filter_jit
-def gradient_alone(problem: Problem, state: State) -> tuple[jax.Array, jax.Array]:
+def gradient(problem: Problem, run: Callable[[Problem], Solution]) -> tuple[jax.Array, jax.Array]:
+    """Derivative of a number made of the poses by the weights of matches, and the energies."""
+
     def loss(weight: jax.Array) -> tuple[jax.Array, jax.Array]:
-        changed = eqx.tree_at(lambda p: p.points.weight, problem, weight)
-        solution = solve(changed, state, solver=SOLVER)
+        solution = run(eqx.tree_at(lambda p: p.points.weight, problem, weight))
         return jnp.sum(solution.state.poses.wxyz_xyz**3), solution.energy
 
     return jax.grad(loss, has_aux=True)(problem.points.weight)
+
+
+@eqx.filter_jit
+def gradient_alone(problem: Problem, state: State) -> tuple[jax.Array, jax.Array]:
+    return gradient(problem, lambda changed: solve(changed, state, solver=SOLVER))
 
 
 def test_windows_of_another_kernel_or_camera_are_refused() -> None:

@@ -11,13 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arrow_systems import dense_matrix, zero_step
-from jax.flatten_util import ravel_pytree
+from arrow_systems import check_exact_hessian
+from own_terms import Sighting
 from scenes import make_scene, matrix
 from scipy.optimize import least_squares
 
 import vggtgeo as vg
-from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 
 GROUP = np.array([0, 1, 0, 1])
 PINHOLES = np.array([[300.0, 310.0, 160.0, 120.0], [250.0, 245.0, 150.0, 125.0]])
@@ -172,48 +171,18 @@ def test_two_cameras_are_adjusted_and_judged_as_by_dense_algebra() -> None:
     assert "aspect ratio of camera 1" in names
 
 
-class Seen(vg.terms.PoseTerm):
-    """A known place and where it was seen: a term on a pose and the camera that took it."""
-
-    place: jax.Array
-    pixel: jax.Array
-
-    def residual(self, pose, camera):
-        return camera.project(pose @ self.place) - self.pixel
-
-
 @pytest.mark.slow
 def test_second_derivatives_with_several_cameras() -> None:
     # Proves gradient and exact Hessian with two distorting cameras and a term on a pose and its camera. Oracle:
     # automatic differentiation of the energy after a step.
     made = rig((tuple(BENT), tuple(BENT * 0.95)), noise=0.5, points=2)
     poses, depth = start_of(made)
-    place = Seen(
+    place = Sighting(
         keyframe=[1, 2], place=jnp.array([[0.1, 0.2, 2.0]] * 2), pixel=jnp.full((2, 2), 150.0), weight=[0.3, 1]
     )
     cameras = vg.cameras.Intrinsics(made.cameras, vg.cameras.RadialTangential, camera_of=GROUP)
     problem, state, _ = vg.pack(made.seen, poses, cameras, depth, terms=[place])
-    zero = zero_step(BundleAdjustment(problem), state)
-    flat, unflat = ravel_pytree(zero)
-
-    @jax.jit
-    def both(problem, state):
-        ba = BundleAdjustment(problem)
-        total = lambda step: vg.energy(problem, ba.retract(state, unflat(step)))
-        system = ba.hessian(state)
-        return (
-            dense_matrix(system, zero),
-            ravel_pytree(ba.gradient(state))[0],
-            jax.hessian(total)(flat),
-            jax.grad(total)(flat),
-        )
-
-    matrix, gradient, hessian, expected = both(problem, state)
-    unit = 1 / np.sqrt(np.abs(np.diag(hessian)) + 1.0)
-    error = float(np.abs((matrix - hessian) * np.outer(unit, unit)).max())
-    assert error < 1e-9, error
-    error = float(np.abs((gradient - expected) * unit).max() / np.abs(expected * unit).max())
-    assert error < 1e-10, error
+    check_exact_hessian(problem, state, vg.energy)
 
 
 @pytest.mark.parametrize(

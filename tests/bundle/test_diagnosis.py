@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_terms import PositionFix
 
 import vggtgeo as vg
 from vggtgeo.bundle.diagnosis import Diagnosis, diagnose, is_finite
@@ -16,15 +17,6 @@ from vggtgeo.bundle.problem import Problem, State
 WINDOW = vg.simulate_window(keyframes=3, points=10, lines=1, noise=0.5)
 PROBLEM, START, _ = WINDOW.pack()
 CENTRES = np.asarray(WINDOW.centres)
-
-
-class Fix(vg.terms.PoseTerm):
-    """A position in the world."""
-
-    position: jax.Array
-
-    def residual(self, pose: vg.terms.PoseTerm, camera: object) -> jax.Array:
-        return pose.inverse().translation() - self.position
 
 
 class Range(vg.terms.PoseTerm):
@@ -47,9 +39,8 @@ def ranges(anchor: np.ndarray) -> Problem:
 def fixes(offset: float, kernel: vg.kernels.AbstractKernel | None = None, sigma: float = 0.02) -> Problem:
     """A fix on each keyframe, all in a frame that is `offset` metres aside of the held pose's."""
     there = jnp.asarray(CENTRES + np.array([offset, 0.0, 0.0]))
-    return PROBLEM.with_term(
-        Fix(keyframe=[0, 1, 2], position=there, weight=jnp.full(3, sigma**-2), kernel=kernel or vg.kernels.Square())
-    )
+    weight, kernel = jnp.full(3, sigma**-2), kernel or vg.kernels.Square()
+    return PROBLEM.with_term(PositionFix(keyframe=[0, 1, 2], position=there, weight=weight, kernel=kernel))
 
 
 @partial(jax.jit, static_argnames="failed")
@@ -124,7 +115,7 @@ def test_a_term_that_its_kernel_rejects_is_named() -> None:
     for kernel in (vg.kernels.GemanMcClure(1.5), vg.kernels.Cauchy(1.5)):
         found = _diagnosed(fixes(1.0, kernel), truth)
         assert float(found.rejected[-1]) == 1
-        assert "`fix` rejects 100%" in said(fixes(1.0, kernel), truth)
+        assert "`position_fix` rejects 100%" in said(fixes(1.0, kernel), truth)
         assert "fix" not in said(fixes(0.02, kernel), truth)
     assert float(_diagnosed(fixes(1.0, vg.kernels.Huber(1.5)), truth).rejected[-1]) == 0
 
@@ -139,7 +130,7 @@ def test_a_held_pose_in_another_frame_is_named() -> None:
     assert np.linalg.norm(found.motion[-1][:3]) == pytest.approx(1.0, rel=1e-6)
     assert int(found.redundancy) > redundancy
     words = said(fixes(1.0), truth)
-    assert "`fix`" in words
+    assert "`position_fix`" in words
     assert "1 m" in words
     assert said(fixes(0.005), truth) == ""
     assert said(fixes(1.0, sigma=2.0), truth) == ""  # a metre is noise there

@@ -138,7 +138,6 @@ def test_absent_observations_may_hold_anything() -> None:
     np.testing.assert_array_equal(gradient, clean_gradient)
 
 
-POSES = make_scene().poses
 PIXEL, DEPTH = np.array([71.5, 180.25]), 2.6
 
 

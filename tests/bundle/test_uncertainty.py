@@ -10,6 +10,7 @@ import monte_carlo
 import numpy as np
 import pytest
 from degenerate_scenes import WELL, packed
+from own_terms import PositionFix, Sighting
 from vggtgeo.solvers.arrow import ArrowVector
 from vggtgeo.solvers.kernels import Huber
 
@@ -150,20 +151,6 @@ class Aspect(vg.terms.CameraTerm):
         return parameters[0] / parameters[1] - 1
 
 
-class Centre(vg.terms.PoseTerm):
-    """A known camera centre."""
-
-    def residual(self, pose, camera):
-        return pose.inverse().translation()
-
-
-class Sight(vg.terms.PoseTerm):
-    """A landmark at a known place, seen by the camera."""
-
-    def residual(self, pose, camera):
-        return camera.project(pose @ jnp.array([0.1, 0.2, 3.0]))
-
-
 @pytest.mark.long
 def test_what_speaks_of_held_unknowns_alone_is_no_redundancy() -> None:
     # Proves that rows which never change are left out by what they depend on, whatever their class. Oracle: what is
@@ -177,10 +164,12 @@ def test_what_speaks_of_held_unknowns_alone_is_no_redundancy() -> None:
     free = eqx.tree_at(lambda p: p.fixed_intrinsics, problem, problem.fixed_intrinsics.at[1].set(False))
     assert kept(Aspect(weight=jnp.ones(1)), free) == [1.0]
     assert kept(problem.intrinsics_prior.reweighted(jnp.ones(4)), problem) == [0.0, 0.0, 1.0, 1.0]
-    assert kept(Centre(keyframe=every, weight=one), problem) == [0.0, 1.0, 1.0]
-    assert kept(Sight(keyframe=every, weight=one), problem) == [1.0, 1.0, 1.0]  # the principal point is free
+    assert kept(PositionFix(keyframe=every, position=jnp.zeros((3, 3)), weight=one), problem) == [0.0, 1.0, 1.0]
+    place, pixel = jnp.tile(jnp.array([0.1, 0.2, 3.0]), (3, 1)), jnp.zeros((3, 2))
+    sighting = Sighting(keyframe=every, place=place, pixel=pixel, weight=one)
+    assert kept(sighting, problem) == [1.0, 1.0, 1.0]  # the principal point is free
     held = eqx.tree_at(lambda p: p.fixed_intrinsics, problem, jnp.ones(4, bool))
-    assert kept(Sight(keyframe=every, weight=one), held) == [0.0, 1.0, 1.0]
+    assert kept(sighting, held) == [0.0, 1.0, 1.0]
     both = eqx.tree_at(lambda p: p.fixed_pose, problem, problem.fixed_pose.at[1].set(True))
     pair = vg.terms.BaselinePrior(first=[0, 0], second=[1, 2], length=one[:2], sigma=one[:2], weight=one[:2])
     assert kept(pair, both) == [0.0, 1.0]

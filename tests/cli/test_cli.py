@@ -123,7 +123,8 @@ def test_solve_from_file_to_file(tmp_path: Path) -> None:
     assert (report["iterations"], report["result"], report["dtype"]) == (3, "max_iterations", "float64")
     assert 0 < report["energy_final"] < report["energy_initial"]
     assert report["ms_per_iteration"] > 0
-    start = arrays_of_start()
+    given = arrays_of(SCENE)
+    start = {"T": given["T_init"], "k": given["k_init"], "d": given["d_init"]}
     with np.load(solution) as arrays:
         assert {name: arrays[name].shape for name in arrays.files} == {name: start[name].shape for name in start}
         assert all(arrays[name].dtype == np.float64 for name in arrays.files)
@@ -150,9 +151,3 @@ def test_float32_reaches_the_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert report["energy_final"] != report["energy_initial"]
     with np.load(solution) as arrays:
         assert all(arrays[name].dtype == np.float64 for name in arrays.files)
-
-
-def arrays_of_start() -> dict[str, np.ndarray]:
-    """The start of the problem that `write` writes, as a solution's arrays."""
-    arrays = arrays_of(SCENE)
-    return {"T": arrays["T_init"].copy(), "k": arrays["k_init"], "d": arrays["d_init"]}

@@ -129,7 +129,6 @@ def test_what_is_not_fit_ends_with_a_reason(check: Callable, tmp_path: Path) -> 
         ((bad,), "`pred_logits`"),
         ((bad, "--network", "vggt"), "is not a file of `vggt`"),
         ((other,), "matches no known network"),
-        ((tmp_path / "none.onnx",), "is not there"),
         ((bad, "--image", bad), "bad.onnx"),
     ):
         result = check(*arguments)

@@ -3,7 +3,6 @@
 import warnings
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import tiny_sequences as tiny
@@ -86,11 +85,7 @@ def test_a_list_out_of_order_is_sorted_with_a_warning(tmp_path: Path) -> None:
 
 def test_a_video_cut_off_gives_its_frames_and_a_warning(tmp_path: Path) -> None:
     # Proves that a video which ends too early gives what there is, and says how much is missing.
-    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        writer.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
-    writer.release()
+    tiny.video(tmp_path / "clip.avi", np.random.default_rng(0).integers(0, 256, (20, 48, 64, 3), dtype=np.uint8))
     _cut(tmp_path / "clip.avi", 0.5)
     tiny.write_calibration(tmp_path, (60.0, 60.0, 32.0, 24.0))
     frames, said = _read(open_sequence(tmp_path / "clip.avi"))

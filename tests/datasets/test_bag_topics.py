@@ -40,11 +40,6 @@ def packed(kind: str, data: bytes = b"") -> Any:
             "/c/rgb/image_color",
             "/c/depth_registered/image_raw",
         ),
-        (
-            {"/depth/image_raw": "16UC1", "/depth_to_rgb/image_raw": "16UC1", "/rgb/image_raw": "bgra8"},
-            "/rgb/image_raw",
-            "/depth_to_rgb/image_raw",
-        ),
         ({"/camera/ir/image": "mono8", "/camera/rgb/image_color": "rgb8"}, "/camera/rgb/image_color", ""),
         ({"/camera/ir/image": "16UC1", "/camera/rgb/image_color": "rgb8"}, "/camera/rgb/image_color", ""),
         ({"/camera/infra1/image_rect_raw": "mono8", "/camera/left/image": "mono8"}, "/camera/left/image", ""),

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import tiny_bags as bags
@@ -46,11 +45,8 @@ def test_a_stream_is_read_until_it_ends(tmp_path: Path) -> None:
     assert is_live("rtsp://user:secret@10.0.0.2/stream")
     assert not is_live("clip.mp4")
     assert "secret" not in LiveCamera("rtsp://user:secret@10.0.0.2/s", CAMERA).name
-    file = tmp_path / "clip.avi"
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
-    for number in range(5):
-        writer.write(np.full((48, 64, 3), 40 * number, np.uint8))
-    writer.release()
+    pictures = [np.full((48, 64, 3), 40 * number, np.uint8) for number in range(5)]
+    file = tiny_sequences.video(tmp_path / "clip.avi", pictures)
     with warns("clip.avi"):
         stream = open_sequence(f"file:{file}", kind="camera")
     frames = list(stream.frames(1, None, 2))

@@ -109,14 +109,9 @@ def test_tum_pairs_the_nearest_depth_once(tmp_path: Path) -> None:
     )
     with warns("2", "4"):
         sequence = open_sequence(tmp_path)
-    found = [None if np.isnan(f.depth).all() else round(float(f.depth[1, 0]) * 5000) for f in _with_depth(sequence)]
+    depths = [frame.depth for frame in sequence.frames()]
+    found = [None if np.isnan(depth).all() else round(float(depth[1, 0]) * 5000) for depth in depths]
     assert found == [None, 1000, 1010, None]
-
-
-def _with_depth(sequence: Sequence) -> list[Frame]:
-    frames = list(sequence.frames())
-    assert all(frame.depth is not None for frame in frames)
-    return frames
 
 
 @pytest.mark.parametrize(
@@ -221,13 +216,7 @@ def test_the_guess_of_a_video_has_its_pixels(tmp_path: Path, aspect: Fraction, a
 
 def _video(path: Path, levels: list[Any]) -> Path:
     """A video of images of one grey level, or one colour (BGR)."""
-    size = (tiny.WIDTH, tiny.HEIGHT)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size)
-    assert writer.isOpened()
-    for level in levels:
-        writer.write(np.full((*size[::-1], 3), level, np.uint8))
-    writer.release()
-    return path
+    return tiny.video(path, [np.full((tiny.HEIGHT, tiny.WIDTH, 3), level, np.uint8) for level in levels])
 
 
 @pytest.mark.parametrize("selection", [(0, None, 1), (1, None, 1), (0, 4, 2), (1, 100, 3), (4, 5, 1)])
@@ -320,7 +309,7 @@ def test_12_bits_in_a_file_of_16_are_not_black(tmp_path: Path) -> None:
     # Proves the scale of such values, alone and beside images that use all 16 bits. Oracle: the pixels written.
     picture = bad.picture(1)
     picture[0, 0] = 255
-    (tmp_path / "twelve.png").write_bytes(bad.encoded(".png", picture[..., ::-1].astype(np.uint16) << 4))
+    cv2.imwrite(str(tmp_path / "twelve.png"), picture[..., ::-1].astype(np.uint16) << 4)
     twelve = read_image_file(tmp_path / "twelve.png")
     assert twelve.bits == 12
     np.testing.assert_array_equal(twelve.image, picture)

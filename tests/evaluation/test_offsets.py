@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from vggtgeo.cli.evaluate import evaluate
 from vggtgeo.evaluation import Offsets, estimate_offsets, shifted
-from vggtgeo.evaluation.offset_model import DriftNoise
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputWarning
 
@@ -150,18 +149,6 @@ def test_offsets_of_few_or_still_poses_are_none() -> None:
     still = Trajectory(truth.timestamps, np.tile(np.eye(4), (len(truth), 1, 1)))
     assert _offsets(estimate, still).significant == ()
     assert not _offsets(truth, truth).explains
-
-
-def test_a_drift_is_told_from_white_noise() -> None:
-    # Proves that whitening with the fitted noise leaves unit variance and no correlation. Oracle: noise that was drawn.
-    rng = np.random.default_rng(0)
-    white = rng.normal(0, 0.01, (400, 3))
-    walk = np.cumsum(rng.normal(0, 0.01, (400, 3)), axis=0)
-    for errors in (white, walk, white + walk):
-        left = DriftNoise.of(errors, np.tile(np.eye(3), (400, 1, 1)), 1e-9).whitened(errors)
-        neighbours = float((left[1:] * left[:-1]).mean())
-        assert float((left**2).mean()) == pytest.approx(1.0, abs=0.02)
-        assert abs(neighbours) < 0.08, f"correlation of neighbours {neighbours:.3f}"
 
 
 def test_a_shifted_truth_is_interpolated() -> None:

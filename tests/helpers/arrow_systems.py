@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,9 @@ from vggtgeo.solvers.arrow import (
     hessian_times,
 )
 from vggtgeo.solvers.problem import AbstractArrowProblem
+from vggtgeo.solvers.schur_complement import dense_schur_complement
+
+from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 
 NODES, BLOCK, SHARED, SLOTS = 3, 2, 2, 4
 
@@ -167,3 +171,27 @@ def zero_step(problem: AbstractArrowProblem, point: Any) -> ArrowVector:
 def free_part(system: ArrowSystem) -> np.ndarray:
     """Indices of the coordinates that are neither held nor undetermined."""
     return np.nonzero(np.concatenate([system.free, np.ravel(system.landmark_hessian != 0)]))[0]
+
+
+@eqx.filter_jit
+def exact_and_derived(problem: Any, state: Any, energy: Callable[[Any, Any], jax.Array]) -> tuple[jax.Array, ...]:
+    """Matrix and gradients of the solver, and gradient and Hessian of the energy after a retraction, all dense."""
+    ba = BundleAdjustment(problem)
+    zero = zero_step(ba, state)
+    flat, unflat = ravel_pytree(zero)
+    total = lambda step: energy(problem, ba.retract(state, unflat(step)))
+    system = ba.hessian(state)
+    by_system = jnp.concatenate([dense_schur_complement(system).gradient, system.landmark_gradient.ravel()])
+    by_energy = ravel_pytree(ba.gradient(state))[0]
+    return dense_matrix(system, zero), by_system, by_energy, jax.grad(total)(flat), jax.hessian(total)(flat)
+
+
+def check_exact_hessian(problem: Any, state: Any, energy: Callable[[Any, Any], jax.Array]) -> None:
+    """Gradient and exact Hessian of the solver are those of automatic differentiation, each unknown in its own unit."""
+    matrix, *gradients, expected, hessian = exact_and_derived(problem, state, energy)
+    unit = 1 / np.sqrt(np.abs(np.diag(hessian)) + 1.0)
+    error = np.abs((matrix - hessian) * np.outer(unit, unit)).max()
+    assert error < 1e-9, error
+    for gradient in gradients:
+        error = np.abs((gradient - expected) * unit).max() / np.abs(expected * unit).max()
+        assert error < 1e-11, error

@@ -63,25 +63,9 @@ def images(path: Path) -> Path:
     return bad.frames(path / "frames")
 
 
-def run_with(*flags: Any) -> Callable[[Path], Sequence[Any]]:
-    """Return the command that runs what was made."""
-    return lambda made: ["run", made, "-o", made.parent / "out", *flags]
-
-
-def words(*given: Any) -> Callable[[Any], Sequence[Any]]:
-    """Return a command that needs no file."""
-    return lambda made: given
-
-
 def settings_file(path: Path) -> Path:
     """Make images, and a settings file that is not TOML."""
     bad.file("run.toml", "stride: 2")(path)
-    return images(path)
-
-
-def output_that_is_a_file(path: Path) -> Path:
-    """Make images, and a file where the output folder would be."""
-    bad.file("out", "")(path)
     return images(path)
 
 
@@ -104,9 +88,17 @@ def long_walk(path: Path) -> Path:
     return path
 
 
-def evaluate(*flags: Any) -> Callable[[Path], Sequence[Any]]:
-    """Return the command that compares the two trajectories."""
-    return lambda made: ["evaluate", made / "estimate.txt", made / "truth.txt", *flags]
+def empty_image(path: Path) -> Path:
+    """Make images, one of them an empty file."""
+    images(path)
+    (path / "frames/1.png").write_bytes(b"")
+    return path / "frames"
+
+
+def half_a_summary(path: Path) -> Path:
+    """Make a run folder whose summary is not JSON."""
+    bad.file("summary.json", "{")(path)
+    return path
 
 
 def linked_to_itself(path: Path) -> Path:
@@ -175,6 +167,9 @@ def bag(**topics: bags.Topic) -> Callable[[Path], Path]:
     return lambda path: bags.write(path / "c.bag", **topics)
 
 
+smaller_image = bag(c_image=bags.image(smaller), c_info=bags.info())
+
+
 def several_bags(path: Path) -> Path:
     """Make a recording in two files."""
     for number in range(2):
@@ -182,126 +177,92 @@ def several_bags(path: Path) -> Path:
     return path
 
 
-RUN = [
-    Row("missing", "no path", ("'path'",), folder, words("run")),
-    Row("wrong", "`--stride 0`", ("--stride",), images, run_with("--stride", "0")),
-    Row("inconsistent", "`--start` behind the last frame", ("start", "100"), images, run_with("--start", "100")),
-    Row("missing", "settings file that does not exist", ("--settings",), images, run_with("--settings", "no.toml")),
-    Row("wrong", "endless settings file", ("--settings", "/dev/zero"), images, run_with("--settings", "/dev/zero")),
-    Row(
-        "wrong",
-        "settings file that is not TOML",
-        ("run.toml", "'='"),
-        settings_file,
-        lambda made: run_with("--settings", made.parent / "run.toml")(made),
-    ),
-    Row("inconsistent", "output that is a file", ("out",), output_that_is_a_file, run_with()),
-    Row("truncated", "checkpoint that is text", ("checkpoint.npz",), garbled_checkpoint, run_with("--resume")),
-]
-COMMANDS = [
-    Row("wrong", "unknown command", ("'solv'", "'solve'"), folder, words("solv")),
-    Row("missing", "trajectory that does not exist", ("no.txt",), folder, words("evaluate", "no.txt", "no.txt")),
-    Row("wrong", "`--delta 0`", ("delta", "0.0"), two_walks, evaluate("--delta", "0")),
-    Row("truncated", "20 GB of zeros", ("estimate.txt", "20000000000"), long_walk, evaluate()),
-]
-VERIFY: dict[str, Any] = {"argv": lambda made: ["models", "verify", made]}
-NETWORKS = [
-    Row("missing", "network that does not exist", ("net.onnx",), lambda path: path / "net.onnx", **VERIFY),
-    Row("truncated", "empty network", ("net.onnx",), bad.file("net.onnx", ""), **VERIFY),
-    Row("wrong", "PyTorch checkpoint", ("net.onnx",), bad.file("net.onnx", b"PK\x03\x04" + b"\0" * 99), **VERIFY),
-]
-LOAD: dict[str, Any] = {"call": lambda made: Result.load(made.parent)}
-RESULTS = [
-    Row("missing", "run without a summary", ("summary.json",), lambda path: path / "summary.json", **LOAD),
-    Row("truncated", "summary that is not JSON", ("1", "2"), bad.file("summary.json", "{"), **LOAD),
-]
-READ: dict[str, Any] = {"call": read_frames}
-IMAGES = [
-    Row("truncated", "empty image", ("1.png",), bad.with_image(lambda: b""), warned=True, **READ),
-    Row("missing", "link to itself", ("frames", "1"), linked_to_itself, warned=True, **READ),
-    Row(
-        "wrong",
-        "depth in metres as 16 bits",
-        ("10.004000.png", "0.0004"),
-        bad.every_depth(lambda: np.full((tiny.HEIGHT, tiny.WIDTH), 2, np.uint16)),
-        warned=True,
-        **READ,
-    ),
-]
-TEXTS = [
-    Row("missing", "list without a line", ("rgb.txt",), bad.rgbd(bad.write("rgb.txt", "# nothing\n")), **READ),
-    Row("wrong", "time that is a word", ("rgb.txt", "1"), bad.rgbd(bad.write("rgb.txt", "now rgb/1.png\n")), **READ),
-    Row("inconsistent", "pose that is not a rotation", ("rotation",), sheared_pose, warned=True, **READ),
-    Row("wrong", "calibration of words", ("calibration.txt", "'fx fy cx cy'"), calibrated("fx fy cx cy"), **READ),
-    Row("missing", "empty calibration", ("calibration.txt", "0"), calibrated(""), **READ),
-    Row(
-        "inconsistent",
-        "focal length of 0.001",
-        ("calibration.txt", "0.001"),
-        calibrated("0.001 0.001 31.5 23.5"),
-        **READ,
-    ),
-]
-VIDEOS = [
-    Row(
-        "wrong",
-        "text as a video",
-        ("clip.mp4",),
-        bad.file("clip.mp4", "ffconcat version 1.0\nfile /etc/passwd\n"),
-        **READ,
-    ),
-    Row("truncated", "empty video", ("clip.mp4",), bad.file("clip.mp4", ""), **READ),
-]
-WITH_MAP: dict[str, Any] = {
-    "argv": lambda made: ["run", made, "-o", made.parent / "out", "--map", made.parent / "office.map"]
-}
-MAPS = [
-    Row("missing", "map that does not exist", ("office.map",), images, **WITH_MAP),
-    Row("truncated", "half a map", ("office.map",), with_map(cut), **WITH_MAP),
-    Row("wrong", "map of a newer version", ("office.map", "99"), with_map(newer), **WITH_MAP),
-    Row("inconsistent", "map with an unknown field", ("office.map",), with_map(with_unknown_field), **WITH_MAP),
-]
-BAGS = [
-    Row("missing", "bag without images", ("c.bag",), bag(c_info=bags.info()), **READ),
-    Row(
-        "inconsistent",
-        "image of another size in a bag",
-        ("image, 1", "40"),
-        bag(c_image=bags.image(smaller), c_info=bags.info()),
-        warned=True,
-        **READ,
-    ),
-    Row("wrong", "several bags", ("2", "1"), several_bags, **READ),
-]
-CLOUD: dict[str, Any] = {"call": PointCloud.load_ply}
-CLOUDS = [
-    Row("wrong", "text as a cloud", ("map.ply", "1"), bad.file("map.ply", "no cloud"), **CLOUD),
-    Row(
-        "truncated",
-        "cloud that declares 10^15 points",
-        ("map.ply", "vertex"),
-        bad.ply(f"format binary_little_endian 1.0\nelement vertex 1000000000000000\n{XYZ}", bytes(999)),
-        **CLOUD,
-    ),
-    Row("missing", "cloud that does not exist", ("map.ply",), lambda path: path / "map.ply", **CLOUD),
-]
-SOLVE: dict[str, Any] = {"argv": lambda made: ["solve", made, "-o", made.parent / "solution.npz"]}
-PROBLEMS = [
-    Row("missing", "problem that does not exist", ("no.npz",), lambda path: path / "no.npz", **SOLVE),
-    Row("truncated", "empty problem", ("problem.npz",), bad.file("problem.npz", ""), **SOLVE),
-    Row("inconsistent", "array of another shape", ("T_init", "3"), bad.problem(T_init=np.zeros((3, 4))), **SOLVE),
-    Row("wrong", "array of words", ("d_prior",), bad.problem(d_prior=lambda old: old.astype(str)), **SOLVE),
-]
-ROWS: tuple[Row, ...] = (
-    *RUN,
-    *COMMANDS,
-    *NETWORKS,
-    *RESULTS,
-    *IMAGES,
-    *TEXTS,
-    *VIDEOS,
-    *MAPS,
-    *BAGS,
-    *CLOUDS,
-    *PROBLEMS,
+def command(kind: str, given: str, named: tuple[str, ...], make: Callable[[Path], Any], *argv: Any) -> Row:
+    """Return a row whose input the command line gets: functions in it are called with what was made."""
+    return Row(kind, given, named, make, lambda made: [word(made) if callable(word) else word for word in argv])
+
+
+def itself(made: Any) -> Any:
+    """Return what was made."""
+    return made
+
+
+def beside(name: str) -> Callable[[Path], Path]:
+    """Return the way from what was made to a file beside it."""
+    return lambda made: made.parent / name
+
+
+def runs(kind: str, given: str, named: tuple[str, ...], make: Callable[[Path], Any], *flags: Any) -> Row:
+    """Return a row whose input is run with these flags."""
+    return command(kind, given, named, make, "run", itself, "-o", beside("out"), *flags)
+
+
+def reads(kind: str, given: str, named: tuple[str, ...], make: Callable[[Path], Any], warned: bool = False) -> Row:
+    """Return a row whose input is read as a sequence."""
+    return Row(kind, given, named, make, call=read_frames, warned=warned)
+
+
+def evaluates(kind: str, given: str, named: tuple[str, ...], make: Callable[[Path], Any], *flags: Any) -> Row:
+    """Return a row whose two trajectories are compared."""
+    files = (lambda made: made / "estimate.txt", lambda made: made / "truth.txt")
+    return command(kind, given, named, make, "evaluate", *files, *flags)
+
+
+WITH_MAP = ("--map", beside("office.map"))
+VERIFY = ("models", "verify", itself)
+SOLVE = ("solve", itself, "-o", beside("solution.npz"))
+MILLIMETRES = np.full((tiny.HEIGHT, tiny.WIDTH), 2, np.uint16)
+FFCONCAT = "ffconcat version 1.0\nfile /etc/passwd\n"
+MANY_POINTS = f"format binary_little_endian 1.0\nelement vertex 1000000000000000\n{XYZ}"
+ROWS = (
+    # Runs and other commands.
+    command("missing", "no path", ("'path'",), folder, "run"),
+    runs("wrong", "`--stride 0`", ("--stride",), images, "--stride", "0"),
+    runs("inconsistent", "`--start` behind the last frame", ("start", "100"), images, "--start", "100"),
+    runs("missing", "settings file that does not exist", ("--settings",), images, "--settings", "no.toml"),
+    runs("wrong", "endless settings file", ("--settings", "/dev/zero"), images, "--settings", "/dev/zero"),
+    runs("wrong", "settings that are not TOML", ("run.toml", "'='"), settings_file, "--settings", beside("run.toml")),
+    runs("truncated", "checkpoint that is text", ("checkpoint.npz",), garbled_checkpoint, "--resume"),
+    command("wrong", "unknown command", ("'solv'", "'solve'"), folder, "solv"),
+    command("missing", "trajectory that does not exist", ("no.txt",), folder, "evaluate", "no.txt", "no.txt"),
+    evaluates("wrong", "`--delta 0`", ("delta", "0.0"), two_walks, "--delta", "0"),
+    evaluates("truncated", "20 GB of zeros", ("estimate.txt", "20000000000"), long_walk),
+    # Networks.
+    command("missing", "network that does not exist", ("net.onnx",), lambda path: path / "net.onnx", *VERIFY),
+    command("truncated", "empty network", ("net.onnx",), bad.file("net.onnx", ""), *VERIFY),
+    command("wrong", "PyTorch checkpoint", ("net.onnx",), bad.file("net.onnx", b"PK\x03\x04" + b"\0" * 99), *VERIFY),
+    # Results.
+    Row("missing", "run without a summary", ("summary.json",), folder, call=Result.load),
+    Row("truncated", "summary that is not JSON", ("1", "2"), half_a_summary, call=Result.load),
+    # Images.
+    reads("truncated", "empty image", ("1.png",), empty_image, warned=True),
+    reads("missing", "link to itself", ("frames", "1"), linked_to_itself, warned=True),
+    reads("wrong", "metres as 16 bits", ("10.004000.png", "0.0004"), bad.every_depth(MILLIMETRES), warned=True),
+    # Lists, poses and cameras.
+    reads("missing", "list without a line", ("rgb.txt",), bad.rgbd("# nothing\n")),
+    reads("wrong", "time that is a word", ("rgb.txt", "1"), bad.rgbd("now rgb/1.png\n")),
+    reads("inconsistent", "pose that is not a rotation", ("rotation",), sheared_pose, warned=True),
+    reads("wrong", "calibration of words", ("calibration.txt", "'fx fy cx cy'"), calibrated("fx fy cx cy")),
+    reads("missing", "empty calibration", ("calibration.txt", "0"), calibrated("")),
+    reads("inconsistent", "focal length of 0.001", ("calibration.txt", "0.001"), calibrated("0.001 0.001 31.5 23.5")),
+    # Videos and bags.
+    reads("wrong", "text as a video", ("clip.mp4",), bad.file("clip.mp4", FFCONCAT)),
+    reads("truncated", "empty video", ("clip.mp4",), bad.file("clip.mp4", "")),
+    reads("missing", "bag without images", ("c.bag",), bag(c_info=bags.info())),
+    reads("inconsistent", "image of another size", ("image, 1", "40"), smaller_image, warned=True),
+    reads("wrong", "several bags", ("2", "1"), several_bags),
+    # Maps.
+    runs("missing", "map that does not exist", ("office.map",), images, *WITH_MAP),
+    runs("truncated", "half a map", ("office.map",), with_map(cut), *WITH_MAP),
+    runs("wrong", "map of a newer version", ("office.map", "99"), with_map(newer), *WITH_MAP),
+    runs("inconsistent", "map with an unknown field", ("office.map",), with_map(with_unknown_field), *WITH_MAP),
+    # Clouds.
+    Row("wrong", "text as a cloud", ("map.ply", "1"), bad.file("map.ply", "no cloud"), call=PointCloud.load_ply),
+    Row("truncated", "10^15 points", ("map.ply", "vertex"), bad.ply(MANY_POINTS, bytes(999)), call=PointCloud.load_ply),
+    Row("missing", "no cloud", ("map.ply",), lambda path: path / "map.ply", call=PointCloud.load_ply),
+    # Problems.
+    command("missing", "problem that does not exist", ("no.npz",), lambda path: path / "no.npz", *SOLVE),
+    command("truncated", "empty problem", ("problem.npz",), bad.file("problem.npz", ""), *SOLVE),
+    command("inconsistent", "array of another shape", ("T_init", "3"), bad.problem(T_init=np.zeros((3, 4))), *SOLVE),
+    command("wrong", "array of words", ("d_prior",), bad.problem(d_prior=np.full(27, "far")), *SOLVE),
 )

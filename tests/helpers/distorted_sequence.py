@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import cv2
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,15 @@ import numpy as np
 import vggtgeo as vg
 from vggtgeo.datasets import Frame
 from vggtgeo.geometry.camera import Camera
+
+WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
+"""Of `simulate_window`: enough views to tell what camera took them."""
+_solve = eqx.filter_jit(vg.solve)
+
+
+def adjusted(problem: vg.Problem, state: vg.State) -> vg.State:
+    """The state that fits the matches."""
+    return _solve(problem, state).state
 
 
 class Bent:

@@ -21,6 +21,16 @@ class PositionFix(vg.terms.PoseTerm):
         return pose.inverse().translation() - self.position
 
 
+class Sighting(vg.terms.PoseTerm):
+    """A known place and where it was seen: a term on a pose and the camera that took it."""
+
+    place: jax.Array  # [m, 3], metres
+    pixel: jax.Array  # [m, 2]
+
+    def residual(self, pose, camera):
+        return camera.project(pose @ self.place) - self.pixel
+
+
 class StepOfWheels(vg.terms.PairTerm):
     """A measured motion between two keyframes."""
 

@@ -1,5 +1,6 @@
 """Tiny sequences on disk, in each layout that the readers know, with contents that tell frame and pixel."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -29,6 +30,17 @@ def write_image(path: Path, pixels: np.ndarray) -> Path:
     return path
 
 
+def video(path: Path, pictures: Iterable[np.ndarray], codec: str = "MJPG") -> Path:
+    """A video of pictures of one size, ten a second, in OpenCV's order of colours."""
+    first, *rest = pictures
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 10.0, first.shape[1::-1])
+    assert writer.isOpened()
+    for picture in (first, *rest):
+        writer.write(picture)
+    writer.release()
+    return path
+
+
 def pose(number: int) -> np.ndarray:
     """Camera -> world: `number` metres along x."""
     matrix = np.eye(4)
@@ -41,20 +53,19 @@ def tum_line(time: float, number: int) -> str:
     return f"{time:.6f} {number} 0 0 0 0 0 1\n"
 
 
-def seven_scenes(folder: Path, numbers: tuple[int, ...] = (0, 2, 4), intrinsics: bool = True) -> Path:
+def seven_scenes(folder: Path, numbers: tuple[int, ...] = (0, 2, 4)) -> Path:
     """A 7-Scenes folder with images, depth and poses of the frames `numbers`."""
     for number in numbers:
         stem = folder / f"frame-{number:06d}"
         write_image(stem.with_suffix(".color.png"), image(number))
         write_image(stem.with_suffix(".depth.png"), depth_codes(number))
         np.savetxt(stem.with_suffix(".pose.txt"), pose(number))
-    if intrinsics:
-        fx, fy, cx, cy = INTRINSICS
-        np.savetxt(folder / "camera-intrinsics.txt", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    fx, fy, cx, cy = INTRINSICS
+    np.savetxt(folder / "camera-intrinsics.txt", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return folder
 
 
-def tum(folder: Path, count: int = 3, calibration: bool = True) -> Path:
+def tum(folder: Path, count: int = 3) -> Path:
     """A TUM RGB-D folder: images every 0.1 s, depth 4 ms later, truth every 0.05 s."""
     rgb, depth, truth = ["# color images\n"], ["# depth maps\n"], ["# ground truth\n"]
     for number in range(count):
@@ -66,8 +77,7 @@ def tum(folder: Path, count: int = 3, calibration: bool = True) -> Path:
         truth += [tum_line(time, number), tum_line(time + 0.05, number)]
     for name, lines in (("rgb", rgb), ("depth", depth), ("groundtruth", truth)):
         (folder / f"{name}.txt").write_text("".join(lines))
-    if calibration:
-        write_calibration(folder, INTRINSICS)
+    write_calibration(folder, INTRINSICS)
     return folder
 
 

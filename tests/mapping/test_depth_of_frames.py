@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from changed import changed
-from recorded_run import RecordedRun, recorded_run
+from recorded_run import RecordedRun
 
 from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.mapping.depth_map import DepthMap, PosedDepth
@@ -16,11 +15,6 @@ from vggtgeo.results.scene import depth_of_frames
 from vggtgeo.slam.state import Slam
 
 CAMERA = np.array([200.0, 200.0, 79.5, 59.5])
-
-
-@pytest.fixture(scope="module")
-def run() -> RecordedRun:
-    return recorded_run()
 
 
 def ordinary(slam: Slam) -> int:

@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 from checked_page import CheckedPage
-from recorded_run import FRAMES, RecordedRun, recorded_run
+from recorded_run import FRAMES, RecordedRun
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
 
@@ -60,7 +60,8 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
     verdict = options.get("verdict", Verdict("good"))
     settings, seconds = {"seed": 0, "no_lines": False}, {"track": 1.0, "all": 2.0}
     summary = summarise(slam, verdict, settings=settings, seconds=seconds, report=report, **facts)
-    maps = tuple(dense_depths(slam.keyframes, slam.intrinsics, "auto" if _deep(slam) else "none"))
+    deep = any(np.isfinite(keyframe.depth).any() for keyframe in slam.keyframes)
+    maps = tuple(dense_depths(slam.keyframes, slam.intrinsics, "auto" if deep else "none"))
     dense = DenseMap(maps, slam.keyframes, maps, slam.intrinsics, options.get("cloud", run.cloud), 0.02)
     given = {"windows": tuple(run.recorder.records), "truth": truth, "warnings": (), "title": "a <room>"}
     given = {name: options.get(name, value) for name, value in given.items()}
@@ -69,15 +70,6 @@ def _page(run: RecordedRun, folder: Path, slam: Slam | None = None, **options: o
         folder / "report.html", record, options.get("summary", summary), verdict, options.get("view", lambda: None)
     )
     return (folder / "report.html").read_text()
-
-
-def _deep(slam: Slam) -> bool:
-    return any(np.isfinite(keyframe.depth).any() for keyframe in slam.keyframes)
-
-
-@pytest.fixture(scope="module")
-def run() -> RecordedRun:
-    return recorded_run()
 
 
 def test_a_run_that_was_found_nowhere_in_a_known_map_has_a_page(run: RecordedRun, tmp_path: Path) -> None:

@@ -223,8 +223,10 @@ def source() -> Source:
     return open_source(vg.simulate("room", 3, size=(160, 120)), None, SETTINGS)
 
 
-def test_recorded_poses_are_prior_or_truth(source: Source) -> None:
-    """Those that the reader knows become the prior, and the run has no truth; without a prior they stay the truth."""
+def test_recorded_poses_are_prior_or_truth(source: Source, tmp_path: Path) -> None:
+    """Those that the reader knows become the prior, and the run has no truth; without a prior they stay the truth, and
+    beside a file of poses, which is read as a trajectory is.
+    """
     same, nothing = with_pose_prior(source, None)
     assert same is source
     assert nothing is None
@@ -233,14 +235,8 @@ def test_recorded_poses_are_prior_or_truth(source: Source) -> None:
     assert recorded is not None
     assert source.truth is not None
     np.testing.assert_array_equal(recorded.trajectory.poses, source.truth.poses)
-
-
-def test_poses_of_a_file_leave_the_truth(source: Source, tmp_path: Path) -> None:
-    """A file of poses is read as a trajectory is, and the truth of the sequence stays."""
-    assert source.truth is not None
-    file = tmp_path / "odometry.txt"
-    source.truth.save_tum(file)
-    same, recorded = with_pose_prior(source, file)
+    source.truth.save_tum(tmp_path / "odometry.txt")
+    same, recorded = with_pose_prior(source, tmp_path / "odometry.txt")
     assert same.truth is source.truth
     assert recorded is not None
     np.testing.assert_allclose(recorded.trajectory.poses, source.truth.poses, atol=1e-6)

@@ -75,11 +75,11 @@ def call(frames: Path, out: Path, *more: str):
     return CliRunner().invoke(make_app(), ["run", str(frames), "-o", str(out), *more])
 
 
-def check_one_run(out: Path, frames: int) -> None:
+def check_one_run(out: Path, frames: int, interrupted: bool) -> None:
     """All files are of one run of so many frames, and nothing of an earlier one is among them."""
     summary = json.loads((out / "summary.json").read_text())
     assert summary["frames"] == frames
-    assert ("interrupted" in (out / "report.html").read_text()) == summary["interrupted"] == (frames < FRAMES)
+    assert ("interrupted" in (out / "report.html").read_text()) == summary["interrupted"] == interrupted
     for file in out.rglob("*"):
         if file.is_file() and file.name != "notes.txt":
             assert file.read_bytes() != b"of the run before", file
@@ -107,17 +107,12 @@ STAGES = (
 )
 
 
-@pytest.mark.parametrize(
-    ("stage", "number"),
-    # SIGINT goes the same way once it has come: the first stage, the last, and one between two files.
-    [*((stage, signal.SIGTERM) for stage in STAGES), *((stage, signal.SIGINT) for stage in STAGES[::3])],
-    ids=lambda given: given.rpartition(".")[2] if isinstance(given, str) else given.name,
-)
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.rpartition(".")[2])
 def test_a_signal_at_any_stage_leaves_one_run(
-    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str, number: signal.Signals
+    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
-    """SIGTERM and SIGINT, in the last adjustment, while the map is made or between two files of the result: the folder
-    holds the new run as a whole, labelled as its summary says; oracle: every file of it.
+    """SIGTERM in the last adjustment, while the map is made or between two files of the result: the folder holds the
+    new run as a whole, labelled as its summary says; oracle: every file of it. The test below has all signals.
     """
     out = tmp_path / "out"
     old_run(out)
@@ -127,20 +122,15 @@ def test_a_signal_at_any_stage_leaves_one_run(
 
     def signalled(*arguments: object, **options: object) -> object:
         if not sent and (name != "replace" or Path(str(arguments[1])).parent == out):
-            sent.append(number)
-            os.kill(os.getpid(), number)
+            sent.append(signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
     monkeypatch.setattr(owner, name, signalled)
     done = call(frames, out)
     assert sent
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["interrupted"] == (name == "finish")
     assert done.exit_code == (130 if name == "finish" else 3), done.output
-    assert ("interrupted" in (out / "report.html").read_text()) == summary["interrupted"]
-    assert b"of the run before" not in {value for key, value in contents(out).items() if key != "notes.txt"}
-    assert not (out / "unfinished").exists()
-    assert not (out / ".lock").exists()
+    check_one_run(out, FRAMES, interrupted=name == "finish")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP], ids=lambda number: number.name)
@@ -164,7 +154,7 @@ def test_a_signal_between_frames_keeps_what_is_done(
     old_run(out)
     done = call(frames, out)
     assert done.exit_code == 130, done.output
-    check_one_run(out, 3)
+    check_one_run(out, 3, interrupted=True)
 
 
 def test_a_second_signal_ends_at_once_and_the_old_run_stays(

@@ -14,18 +14,23 @@ def oracle() -> SimulatedOracle:
     return SimulatedOracle(simulate("room", 120, 0, SIZE, rate=10.0, sensor=IDEAL))
 
 
+def reprojected(oracle: SimulatedOracle, first: int, second: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [n, 2] of a frame in another one, by the frame's own depth and both poses; and their depth there."""
+    fx, fy, cx, cy = oracle.intrinsics
+    depth = oracle.depth(first)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+    points = depth[:, None] * np.column_stack([(pixels - [cx, cy]) / [fx, fy], np.ones(len(pixels))])
+    motion = oracle.pose(second) @ np.linalg.inv(oracle.pose(first))
+    moved = points @ motion[:3, :3].T + motion[:3, 3]
+    return moved[:, :2] / moved[:, 2:] * [fx, fy] + [cx, cy], moved[:, 2]
+
+
 def test_correspondences_agree_with_depth_and_pose_and_come_back(oracle: SimulatedOracle) -> None:
     # At pixel centres a match is the reprojection of the frame's own depth; matching back returns to the start.
     first, second = 10, 16
     rng = np.random.default_rng(0)
     pixels = np.stack([rng.integers(0, SIZE[0], 400), rng.integers(0, SIZE[1], 400)], axis=1).astype(float)
     target, seen = oracle.correspond(first, second, pixels)
-    fx, fy, cx, cy = oracle.intrinsics
-    depth = oracle.depth(first)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-    points = depth[:, None] * np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(400)], axis=1)
-    motion = oracle.pose(second) @ np.linalg.inv(oracle.pose(first))
-    moved = points @ motion[:3, :3].T + motion[:3, 3]
-    expected = np.stack([fx * moved[:, 0] / moved[:, 2] + cx, fy * moved[:, 1] / moved[:, 2] + cy], axis=1)
+    expected, _ = reprojected(oracle, first, second, pixels)
     assert seen.mean() > 0.5
     assert np.abs(target - expected)[seen].max() < 1e-8, f"{np.abs(target - expected)[seen].max()=}"
     back, there = oracle.correspond(second, first, target[seen])
@@ -40,13 +45,7 @@ def test_hidden_points_are_not_seen(oracle: SimulatedOracle) -> None:
     v, u = np.mgrid[4 : SIZE[1] : 9, 4 : SIZE[0] : 9]
     pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
     target, seen = oracle.correspond(first, second, pixels)
-    fx, fy, cx, cy = oracle.intrinsics
-    depth = oracle.depth(first)[v.ravel(), u.ravel()]
-    points = depth[:, None] * np.stack(
-        [(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(depth))], axis=1
-    )
-    motion = oracle.pose(second) @ np.linalg.inv(oracle.pose(first))
-    z = (points @ motion[:3, :3].T + motion[:3, 3])[:, 2]
+    _, z = reprojected(oracle, first, second, pixels)
     inside = np.all((target > 2) & (target < np.subtract(SIZE, 3)), axis=1) & (z > 0)
     there = np.rint(target[inside]).astype(int)
     other = oracle.depth(second)

@@ -14,8 +14,6 @@ from vggtgeo.simulation.stubs import (
     SimulatedMast3r,
     SimulatedMoge,
     SimulatedVggt,
-    smooth_field,
-    stream,
     weakness,
 )
 
@@ -42,19 +40,6 @@ def test_stubs_fulfil_their_roles(oracle: SimulatedOracle) -> None:
     stubs = (SimulatedMast3r, SimulatedLetr, SimulatedMoge, SimulatedDino, SimulatedVggt)
     roles = (PointMatcher, LineDetector, MetricDepth, DenseConfidence, WindowGeometry)
     assert all(isinstance(stub(oracle), role) for stub, role in zip(stubs, roles, strict=True))
-
-
-def test_smooth_fields_have_unit_variance_and_memory() -> None:
-    # Over many seeds: mean 0, variance 1, and correlation exp(-(t / memory)^2 / 2) after t, to 4 standard errors.
-    count, memory = 500, 1.5
-    first, later = np.empty(count), np.empty(count)
-    for seed in range(count):
-        field = lambda time, seed=seed: smooth_field(stream(seed, "test"), (48, 64), time, cycles=1.0, memory=memory)
-        first[seed], later[seed] = field(2.0)[20, 30], field(3.0)[20, 30]
-    expected = np.exp(-0.5 / memory**2)
-    assert abs(first.mean()) < 4 / np.sqrt(count), f"{first.mean()=}"
-    assert abs(first.var() - 1) < 4 * np.sqrt(2 / count), f"{first.var()=}"
-    assert abs(np.mean(first * later) - expected) < 4 * np.sqrt(2 / count), f"{np.mean(first * later)=} {expected=}"
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import tiny_suites
 from conftest import ROOT
-from recorded_run import RecordedRun, recorded_run
+from recorded_run import RecordedRun
 from rrd_files import components_of, entities_of
 from typer.testing import CliRunner
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
@@ -25,11 +25,6 @@ from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.results.files import write_depth, write_trajectories
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.state import Slam
-
-
-@pytest.fixture(scope="module")
-def run() -> RecordedRun:
-    return recorded_run()
 
 
 def iterations_of(slam: Slam) -> IterationRecord | None:

@@ -241,13 +241,3 @@ def test_it_traces_under_vmap() -> None:
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)
     shapes = jax.eval_shape(jax.vmap(observability), *stacked)
     assert all(leaf.shape[0] == 2 for leaf in jax.tree.leaves(shapes))
-
-
-LOOP = 60
-FIRST, NONE, MOST = (np.arange(LOOP) < count for count in (1, 0, LOOP - 5))
-
-
-def lacking(problem: Problem, kinds: tuple[str, ...]) -> Problem:
-    for kind in kinds:
-        problem = eqx.tree_at(lambda p, kind=kind: getattr(p, kind).weight, problem, replace_fn=jnp.zeros_like)
-    return problem

@@ -7,13 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arrow_systems import dense_matrix, zero_step
-from jax.flatten_util import ravel_pytree
+from arrow_systems import check_exact_hessian
 from own_terms import with_own_terms
-from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 import vggtgeo as vg
-from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 
 SOLVER = vg.SchurLevenbergMarquardt(rtol=1e-12, max_iterations=40)
 
@@ -52,25 +49,7 @@ def test_second_derivatives_are_derived(own) -> None:
     # differentiation of the energy after a retraction.
     problem, state, _ = own
     problem = problem.without_term("points").without_term("lines")  # tests/bundle/test_linearise.py has theirs
-    zero = zero_step(BundleAdjustment(problem), state)
-    flat, unflat = ravel_pytree(zero)
-
-    @jax.jit
-    def both(problem, state):
-        ba = BundleAdjustment(problem)
-        total = lambda step: vg.energy(problem, ba.retract(state, unflat(step)))
-        system = ba.hessian(state)
-        gradients = ravel_pytree(ba.gradient(state))[0], dense_schur_complement(system).gradient
-        return dense_matrix(system, zero), gradients, jax.hessian(total)(flat), jax.grad(total)(flat)
-
-    matrix, (gradient, dense), hessian, expected = both(problem, state)
-    unit = 1 / np.sqrt(np.abs(np.diag(hessian)) + 1.0)
-    error = float(np.abs((matrix - hessian) * np.outer(unit, unit)).max())
-    assert error < 1e-9, error
-    size = float(np.abs(expected * unit).max())
-    for found in (gradient, np.concatenate([dense, gradient[len(dense) :]])):
-        error = float(np.abs((found - expected) * unit).max())
-        assert error < 1e-10 * size, error
+    check_exact_hessian(problem, state, vg.energy)
 
 
 @pytest.mark.long

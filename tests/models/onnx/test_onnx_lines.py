@@ -15,7 +15,6 @@ from vggtgeo.models.onnx.line_detectors import (
     cut_off,
     decode_maps,
     directed,
-    tidy,
 )
 from vggtgeo.models.onnx.session import open_session
 from vggtgeo.models.roles import LineDetector, LineMatcher, Segments
@@ -97,16 +96,6 @@ def test_directions_are_those_of_lsd(seed: int) -> None:
     shuffled = np.where(swap[:, None, None], segments[:, ::-1], segments)
     assert len(segments) > 20
     np.testing.assert_array_equal(directed(gray, shuffled), segments)
-
-
-def test_segments_are_clipped_filtered_and_ordered() -> None:
-    # Proves `tidy`: cut off at the border, the short one and the one outside dropped, the best first. Oracle: four
-    # segments whose fate is plain.
-    ends = np.array([[[-5.0, 10], [100, 10]], [[0, 0], [5, 0]], [[0, 50], [319, 50]], [[400, 20], [400, 90]]])
-    found = tidy(_blocks(0), ends, np.array([0.7, 1.0, 0.8, 0.9]), 20.0, 10)
-    expected = np.array([[[0.0, 50], [319, 50]], [[0, 10], [100, 10]]])
-    np.testing.assert_allclose(np.sort(found.endpoints, axis=1), np.sort(expected, axis=1))
-    np.testing.assert_array_equal(found.scores, [0.8, 0.7])
 
 
 def test_a_segment_is_cut_off_along_itself() -> None:

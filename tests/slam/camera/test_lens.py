@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from changed import changed
-from distorted_sequence import Bent, bent
+from distorted_sequence import WINDOW, Bent, adjusted, bent
 from recorded_run import ROLES, SETTINGS, recorded_run
 from reported import raises
 from vggtgeo.models.classical import NoDepth, SiftMatcher
@@ -33,9 +33,6 @@ from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.judge import aligned
 from vggtgeo.slam.window_steps import merge_pending_window
 
-WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
-_solve = eqx.filter_jit(vg.solve)
-
 
 def packed(window: vg.data.SimulatedWindow, camera: vg.cameras.Intrinsics | None = None) -> tuple[Any, Any, Any]:
     """The problem of the window with one focal length, by default the true one."""
@@ -52,8 +49,7 @@ def found_in(window: vg.data.SimulatedWindow, focal: float) -> FoundLens:
         window, vg.cameras.Intrinsics(guess, shared_focal=True, prior_sigma=np.full(3, 0.3 * guess[0]))
     )
     size = (round(2 * cy + 1), round(2 * cx + 1))
-    solve = lambda problem, state: _solve(problem, state).state
-    found = find_lens(problem, solve(problem, state), size, solve)
+    found = find_lens(problem, adjusted(problem, state), size, adjusted)
     assert found is not None
     return found
 
@@ -91,7 +87,7 @@ def test_the_lens_is_that_of_an_adjustment_with_its_camera() -> None:
         fixed=np.arange(7) > 4,
     )
     problem, start, _ = vg.pack(window.observations, window.start, intrinsics, 1.0 / window.observations.depth_mean)
-    expected = np.asarray(_solve(problem, start).state.intrinsics)
+    expected = np.asarray(adjusted(problem, start).intrinsics)
     camera = found_in(window, 1.1).camera
     radius = np.linspace(0, np.hypot(cx, cy) / expected[0], 50)
     drawn = lambda f, k1, k2: f * radius * (1 + k1 * radius**2 + k2 * radius**4)

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 from changed import changed
-from distorted_sequence import bent
+from distorted_sequence import WINDOW, adjusted, bent
 from recorded_run import SETTINGS, recorded_run
 
 import vggtgeo as vg
@@ -18,13 +18,6 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.pixel_aspect import FoundAspect, find_aspect
 from vggtgeo.slam.global_map import global_adjustment
 from vggtgeo.slam.global_map.global_adjustment import adjust_all, shares_focal
-
-WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
-_solve = eqx.filter_jit(vg.solve)
-
-
-def solve(problem: Problem, state: State) -> State:
-    return _solve(problem, state).state
 
 
 def rolling(seed: int) -> vg.data.SimulatedWindow:
@@ -54,11 +47,11 @@ def as_square(window: vg.data.SimulatedWindow, squeeze: float) -> tuple[Problem,
         vg.cameras.Intrinsics(guess, shared_focal=True, prior_sigma=np.full(3, 0.3 * f)),
         depths,
     )
-    return packed[0], solve(*packed[:2])
+    return packed[0], adjusted(*packed[:2])
 
 
 def found_in(window: vg.data.SimulatedWindow, squeeze: float) -> FoundAspect:
-    found = find_aspect(*as_square(window, squeeze), solve)
+    found = find_aspect(*as_square(window, squeeze), adjusted)
     assert found is not None
     return found
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from distorted_sequence import bent
+from distorted_sequence import WINDOW, adjusted, bent
 
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
@@ -18,8 +18,6 @@ from vggtgeo.slam.camera.pixel_aspect import aspect_prior
 
 HELD = 1e-6
 """Relative standard deviation of a camera that is held, as in the pipeline."""
-WINDOW = {"keyframes": 12, "points": 100, "lines": 0, "noise": 0.5, "depth_error": 0.005, "start_error": 0.01}
-_solve = eqx.filter_jit(vg.solve)
 
 
 def pairs(window: vg.data.SimulatedWindow) -> list[CameraPair]:
@@ -40,8 +38,7 @@ def trial(window: vg.data.SimulatedWindow, given: np.ndarray) -> RefinedCamera:
     held = vg.cameras.Intrinsics(window.intrinsics, prior_mean=given, prior_sigma=np.full(4, HELD * given[0]))
     problem, initial, _ = window.pack(intrinsics=held)
     start = eqx.tree_at(lambda state: state.intrinsics, initial, jnp.asarray(given))
-    solve = lambda problem, state: _solve(problem, state).state
-    found = refine_given_camera(pairs(window), problem, solve(problem, start), solve)
+    found = refine_given_camera(pairs(window), problem, adjusted(problem, start), adjusted)
     assert found is not None
     return found
 
@@ -84,8 +81,7 @@ def with_the_map(window: vg.data.SimulatedWindow, factor: float) -> RefinedCamer
     seen = replace(window.observations, depth_weight=np.full(len(window.observations.host), 1e-6))
     terms = (aspect_prior(given),)
     problem, initial, _ = vg.pack(seen, window.start, cameras, 1.0 / window.observations.depth_mean, terms=terms)
-    solve = lambda problem, state: _solve(problem, state).state
-    return estimate_with_map(problem, solve(problem, initial), solve)[1]
+    return estimate_with_map(problem, adjusted(problem, initial), adjusted)[1]
 
 
 @pytest.mark.parametrize("factor", [1.02, 0.97])

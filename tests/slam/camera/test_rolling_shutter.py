@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from changed import changed
+from distorted_sequence import adjusted
 from recorded_run import recorded_run
 
 import vggtgeo as vg
-from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residuals import residuals_at
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.degradations import camera_velocities, rolled
@@ -33,12 +32,6 @@ WIDTH, HEIGHT = SIZE
 KEYFRAMES = 8
 WINDOW = vg.simulate_window(KEYFRAMES, points=60, lines=4, noise=0.3, depth_error=0.01, start_error=0.01)
 LONGEST = 1 / 30
-_solve = eqx.filter_jit(vg.solve)
-
-
-def adjusted(problem: Problem, state: State) -> State:
-    """The map adjusted to its matches."""
-    return _solve(problem, state).state
 
 
 def some_motions(seed: int = 0) -> np.ndarray:

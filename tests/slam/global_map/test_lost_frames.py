@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recorded_run import ROLES, SETTINGS, room, run_over
+from recorded_run import ROLES, SETTINGS, run_over
 from vggtgeo.models.classical import NoDepth
 
 from vggtgeo.datasets.frame import Frame
@@ -26,14 +26,9 @@ KNOWN = 12
 
 
 @pytest.fixture(scope="module")
-def walk() -> tuple[list[Frame], Camera, Trajectory]:
-    return room()
-
-
-@pytest.fixture(scope="module")
-def lost(walk: tuple[list[Frame], Camera, Trajectory]) -> Slam:
+def lost(room: tuple[list[Frame], Camera, Trajectory]) -> Slam:
     """A map of the first frames whose scale is free, and all later frames without a pose."""
-    frames, camera, _ = walk
+    frames, camera, _ = room
     slam = run_over(frames[:KNOWN], camera)
     last = slam.frames[-1]
     later = [replace(last, frame=frame.index, timestamp=frame.timestamp, tracked=False) for frame in frames[KNOWN:]]
@@ -46,7 +41,7 @@ def _lost(frame: Frame) -> UnplacedFrame:
 
 
 def test_lost_frames_are_placed_by_keyframes_made_of_them(
-    lost: Slam, walk: tuple[list[Frame], Camera, Trajectory]
+    lost: Slam, room: tuple[list[Frame], Camera, Trajectory]
 ) -> None:
     """The camera leaves what the map shows; frames that see its border become keyframes, which place those beyond.
     Oracle: the renderer's poses.
@@ -55,7 +50,7 @@ def test_lost_frames_are_placed_by_keyframes_made_of_them(
     assert all(record.tracked for record in found.frames), [r.frame for r in found.frames if not r.tracked]
     assert len(found.keyframes) > len(lost.keyframes)
     assert not found.tracker.unplaced
-    error = evaluate_trajectory(frame_trajectory(found), walk[2]).se3.statistics.rmse
+    error = evaluate_trajectory(frame_trajectory(found), room[2]).se3.statistics.rmse
     assert error < 0.03, f"{100 * error:.1f} cm"
 
 
@@ -67,11 +62,11 @@ def test_keyframes_are_listed_by_time(lost: Slam) -> None:
     assert listed.timestamps.tolist() == sorted(keyframe.timestamp for keyframe in swapped)
 
 
-def test_frames_of_another_place_stay_lost(lost: Slam, walk: tuple[list[Frame], Camera, Trajectory]) -> None:
+def test_frames_of_another_place_stay_lost(lost: Slam, room: tuple[list[Frame], Camera, Trajectory]) -> None:
     """Frames that show nothing of the map (a room that is the other way round) get no pose, and the map stays as it
     is.
     """
-    mirrored = [replace(frame, image=frame.image[:, ::-1].copy()) for frame in walk[0][:3]]
+    mirrored = [replace(frame, image=frame.image[:, ::-1].copy()) for frame in room[0][:3]]
     elsewhere = tuple(
         replace(_lost(frame), frame=KNOWN + row, timestamp=(KNOWN + row) / 10) for row, frame in enumerate(mirrored)
     )

@@ -1,4 +1,4 @@
-"""`--preset`: networks behind every role of a whole run, from tiny files; and real exports where there are any."""
+"""`--preset`: networks behind every role of a whole run, from tiny files."""
 
 import importlib
 import json
@@ -20,7 +20,7 @@ from vggtgeo.models.window_locator import WindowLocator
 from vggtgeo.cli.main import make_app
 from vggtgeo.cli.models import FLAGS
 from vggtgeo.io.errors import InputWarning
-from vggtgeo.simulation.sequence import SyntheticSequence, simulate, write_tum_folder
+from vggtgeo.simulation.sequence import simulate, write_tum_folder
 from vggtgeo.slam.run import frame_trajectory, run
 from vggtgeo.slam.settings.groups import GlobalMapSettings
 from vggtgeo.slam.settings.presets import CHOICES, NEEDED, Perception, perception
@@ -50,12 +50,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def walk() -> SyntheticSequence:
-    """Eight simulated frames that move enough for three keyframes."""
-    return simulate("room", 8, 0, SIZE[::-1], rate=5.0)
-
-
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     """How often each file ran, by its name, once it was warm."""
@@ -72,12 +66,11 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 
 @pytest.mark.long
-def test_a_run_asks_every_network_and_from_a_cache_none(
-    files: Path, walk: SyntheticSequence, tmp_path: Path, counted: dict[str, int]
-) -> None:
+def test_a_run_asks_every_network_and_from_a_cache_none(files: Path, tmp_path: Path, counted: dict[str, int]) -> None:
     # Proves that a whole run goes through every network of the preset and no other, that its result is finite, and
     # that a second run with the same cache asks none and gives the same. Oracle: a count, and the first trajectory.
     settings = SlamSettings(refinement=GlobalMapSettings(global_adjustment=False))
+    walk = simulate("room", 8, 0, SIZE[::-1], rate=5.0)  # enough for three keyframes
     poses = []
     for expected in (set(NEEDED["paper"]), set()):
         found = perception("paper", Roles(), files, tmp_path / "cache")
@@ -154,28 +147,23 @@ def test_the_preset_builds_the_roles_it_documents(files: Path) -> None:
     assert paper.geometry.judge is classical.geometry
 
 
-def _whole_run(folder: Path, models: Path, size: tuple[int, int]) -> dict:
-    """The program on ten simulated frames with the paper's preset; its summary."""
-    walk, output = folder / "walk", folder / "run"
-    for _ in write_tum_folder(simulate("room", 10, 0, size, rate=10.0), walk):
+@pytest.mark.slow
+def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
+    # Proves that `vggtgeo run --preset paper` writes every output, and the warning into its summary and its page.
+    folder, output = tmp_path / "walk", tmp_path / "run"
+    for _ in write_tum_folder(simulate("room", 10, 0, SIZE[::-1], rate=10.0), folder):
         pass
-    arguments = ["run", walk, "-o", output, "--quiet", "--preset", "paper", "--models", models]
+    arguments = ["run", folder, "-o", output, "--quiet", "--preset", "paper", "--models", files]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         result = CliRunner().invoke(make_app(), [str(argument) for argument in arguments])
     assert result.exit_code == 0, result.output
     assert np.isfinite(np.loadtxt(output / "trajectory.txt")).all()
-    return json.loads((output / "summary.json").read_text())
-
-
-@pytest.mark.slow
-def test_the_program_runs_with_tiny_files(files: Path, tmp_path: Path) -> None:
-    # Proves that `vggtgeo run --preset paper` writes every output, and the warning into its summary and its page.
-    summary = _whole_run(tmp_path, files, SIZE[::-1])
+    summary = json.loads((output / "summary.json").read_text())
     assert summary["frames"] == 10
     assert all(network["calls"] > 0 for network in summary["networks"].values()), summary["networks"]
     assert "this result means nothing" in summary["meaningless"]
-    assert "this result means nothing" in (tmp_path / "run" / "report.html").read_text()
+    assert "this result means nothing" in (output / "report.html").read_text()
 
 
 def test_a_role_takes_networks_of_its_kind_alone(files: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from changed import changed
-from recorded_run import RecordedRun, recorded_run
+from recorded_run import RecordedRun
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
@@ -26,11 +26,6 @@ from vggtgeo.slam.tracking.tracker import FramePose, scaled_record
 
 AWAY = np.array([0.006, -0.005, 0.004, 0.002, -0.003, 0.001])
 """Metres and radians."""
-
-
-@pytest.fixture(scope="module")
-def run() -> RecordedRun:
-    return recorded_run()
 
 
 def between(slam: Slam) -> list[int]:

@@ -139,13 +139,8 @@ def _knowing(keyframe: Keyframe, frame: Keyframe, true: np.ndarray, intrinsics: 
     seen = search_near(keyframe.features, known, pixels, frame.features, search_tree(frame.features), radius=4.0)
     kept = seen.index_i[:: max(len(seen) // count, 1)][:count]
     assert len(kept) == count
-    return replace(keyframe, points=replace(keyframe.points, inverse_depth=_only(inverse, kept)))
-
-
-def _only(values: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    result = np.full_like(values, np.nan)
-    result[kept] = values[kept]
-    return result
+    inverse = np.where(np.isin(np.arange(len(inverse)), kept), inverse, np.nan)
+    return replace(keyframe, points=replace(keyframe.points, inverse_depth=inverse))
 
 
 def test_a_match_is_searched_where_it_must_be(view: View) -> None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from changed import changed
-from recorded_run import ROLES, SETTINGS, black, room, run_over
+from recorded_run import ROLES, SETTINGS, black, run_over
 from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
 from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery, Segments
 
@@ -36,11 +36,6 @@ from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingI
 SIZE = (320, 240)
 FREE_ROLES = replace(ROLES, depth=NoDepth())
 Room = tuple[list[Frame], Camera, Trajectory]
-
-
-@pytest.fixture(scope="module", name="room")
-def _room() -> Room:
-    return room()
 
 
 def _unlit(frame: Frame) -> Frame:

@@ -48,7 +48,6 @@ def _knots(name: str, ends: tuple[float, float]) -> np.ndarray:
     return at_knots if name == "focal length" else at_knots[1:] - at_knots[0]
 
 
-GROWTH = np.linspace(1.0, 1.15, COUNT)
 PLANTED = {
     "focal length": (walk(COUNT, seen=_scaled(np.full(COUNT, 0.9))), [np.log(0.9)]),  # type: ignore[arg-type]
     "zoom": (walk(COUNT, seen=_scaled(np.exp(np.linspace(0, 0.12, COUNT)))), _knots("focal length", (0, 0.12))),  # type: ignore[arg-type]

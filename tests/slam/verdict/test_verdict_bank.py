@@ -71,11 +71,3 @@ def _differs(first: Recording, second: Recording) -> bool:
     pairs = list(zip(first.frames, second.frames, strict=True))
     images = any(not np.array_equal(a.image, b.image) for a, b in pairs)
     return images or any(not np.array_equal(a.depth, b.depth, equal_nan=True) for a, b in pairs)
-
-
-def test_shares_have_wilson_intervals(bank: ModuleType) -> None:
-    # Proves the numbers of the table. Oracle: the closed form of Wilson (1927) for 98 of 100.
-    n, p, z = 100, 0.98, 1.959964
-    middle, half = p + z**2 / (2 * n), z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    low, high = ((middle + side * half) / (1 + z**2 / n) for side in (-1, 1))
-    assert bank.share([True] * 98 + [False] * 2) == f"98 of 100: 98.0 % ({100 * low:.1f} to {100 * high:.1f})"
