@@ -23,7 +23,7 @@ _HEAPS = {
     "MALLOC_TRIM_THRESHOLD_": (-1, 32_000_000),
 }
 """glibc's settings: environment variable, number in `malloc.h`, value. Number of heaps; bytes from which a block lies
-in none; free bytes that a heap keeps. Smaller limits save no memory, and system calls for images cost a tenth of a run."""
+in none; free bytes that a heap keeps. With smaller limits, system calls for images cost a tenth of a run."""
 
 
 class Interruption:
