@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tiny_bags import Topic, image, info, of_frame, transforms
 
 from vggtgeo.datasets import open_sequence, with_intrinsics, without_depth
-from vggtgeo.datasets.registration import DepthRegistration
+from vggtgeo.datasets.depth_registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import NoteWarning
 

@@ -14,7 +14,7 @@ from reported import raises, warns
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets import open_sequence
-from vggtgeo.datasets.registration import DepthRegistration
+from vggtgeo.datasets.depth_registration import DepthRegistration
 from vggtgeo.datasets.seven_scenes import _TO_COLOUR
 from vggtgeo.datasets.tanks import inside_crop
 from vggtgeo.geometry.camera import Camera

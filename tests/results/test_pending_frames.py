@@ -11,7 +11,7 @@ import pytest
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.results.tracking_loop import PendingFrames, read_only
-from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.tracking.tracking_state import FramePose
 
 
 def _frame(index: int, timestamp: float | None = None) -> Frame:

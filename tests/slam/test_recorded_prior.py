@@ -26,7 +26,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map, longer, scaled_factor, scaled_keyframe, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.recorded_motion import SIGNIFICANT, compare
-from vggtgeo.slam.tracking.tracker import FramePose, Tracker
+from vggtgeo.slam.tracking.tracking_state import FramePose, Tracker
 
 SIZE = (320, 240)
 DARK = range(16, 26)

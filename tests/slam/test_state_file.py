@@ -27,7 +27,7 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.tracker import SeenPoints, UnplacedFrame
+from vggtgeo.slam.tracking.tracking_state import SeenPoints, UnplacedFrame
 from vggtgeo.slam.window.sliding_window import WindowPrior
 from vggtgeo.slam.window_steps import merge_pending_window
 

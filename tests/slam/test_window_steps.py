@@ -13,7 +13,7 @@ from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.tracking.tracking_state import FramePose
 from vggtgeo.slam.window.sliding_window import Window
 from vggtgeo.slam.window_steps import LAG, begin_window, is_due, merge_pending_window
 

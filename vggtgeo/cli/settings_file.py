@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import whole_text
 
 if TYPE_CHECKING:
     from vggtgeo.slam.settings.slam_settings import SlamSettings
@@ -58,6 +57,8 @@ def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
     """Use the file's values as defaults of the command's other parameters."""
     if path is None or context.resilient_parsing:
         return SettingsInUse(context)
+    from vggtgeo.io.files import whole_text  # loads numpy
+
     try:
         given = tomllib.loads(whole_text(path, errors="strict"))
     except InputError as error:

@@ -36,11 +36,11 @@ from vggtgeo.datasets.bag_images import (
     note_choice,
     truth_topic,
 )
+from vggtgeo.datasets.depth_registration import DepthRegistration
 from vggtgeo.datasets.folder import ImageChecks
 from vggtgeo.datasets.frame import MAX_DELAY, Frame, NearestInTime, check_selection
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.datasets.pose_files import poses_of, trajectory_of
-from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning, install_hint, warn

@@ -25,12 +25,12 @@ from typing import Self
 import cv2
 import numpy as np
 
+from vggtgeo.datasets.depth_registration import DepthRegistration
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
 from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_of_other_size
 from vggtgeo.datasets.pose_files import have_rotations, numbers_of, parsing, read_matrix, trajectory_of
-from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError

@@ -17,10 +17,10 @@ from typing import Self
 
 import numpy as np
 
+from vggtgeo.datasets.depth_registration import DepthRegistration
 from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning
 from vggtgeo.datasets.pose_files import read_matrix, trajectory_of
-from vggtgeo.datasets.registration import DepthRegistration
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import NoteWarning, warn

@@ -44,8 +44,8 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
-from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import check_input, check_refusals, judge_or_report
+from vggtgeo.slam.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True)

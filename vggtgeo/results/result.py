@@ -46,8 +46,8 @@ from vggtgeo.slam.known_map import save_map
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
-from vggtgeo.slam.verdict.finding import Verdict
 from vggtgeo.slam.verdict.judge import judge
+from vggtgeo.slam.verdict.verdict import Verdict
 from vggtgeo.slam.window_steps import merge_pending_window
 
 DepthChoice = bool | Literal["every"]

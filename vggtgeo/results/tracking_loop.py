@@ -23,7 +23,7 @@ from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.tracking.tracking_state import FramePose
 from vggtgeo.slam.window.sliding_window import warm_up
 from vggtgeo.slam.window_steps import merge_pending_window
 

@@ -53,7 +53,7 @@ from vggtgeo.slam.tracking.track import (
     track_by_rays,
     unless_contradicted,
 )
-from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose
+from vggtgeo.slam.tracking.tracking_state import MAX_UNPLACED, FramePose
 from vggtgeo.slam.tracking.two_view_motion import usual_step
 from vggtgeo.slam.window_steps import adjust_window, begin_window, insert_keyframe, is_due, merge_pending_window
 

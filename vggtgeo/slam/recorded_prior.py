@@ -34,7 +34,7 @@ from vggtgeo.slam.tracking.recorded_motion import (
     weighted_median,
 )
 from vggtgeo.slam.tracking.track import Track
-from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.tracking.tracking_state import FramePose
 
 AROUND = 5
 """Motions before and after a keyframe that tell its unit: about as many as are adjusted together."""

@@ -17,7 +17,7 @@ from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH, longer
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import record_of
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track
-from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, UnplacedFrame, given_up
+from vggtgeo.slam.tracking.tracking_state import MAX_UNPLACED, FramePose, UnplacedFrame, given_up
 from vggtgeo.slam.window.sliding_window import scale_anchor
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 

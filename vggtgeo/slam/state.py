@@ -13,7 +13,7 @@ from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.factors import Factor
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map, submap_of
-from vggtgeo.slam.tracking.tracker import FramePose, Tracker, frame_pose
+from vggtgeo.slam.tracking.tracking_state import FramePose, Tracker, frame_pose
 from vggtgeo.slam.window.sliding_window import Window
 
 

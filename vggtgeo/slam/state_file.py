@@ -33,7 +33,7 @@ from vggtgeo.slam.sparse_map.keyframe import CompressedImage, Keyframe, Keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, SeenPoints, Tracker, UnplacedFrame
+from vggtgeo.slam.tracking.tracking_state import FramePose, SecondMotion, SeenPoints, Tracker, UnplacedFrame
 from vggtgeo.slam.window.adjustment import Adjustment
 from vggtgeo.slam.window.sliding_window import Window, WindowPrior
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square

@@ -27,7 +27,7 @@ from vggtgeo.slam.camera.lens import RADIAL, FoundLens, can_undistort, composed,
 from vggtgeo.slam.global_map.global_adjustment import _apply_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.tracker import SeenPoints
+from vggtgeo.slam.tracking.tracking_state import SeenPoints
 from vggtgeo.slam.verdict.claim import Claim
 from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
 from vggtgeo.slam.verdict.judge import aligned

@@ -14,7 +14,7 @@ from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.tracker import FramePose, Tracker
+from vggtgeo.slam.tracking.tracking_state import FramePose, Tracker
 
 KEYFRAMES = (0, 4, 8)
 

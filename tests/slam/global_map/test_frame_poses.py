@@ -22,7 +22,7 @@ from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.following import MAX_KEPT, Located
-from vggtgeo.slam.tracking.tracker import FramePose, SeenPoints, Tracker
+from vggtgeo.slam.tracking.tracking_state import FramePose, SeenPoints, Tracker
 
 POINTS = 60
 MOVED = np.array([0.05, -0.02, 0.03, 0.01, 0.02, -0.01])

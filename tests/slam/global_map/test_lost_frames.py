@@ -17,7 +17,7 @@ from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.relocalisation import place_waiting
-from vggtgeo.slam.tracking.tracker import MAX_UNPLACED, FramePose, UnplacedFrame
+from vggtgeo.slam.tracking.tracking_state import MAX_UNPLACED, FramePose, UnplacedFrame
 
 SIZE = (320, 240)
 FREE_ROLES = replace(ROLES, depth=NoDepth())

@@ -22,7 +22,7 @@ from vggtgeo.slam.tracking.frame_refinement import (
     squared_distance,
 )
 from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE
-from vggtgeo.slam.tracking.tracker import FramePose, scaled_record
+from vggtgeo.slam.tracking.tracking_state import FramePose, scaled_record
 
 AWAY = np.array([0.006, -0.005, 0.004, 0.002, -0.003, 0.001])
 """Metres and radians."""

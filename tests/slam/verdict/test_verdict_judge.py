@@ -19,9 +19,9 @@ from vggtgeo.slam.verdict.claim import WINDOW, Claim, linked, thinned, windows
 from vggtgeo.slam.verdict.corner_adjustment import Noise, solve, start_of
 from vggtgeo.slam.verdict.corner_findings import findings
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
-from vggtgeo.slam.verdict.finding import Finding, Verdict, conclude
 from vggtgeo.slam.verdict.judge import check_unit, judge, judge_or_report
 from vggtgeo.slam.verdict.thresholds import MAX_REASONS
+from vggtgeo.slam.verdict.verdict import Finding, Verdict, conclude
 
 
 def _turn(degrees: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import by_both
 from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE
-from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.tracking.tracking_state import FramePose
 
 GROSS = SHARED_ERRORS * AGREEMENT_GATE
 """Squared Mahalanobis distance between the tracked and the adjusted pose of a keyframe above which its tracking was an

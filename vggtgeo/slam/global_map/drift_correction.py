@@ -26,7 +26,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import tangent
-from vggtgeo.slam.tracking.tracker import scaled_record
+from vggtgeo.slam.tracking.tracking_state import scaled_record
 
 MAX_LOOP_ERROR = 20.0
 """Median reprojection error of a loop's matches above which a pose graph corrects the map before its adjustment,

@@ -33,7 +33,7 @@ from vggtgeo.slam.sparse_map.map import (
 from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.tracking.relocalisation import relocalise
 from vggtgeo.slam.tracking.track import FrameData, TrackingInput
-from vggtgeo.slam.tracking.tracker import scaled_record
+from vggtgeo.slam.tracking.tracking_state import scaled_record
 from vggtgeo.slam.window.sliding_window import WindowPrior
 
 TRIED = 2

@@ -20,7 +20,7 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.map_points import in_view
 from vggtgeo.slam.tracking.relocalisation import record_of, relocalise
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_to, track, track_by_map
-from vggtgeo.slam.tracking.tracker import FramePose, UnplacedFrame
+from vggtgeo.slam.tracking.tracking_state import FramePose, UnplacedFrame
 from vggtgeo.slam.window.sliding_window import Window
 from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 

@@ -16,7 +16,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import PatchFlow
 from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches, PoseGuess, PoseQuery
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.tracking.tracker import SeenPoints
+from vggtgeo.slam.tracking.tracking_state import SeenPoints
 
 MAX_POINTS = 300
 """Largest number of key points of a keyframe that are used, spread over its image: more cost time, share the keyframe's

@@ -27,7 +27,7 @@ from vggtgeo.slam.tracking.evidence import MIN_CORRELATION, MIN_OVERLAP, MIN_SUR
 from vggtgeo.slam.tracking.map_points import in_view
 from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE, with_systematic
 from vggtgeo.slam.tracking.relocalisation import view_of
-from vggtgeo.slam.tracking.tracker import FramePose, SecondMotion, Tracker, frame_pose
+from vggtgeo.slam.tracking.tracking_state import FramePose, SecondMotion, Tracker, frame_pose
 
 FINEST = (4, 0, 0)
 """Iterations by level, the finest first: a frame starts within millimetres of its optimum."""

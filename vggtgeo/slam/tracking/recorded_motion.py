@@ -30,7 +30,7 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map, longer, submap_of
 from vggtgeo.slam.tracking.evidence import Evidence, worst_sigma
 from vggtgeo.slam.tracking.track import Track
-from vggtgeo.slam.tracking.tracker import FramePose
+from vggtgeo.slam.tracking.tracking_state import FramePose
 
 SIGNIFICANT = float(np.log(1e4))
 """Logarithm of the ratio of likelihoods that decides: one false decision in 10,000 runs, as at the other gates."""

@@ -19,7 +19,7 @@ from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.tracking.evidence import STEP_GATE
 from vggtgeo.slam.tracking.odometry import Odometry
 from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_between, track
-from vggtgeo.slam.tracking.tracker import FramePose, Tracker, UnplacedFrame, frame_pose, given_up
+from vggtgeo.slam.tracking.tracking_state import FramePose, Tracker, UnplacedFrame, frame_pose, given_up
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""

@@ -38,7 +38,7 @@ from vggtgeo.slam.tracking.pose_fusion import (
     with_lines,
     with_systematic,
 )
-from vggtgeo.slam.tracking.tracker import SeenPoints
+from vggtgeo.slam.tracking.tracking_state import SeenPoints
 from vggtgeo.slam.tracking.two_view_motion import explains_more, may_explain_more, two_view_motion
 
 PIXEL_SIGMA = 2.0

@@ -20,7 +20,7 @@ from vggtgeo.slam.verdict.alternatives import explain
 from vggtgeo.slam.verdict.claim import Claim, extent, max_place_error, tracks_of_windows
 from vggtgeo.slam.verdict.corner_findings import findings
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks, FrameEvidence
-from vggtgeo.slam.verdict.finding import Finding, Level, Verdict, conclude
+from vggtgeo.slam.verdict.verdict import Finding, Level, Verdict, conclude
 
 
 def judge(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
