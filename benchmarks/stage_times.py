@@ -27,6 +27,7 @@ from vggtgeo.cli.run import DEMO_SIZE
 from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.io.process import share_heaps
 
 COUNTS = ("frames", "keyframes")
 WHOLE = ("whole", "processor", "memory, GB")
@@ -39,6 +40,7 @@ def main() -> None:
     """Print a table for each clip."""
     options = _options()
     if options.one:
+        share_heaps()  # as the program does
         print(json.dumps(_summary(options.clips[0], options.one, options.end)))
         return
     columns = {}
