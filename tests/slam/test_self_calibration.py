@@ -105,10 +105,8 @@ def test_frames_are_tracked_again_until_the_camera_settles(monkeypatch: pytest.M
 
 
 def test_few_of_the_calibration_frames_are_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first pass tracks every third of 150 frames, the next its keyframes; all if the third are not enough.
-
-    Oracle: the indices of the frames that each pass is given.
-    """
+    # Proves that the first pass tracks every third of 150 frames, the next its keyframes; and all where these are not
+    # enough. Oracle: the indices of the frames that each pass is given.
     frame = recorded_run().frames[0]
     read = lambda stride: (replace(frame, index=index) for index in range(0, 150, stride))
     keyframes, passes = {0, 30, 60, 147}, []

@@ -23,7 +23,8 @@ from vggtgeo.datasets.views import SequenceView
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.camera.lens import RADIAL, FoundLens, can_undistort, composed, find_lens, largest_shift
+from vggtgeo.slam.camera.lens import RADIAL, FoundLens, can_undistort, find_lens, largest_shift
+from vggtgeo.slam.global_map import global_adjustment
 from vggtgeo.slam.global_map.global_adjustment import _apply_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
 from vggtgeo.slam.state import Slam
@@ -199,22 +200,29 @@ def test_the_map_is_as_an_ideal_camera_sees_it() -> None:
     np.testing.assert_allclose(redrawn(last.pixels), kept.pixels, atol=1e-3)
 
 
-def test_two_lenses_in_a_row_are_one() -> None:
-    """Undistorting by a first guess of the lens and then by what it left is one lens. Oracle: both in a row."""
-    first = Camera((500.0, 500.0, 318.0, 242.0), 640, 480, (0.02, -0.05, 0.0, 0.0))
-    second = Camera((505.0, 505.0, 321.0, 239.0), 640, 480, (-0.03, 0.01, 0.0, 0.0))
-    ideal = np.random.default_rng(0).uniform((0, 0), (640, 480), (200, 2))
-    off = composed(first, second).distorted(ideal) - first.distorted(second.distorted(ideal))
-    assert np.abs(off).max() < 0.1, f"{np.abs(off).max():.3f} px"
-
-
 def test_a_second_lens_is_added_to_the_first() -> None:
     """A map of images that were undistorted keeps the first lens in that of the images as read. Oracle: both."""
     slam = changed(run_of_room(), "camera", lens=LENS, self_calibrated=True)
-    rest = replace(LENS, distortion=(0.02, 0.0, 0.0, 0.0))
+    rest = replace(LENS, intrinsics=(141.0, 141.0, 81.0, 57.0), distortion=(0.02, 0.01, 0.0, 0.0))
     lens = undistorted(slam, rest).camera.lens
-    pixels = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]])
-    np.testing.assert_allclose(lens.distorted(pixels), LENS.distorted(rest.distorted(pixels)), atol=0.1)
+    pixels = np.random.default_rng(0).uniform((0, 0), (160, 120), (200, 2))
+    off = np.abs(lens.distorted(pixels) - LENS.distorted(rest.distorted(pixels))).max()
+    assert off < 0.1, f"{off:.3f} px"
+
+
+@pytest.mark.parametrize(("before", "self_calibrated"), [(None, False), (LENS, True), (LENS, False)])
+def test_a_known_lens_stays(before: Camera | None, self_calibrated: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last adjustment searches a lens that is unknown, or a first guess of self-calibration. Oracle: the rule."""
+    slam = merge_pending_window(recorded_run().states[-1])
+    adjustment, state = slam.window.solved
+    sigma = np.full(4, 100.0)
+    slam = slam.with_map(metric=False).with_camera(lens=before, self_calibrated=self_calibrated, sigma=sigma)
+    rest = FoundLens(replace(LENS, distortion=(0.02, 0.0, 0.0, 0.0)), state, gain=1.0, needed=0.0, warp=5.0)
+    monkeypatch.setattr(global_adjustment, "find_lens", lambda *_: rest)
+    monkeypatch.setattr(global_adjustment, "undistorted", lambda slam, lens: slam.with_camera(lens=lens))
+    monkeypatch.setattr(global_adjustment, "_try_pixel_aspect", lambda done: done)
+    after = global_adjustment._try_camera(global_adjustment._Solved(slam, adjustment, state), [], SETTINGS)
+    assert after.camera.lens == (rest.camera if before is None or self_calibrated else before)
 
 
 def test_corners_of_the_verdict_go_through_the_lens() -> None:
