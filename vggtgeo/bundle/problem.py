@@ -8,6 +8,7 @@ cameras, `k` each.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Iterator
 from typing import Any
 
@@ -302,3 +303,19 @@ class Problem(eqx.Module):
         """First slot that belongs to a line segment."""
         slots = self.pixels.shape[1]
         return slots if self.fraction is None else slots - self.fraction.shape[1] * self.fraction.shape[2]
+
+
+class Readable(eqx.Module):
+    """A result, a pytree whose representation is one line; inside `jit`, or for a batch, its leaves."""
+
+    @abc.abstractmethod
+    def _line(self) -> str:
+        """Return the line; may raise an error of shape or type for traced values and batches."""
+
+    def __str__(self) -> str:
+        try:
+            return self._line()
+        except (TypeError, ValueError, IndexError):  # traced values and batches have no single number
+            return eqx.Module.__repr__(self)
+
+    __repr__ = __str__

@@ -22,8 +22,7 @@ from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.checks import check_observed, check_pair
 from vggtgeo.bundle.diagnosis import MAJORITY, Diagnosis, diagnose, diagnosis_like
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
-from vggtgeo.bundle.readable import Readable
+from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, Readable, State
 from vggtgeo.bundle.solver_choice import default_solver
 from vggtgeo.io.argument_checks import check_kind, check_whole, real_numbers
 from vggtgeo.io.errors import InputError

@@ -101,20 +101,19 @@ def demo(
     slam_settings = pipeline_settings(settings, assignments or (), {})
     # While the light of the scene is computed, what every window needs is compiled.
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
-        compiled = pool.submit(compile_window, slam_settings)
+        pool.submit(compile_window, slam_settings)
         sequence = simulate(scene, frames, seed, rate=10.0, size=DEMO_SIZE)
-        compiled.result()
-    if not (quiet or as_json):
-        typer.echo(f"simulated scene `{scene}`: all results below are from a simulation")
-    run_and_write(
-        sequence,
-        Roles(),
-        slam_settings,
-        output,
-        ResultOptions(rerun=rerun, resume=resume, quiet=quiet, as_json=as_json),
-        RunOptions(title=f"simulated {scene}", facts={"simulated": True}),
-        flags=settings.values() if settings else {},
-    )
+        if not (quiet or as_json):
+            typer.echo(f"simulated scene `{scene}`: all results below are from a simulation")
+        run_and_write(
+            sequence,
+            Roles(),
+            slam_settings,
+            output,
+            ResultOptions(rerun=rerun, resume=resume, quiet=quiet, as_json=as_json),
+            RunOptions(title=f"simulated {scene}", facts={"simulated": True}),
+            flags=settings.values() if settings else {},
+        )
 
 
 def warm_up(

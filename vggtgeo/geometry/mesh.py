@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 from vggtgeo.geometry.point_cloud import COLOUR, NORMAL, UNREADABLE, bytes_of_colours, columns_of, write_ply
 from vggtgeo.io.argument_checks import path_of, real_array
@@ -45,11 +45,9 @@ class Mesh:
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
         """Write binary little-endian PLY, atomically: float32 x y z nx ny nz, uint8 RGB, and the faces."""
-        faces = np.empty(len(self.faces), [("vertex_indices", "<i4", (3,))])
-        faces["vertex_indices"] = self.faces
         values = [*self.vertices.T, *self.normals.T, *self.colours.T]
         columns = dict(zip((*"xyz", *NORMAL, *COLOUR), values, strict=True))
-        write_ply(path, columns, PlyElement.describe(faces, "face"))
+        write_ply(path, columns, self.faces)
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> Mesh:

@@ -90,14 +90,23 @@ class PointCloud:
             ) from None
 
 
-def write_ply(path: str | os.PathLike[str], columns: Mapping[str, np.ndarray], *others: PlyElement) -> None:
-    """Write vertices with these properties, colours as bytes, and other elements: binary little-endian, atomically."""
+def write_ply(path: str | os.PathLike[str], columns: Mapping[str, np.ndarray], faces: np.ndarray | None = None) -> None:
+    """Write vertices with these properties, colours as bytes, and triangles int [m, 3]: binary, atomically."""
     kinds = [(name, "u1" if name in COLOUR else "<f4") for name in columns]
     vertices = np.empty(len(columns["x"]), dtype=kinds)
     for name, column in columns.items():
         vertices[name] = column
+    parts = {"vertex": vertices}
+    if faces is not None:
+        parts["face"] = np.empty(len(faces), [("vertex_indices", "<i4", (3,))])
+    header = PlyData([PlyElement.describe(rows, name) for name, rows in parts.items()], byte_order="<").header
     with atomic_open(path, "wb") as handle:
-        PlyData([PlyElement.describe(vertices, "vertex"), *others], byte_order="<").write(handle)
+        handle.write(f"{header}\n".encode("ascii"))
+        handle.write(vertices.tobytes())
+        if faces is not None:  # plyfile writes lists one by one: a second for 600,000 triangles
+            triangles = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", (3,))])
+            triangles["count"], triangles["corners"] = 3, faces
+            handle.write(triangles.tobytes())
 
 
 def columns_of(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:

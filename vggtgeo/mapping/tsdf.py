@@ -158,10 +158,15 @@ def _with_view(
     v = jnp.rint(y / z * intrinsics[1] + intrinsics[3]).astype(jnp.int32)
     height, width, _ = pixels.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & ahead
-    seen = pixels[jnp.clip(v, 0, height - 1), jnp.clip(u, 0, width - 1)]
+    # Pixels in one row, and a last one without weight for voxels outside the image.
+    every = jnp.concatenate([pixels.reshape(-1, 5), jnp.zeros((1, 5), pixels.dtype)])
+    place = jnp.where(inside, v * width + u, height * width)
+    # Without the barrier XLA computes all this again for each of the six sums, which takes twice as long.
+    place, z = jax.lax.optimization_barrier((place, z))
+    seen = every[place]
     distance = seen[..., :1] - z[..., None]
     # Beyond `FREE` in front of the surface a view must not count: whether a block includes it depends on the block.
-    weight = jnp.where(inside[..., None] & (distance >= -reach) & (distance <= FREE * reach), seen[..., 1:2], 0.0)
+    weight = jnp.where((distance >= -reach) & (distance <= FREE * reach), seen[..., 1:2], 0.0)
     values = jnp.concatenate([jnp.minimum(distance / reach, 1.0), seen[..., 2:]], axis=-1)
     added = jnp.concatenate([weight * values, weight, (weight > 0).astype(jnp.float32)], axis=-1)
     return sums.at[rows].add(added, mode="promise_in_bounds")

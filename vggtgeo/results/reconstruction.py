@@ -192,6 +192,7 @@ def reconstruct(
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
         with loop.checkpoint_writer(options.checkpoints, identity) as writer:
             slam, interrupted, rate = loop.track(writer)
+            hooks.compiled()
             hooks.each("on_adjust", slam)
             if not interrupted:
                 slam, interrupted = _finish(slam, perception.roles, settings, hooks, stop)

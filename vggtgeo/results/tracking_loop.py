@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 from vggtgeo.datasets import Frame
@@ -179,19 +180,35 @@ class RunCallbacks:
 
     members: tuple[Callback, ...]
     clock: Clock
+    compiling: list[Future[None]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for member in self.members:
             check_kind("callbacks", member, Callback, "instances of `vggtgeo.Callback`")
 
     def warm_up(self, settings: SlamSettings, roles: Roles, camera: Camera) -> None:
-        """Compile the window adjustment, the RGB-D alignment, and what the callbacks compute from windows."""
+        """Compile the RGB-D alignment; in a thread, window adjustments and what the callbacks compute from them.
+
+        The first frames are tracked meanwhile. A window that is adjusted before its program is ready waits for it.
+        """
         self.each("on_stage", "compiling")
-        compiled = warm_up(settings, roles.metric)
+
+        def compile_windows() -> None:
+            compiled = warm_up(settings, roles.metric)
+            for member in self.members:
+                member.on_warm_up(*compiled)
+
+        pool = ThreadPoolExecutor(1, thread_name_prefix="compile")
+        self.compiling.append(pool.submit(compile_windows))
+        pool.shutdown(wait=False)
         if roles.alignment is not None and roles.metric:
             compile_alignment(camera)
-        for member in self.members:
-            member.on_warm_up(*compiled)
+
+    def compiled(self) -> None:
+        """Wait for what `warm_up` compiles, and raise its error."""
+        with self.clock.measure("compile"):
+            while self.compiling:
+                self.compiling.pop().result()
 
     def so_far(self) -> dict[str, Any]:
         """Return the state of each callback that has one, by class name, for a checkpoint."""

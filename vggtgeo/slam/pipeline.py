@@ -32,14 +32,8 @@ from vggtgeo.slam.start import (
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
-from vggtgeo.slam.tracking.relocalisation import (
-    frame_data,
-    place_waiting,
-    record_of,
-    relocalise,
-    view_of,
-    wait,
-)
+from vggtgeo.slam.tracking.lost_tracking import begins_submap, place_waiting, wait
+from vggtgeo.slam.tracking.relocalisation import frame_data, record_of, relocalise, view_of
 from vggtgeo.slam.tracking.track import (
     FrameData,
     MotionPrior,
@@ -53,12 +47,10 @@ from vggtgeo.slam.tracking.track import (
     track_by_rays,
     unless_contradicted,
 )
-from vggtgeo.slam.tracking.tracking_state import MAX_UNPLACED, FramePose
+from vggtgeo.slam.tracking.tracking_state import FramePose
 from vggtgeo.slam.tracking.two_view_motion import usual_step
 from vggtgeo.slam.window_steps import adjust_window, begin_window, insert_keyframe, is_due, merge_pending_window
 
-LOST_PATIENCE = 10
-"""Number of lost frames with texture after which a new submap begins. Black frames do not count."""
 NEIGHBOURS = 3
 """Keyframes before and after an old one that make up the window when the camera comes back to it."""
 
@@ -369,19 +361,13 @@ def _handle_lost_frame(
             return _with_record(slam, record_of(frame, carried))
         return _insert_and_adjust(slam, data, carried, recorded, roles, settings, clock)
     if slam.tracker.lost == 0:
-        note = f"tracking was lost at frame {frame.index} ({frame.name})"
-        slam = replace(slam, tracker=replace(slam.tracker, velocity=np.eye(4)), notes=(*slam.notes, note))
-    waiting = wait(slam.tracker, frame, features, MAX_UNPLACED)
-    slam = replace(slam, tracker=replace(slam.tracker, lost=slam.tracker.lost + 1))
-    shown = sum(len(other.features) > settings.keyframes.min_inliers for other in waiting)
-    patient = settings.keyframes.localise_only or shown <= LOST_PATIENCE
-    if not patient and len(features) > settings.keyframes.min_inliers:
-        note = (
-            f"a new submap begins at frame {frame.index} ({frame.name}): "
-            "nothing connects it to the one before, its place is only a guess"
-        )
-        begun = _first(replace(slam, notes=(*slam.notes, note)), frame, features, roles, settings)
-        return _place_waiting(begun, roles) if _started(begun) else begun
-    reference, relative = (slam.frames[-1].reference, slam.frames[-1].relative) if slam.frames else (0, np.eye(4))
-    record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, evidence)
-    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record), waiting=waiting))
+        slam = slam.with_notes(f"tracking was lost at frame {frame.index} ({frame.name})")
+    lost = replace(slam, tracker=wait(slam.tracker, frame, features, evidence))
+    if not begins_submap(lost.tracker, features, settings.keyframes):
+        return lost
+    note = (
+        f"a new submap begins at frame {frame.index} ({frame.name}): "
+        "nothing connects it to the one before, its place is only a guess"
+    )
+    begun = _first(slam.with_notes(note), frame, features, roles, settings)
+    return _place_waiting(begun, roles) if _started(begun) else begun

@@ -16,7 +16,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.relocalisation import place_waiting
+from vggtgeo.slam.tracking.lost_tracking import place_waiting
 from vggtgeo.slam.tracking.tracking_state import MAX_UNPLACED, FramePose, UnplacedFrame
 
 SIZE = (320, 240)

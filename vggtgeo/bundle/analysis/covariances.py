@@ -23,8 +23,7 @@ from vggtgeo.bundle.checks import check_finite, check_pair, check_range
 from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_finite
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
-from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.readable import Readable
+from vggtgeo.bundle.problem import Problem, Readable, State
 from vggtgeo.bundle.residuals import count_rows
 from vggtgeo.bundle.terms.node import CameraTerm, NodeTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.analysis.weak_directions import direction_names
-from vggtgeo.bundle.readable import Readable
+from vggtgeo.bundle.problem import Readable
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.schur_complement import rank_tolerance
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,8 +17,8 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.tracking.evidence import STEP_GATE
 from vggtgeo.slam.tracking.odometry import Odometry
-from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_between, track
-from vggtgeo.slam.tracking.tracking_state import FramePose, Tracker, UnplacedFrame, frame_pose, given_up
+from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput, tie_between, track
+from vggtgeo.slam.tracking.tracking_state import FramePose, Tracker
 
 CANDIDATES = 5
 """Keyframes that are verified by geometry for one frame; each costs about as much as a tracked frame."""
@@ -93,33 +92,6 @@ def view_of(keyframe: Keyframe, tracker: Tracker, intrinsics: np.ndarray, roles:
         return tracker.reference[1]
     depth = keyframe.depth.astype(np.float32), keyframe.depth_sigma.astype(np.float32)
     return RgbdView.of(keyframe.image, depth, intrinsics)
-
-
-def wait(tracker: Tracker, frame: Frame, features: Features, most: int) -> tuple[UnplacedFrame, ...]:
-    """Return the waiting frames with this one; the oldest are dropped beyond `most`."""
-    return (*tracker.waiting, UnplacedFrame(frame.index, frame.timestamp, frame.image, features, frame.depth))[-most:]
-
-
-def place_waiting(known: Map, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> Tracker:
-    """Track the frames that waited while tracking was lost, from the newest back, each predicted from the next."""
-    placed: dict[int, FramePose] = {}
-    last = tracker.frames[-1]
-    pose, step = frame_pose(known, last), np.eye(4)
-    keyframe = known.keyframes[last.reference]
-    source = view_of(keyframe, tracker, intrinsics, roles)
-    for number, waiting in enumerate(reversed(tracker.waiting)):
-        frame = Frame(waiting.frame, waiting.timestamp, waiting.image, waiting.depth, "")
-        data = frame_data(frame, Description.of(waiting.features), intrinsics, roles, known.metric)
-        # Backwards in time the motion of the last step continues as well as forwards.
-        prior = MotionPrior(step @ pose, step, waited=min(number, 3))
-        found = track(TrackingInput(data, intrinsics, roles, prior), keyframe, source)
-        if not found.accepted:
-            continue
-        step, pose = found.pose @ rigid.invert(pose), found.pose
-        placed[waiting.frame] = record_of(frame, found)
-    frames = tuple(placed.get(record.frame, record) for record in tracker.frames)
-    left = () if known.metric else (waiting for waiting in tracker.waiting if waiting.frame not in placed)
-    return replace(tracker, frames=frames, waiting=(), unplaced=given_up(tracker, left))
 
 
 def frame_data(frame: Frame, description: Description, intrinsics: np.ndarray, roles: Roles, metric: bool) -> FrameData:
