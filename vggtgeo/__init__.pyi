@@ -25,7 +25,7 @@ from .bundle.problem import Problem as Problem
 from .bundle.problem import State as State
 from .bundle.problem_file import load_problem as load_problem
 from .bundle.problem_file import save_problem as save_problem
-from .bundle.residuals import residuals_at as residuals_at
+from .bundle.residual_values import residuals_at as residuals_at
 from .bundle.solution import Graduation as Graduation
 from .bundle.solution import Solution as Solution
 from .bundle.solution import solve as solve

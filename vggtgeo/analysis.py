@@ -3,5 +3,5 @@
 from vggtgeo.bundle.analysis.covariances import Covariances as Covariances
 from vggtgeo.bundle.analysis.observability_report import Observability as Observability
 from vggtgeo.bundle.objective import energy_terms as energy_terms
-from vggtgeo.bundle.residuals import ResidualSizes as ResidualSizes
-from vggtgeo.bundle.residuals import residual_sizes as residual_sizes
+from vggtgeo.bundle.residual_values import ResidualSizes as ResidualSizes
+from vggtgeo.bundle.residual_values import residual_sizes as residual_sizes

@@ -17,7 +17,7 @@ from vggtgeo.bundle.objective import energy, energy_terms
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import State
 from vggtgeo.bundle.terms.edge import View
-from vggtgeo.bundle.terms.image import PointTerm
+from vggtgeo.bundle.terms.points_and_lines import PointTerm
 from vggtgeo.geometry.camera_models import MIN_RELATIVE_DEPTH, Pinhole
 
 EnergyTerms = dict[str, float]

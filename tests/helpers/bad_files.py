@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -71,12 +70,6 @@ def file(name: str, content: str | bytes) -> Callable[[Path], Path]:
         return path
 
     return make
-
-
-def lengthened(path: Path) -> Path:
-    """The file with a hole behind what it holds, so that it is of 20 GB and takes no space."""
-    os.truncate(path, 20_000_000_000)
-    return path
 
 
 def walk(path: Path, seed: int) -> Path:

@@ -82,12 +82,6 @@ def two_walks(path: Path) -> Path:
     return path
 
 
-def long_walk(path: Path) -> Path:
-    """Make an estimate with 20 GB of zeros behind it, and its ground truth."""
-    bad.lengthened(two_walks(path) / "estimate.txt")
-    return path
-
-
 def empty_image(path: Path) -> Path:
     """Make images, one of them an empty file."""
     images(path)
@@ -99,14 +93,6 @@ def half_a_summary(path: Path) -> Path:
     """Make a run folder whose summary is not JSON."""
     bad.file("summary.json", "{")(path)
     return path
-
-
-def linked_to_itself(path: Path) -> Path:
-    """Make images, one of them a link to itself."""
-    images(path)
-    (path / "frames/1.png").unlink()
-    (path / "frames/1.png").symlink_to("1.png")
-    return path / "frames"
 
 
 def sheared_pose(path: Path) -> Path:
@@ -226,7 +212,6 @@ ROWS = (
     command("wrong", "unknown command", ("'solv'", "'solve'"), folder, "solv"),
     command("missing", "trajectory that does not exist", ("no.txt",), folder, "evaluate", "no.txt", "no.txt"),
     evaluates("wrong", "`--delta 0`", ("delta", "0.0"), two_walks, "--delta", "0"),
-    evaluates("truncated", "20 GB of zeros", ("estimate.txt", "20000000000"), long_walk),
     # Networks.
     command("missing", "network that does not exist", ("net.onnx",), lambda path: path / "net.onnx", *VERIFY),
     command("truncated", "empty network", ("net.onnx",), bad.file("net.onnx", ""), *VERIFY),
@@ -236,7 +221,6 @@ ROWS = (
     Row("truncated", "summary that is not JSON", ("1", "2"), half_a_summary, call=Result.load),
     # Images.
     reads("truncated", "empty image", ("1.png",), empty_image, warned=True),
-    reads("missing", "link to itself", ("frames", "1"), linked_to_itself, warned=True),
     reads("wrong", "metres as 16 bits", ("10.004000.png", "0.0004"), bad.every_depth(MILLIMETRES), warned=True),
     # Lists, poses and cameras.
     reads("missing", "list without a line", ("rgb.txt",), bad.rgbd("# nothing\n")),

@@ -14,7 +14,7 @@ from recorded_run import FRAMES, RecordedRun
 from scenes import make_scene
 from vggtgeo.solvers.kernels import Square
 
-from vggtgeo.bundle.residuals import residual_sizes
+from vggtgeo.bundle.residual_values import residual_sizes
 from vggtgeo.cli.progress import errors_line
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.figures import map_view

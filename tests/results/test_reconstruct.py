@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -144,6 +145,21 @@ def test_a_saved_result_is_read_again(folder: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "two/report.html").exists()
     with raises("`depth`"):
         again.save(tmp_path / "two", depth=True)
+
+
+def test_frames_are_tracked_while_windows_compile() -> None:
+    # Proves that the first frame does not wait for `on_warm_up`, whose error still ends the run.
+    seen = Event()
+
+    class Compiles(vg.Callback):
+        def on_warm_up(self) -> None:  # type: ignore[override]
+            raise RuntimeError("compiled too late" if seen.wait(30.0) else "compiled before the first frame")
+
+        def on_frame(self, slam: object, frame: vg.data.Frame) -> None:
+            seen.set()
+
+    with pytest.raises(RuntimeError, match="too late"):
+        vg.reconstruct(vg.simulate("room", 2, size=(160, 120)), settings=SETTINGS, callbacks=[Compiles()])
 
 
 def test_any_iterable_of_frames_will_do() -> None:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.residuals import residual_sizes
+from vggtgeo.bundle.residual_values import residual_sizes
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm
 from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.datasets.frame import Frame

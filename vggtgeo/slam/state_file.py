@@ -13,11 +13,11 @@ import jaxlie
 
 from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Edges, Problem, State
-from vggtgeo.bundle.terms.image import LineTerm, PointTerm
 from vggtgeo.bundle.terms.landmark import DepthPrior
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.measured_pose import BaselinePrior, RelativePose, RotationPrior, SurfaceAlignment
 from vggtgeo.bundle.terms.node import IntrinsicsPrior
+from vggtgeo.bundle.terms.points_and_lines import LineTerm, PointTerm
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError

@@ -12,7 +12,7 @@ from distorted_sequence import adjusted
 from recorded_run import recorded_run
 
 import vggtgeo as vg
-from vggtgeo.bundle.residuals import residuals_at
+from vggtgeo.bundle.residual_values import residuals_at
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.simulation.degradations import camera_velocities, rolled
 from vggtgeo.simulation.small_window import SIZE

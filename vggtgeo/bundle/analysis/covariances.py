@@ -24,7 +24,7 @@ from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import cameras_of, prepared, prepared_energy
 from vggtgeo.bundle.problem import Problem, Readable, State
-from vggtgeo.bundle.residuals import count_rows
+from vggtgeo.bundle.residual_values import count_rows
 from vggtgeo.bundle.terms.node import CameraTerm, NodeTerm, node_derivatives
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie

@@ -38,7 +38,7 @@ from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_
 from vggtgeo.bundle.linearise import linearise, num_offsets
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.residuals import term_residuals, used_slots
+from vggtgeo.bundle.residual_values import term_residuals, used_slots
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import (
     ArrowSystem,

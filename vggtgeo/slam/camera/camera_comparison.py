@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.residuals import residuals_at
+from vggtgeo.bundle.residual_values import residuals_at
 from vggtgeo.compilation.program_cache import CachedProgram
 
 CHANCE = 1e-3
