@@ -50,6 +50,7 @@ STATE_CLASSES: tuple[type, ...] = (
 )
 """All classes that a file may have; a state with any other (descriptors of a user's matcher) is not written."""
 VERSION = 20
+"""Of the content: a file of another one is refused."""
 
 
 def checked_state(path: Path, found: object) -> Slam:

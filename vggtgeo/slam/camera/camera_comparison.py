@@ -22,6 +22,7 @@ from vggtgeo.compilation.program_cache import CachedProgram
 CHANCE = 1e-3
 """Significance level of the test."""
 MIN_HOSTS = 3
+"""Minimum number of hosts of landmarks: the variance of fewer sums cannot be estimated."""
 
 
 class Shifts(NamedTuple):

@@ -49,10 +49,12 @@ HELD_OUT = 0.2
 MIN_SEEN = 2
 """Minimum number of matches that each key point keeps."""
 SEED = 0
+"""Of the observations that are held out: the same run gives the same result."""
 MAX_PAIRS = 1000
 """Maximum number of pairs, evenly spaced over all edges: bounds memory and time. Too few make the result depend on the
 seed (`benchmarks/seeds.py`)."""
 MIN_MATCHES = 15
+"""Minimum number of matches of a pair: three for each of the five parameters of its relative pose."""
 MIN_FLOW = 3.0
 """Minimum median flow of a pair's matches, pixels: without motion the intrinsics are not observable."""
 BLOCK = 3

@@ -50,6 +50,7 @@ MAX_STEP = 10.0
 PROMISE = 0.05
 """Decrease of the energy that a step must promise: a tenth of what a standard deviation of a coefficient costs."""
 MAX_STEPS = 8
+"""Iteration limit of Newton's method; first steps may be cut at the largest distortion."""
 DIRECTIONS = np.array([[1.0, 0.0], [-1.2, 1.0]])
 """Two distortions, as displacements of a corner by either coefficient, of which none looks like the other, or like a
 focal length: Zernike's radial polynomials `3 r^3 - 2 r` and `10 r^5 - 12 r^3 + 3 r`."""

@@ -26,20 +26,26 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.threads import map_in_threads
 
 MIN_PAIRS = 8
+"""Minimum number of pairs, twice that of the parameters."""
 PARAMETERS = 4
+"""Logarithm of the focal length, principal point, k1."""
 MIN_BLOCKS = PARAMETERS + 2
+"""Minimum number of blocks: the covariance between them needs degrees of freedom beyond the parameters."""
 ITERATIONS, SETTLED = 20, 0.002
 """Iteration limit, and the step, as a share of the longest one, that ends the iteration. Half the focal length is seven
 of the longest steps away."""
 POSE_ITERATIONS = 4
+"""Gauss-Newton iterations from poses that were right for other intrinsics."""
 BATCH = 200
 """Pairs per batch, of some hundred points each: 20 MB."""
 HUBER = 1.0
+"""Width of the kernel, pixels: the noise of a match."""
 MAX_RESIDUAL = 30.0
 """Pixels: larger residuals are outliers and have no weight."""
 PRIOR = np.array([0.5, 300.0, 300.0, 1.0])
 """Standard deviations: so weak that they only keep the problem solvable."""
 LONGEST_STEP = np.array([0.1, 30.0, 30.0, 0.1])
+"""Longest step of an iteration, in which the linearisation holds: 10 % of the focal length, 30 pixels, 0.1 of k1."""
 
 
 @dataclass(frozen=True, eq=False)

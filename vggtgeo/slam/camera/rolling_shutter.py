@@ -43,6 +43,7 @@ FASTEST = 1e6
 PROBE = 0.05
 """Step of the finite difference, in the same unit."""
 SOLVES = 6
+"""Largest number of adjustments, in which a secant method finds the readout time."""
 BATCH = 128
 """Edges per batch and thread: 15,000 at once would take gigabytes."""
 LONGEST = 2.0

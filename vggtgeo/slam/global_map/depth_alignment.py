@@ -28,6 +28,7 @@ CELL = 4
 MAX_DISTANCE = 0.10
 """Largest distance of points on one surface, metres."""
 MIN_COSINE = 0.8
+"""Smallest cosine between the normals of points on one surface."""
 MIN_POINTS = 150
 """Minimum number of the source's samples near a surface of the target."""
 

@@ -33,6 +33,7 @@ WIDTH, MAX_WIDTH = 1.0, 8.0
 """Width of the Geman-McClure kernel, pixels: final and initial, halved in each step. A redescending kernel, because
 matches may be off by as much as the gate of tracking, some pixels (`benchmarks/between_keyframes.py`)."""
 STEPS, CONVERGED = 15, 1e-5
+"""Iteration limit; step, metres and radians, that ends the iteration: far below the noise of a pose."""
 MIN_NOISE = 0.01
 """Smallest noise of a match, pixels: of their rounding."""
 MAX_DEPTH = 1e6

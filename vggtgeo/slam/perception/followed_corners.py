@@ -36,6 +36,7 @@ MORE = 1.2
 ROUND_TRIP = 0.5
 """Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
 PATCH = (15, 15)
+"""Pixels: smaller patches of these images are ambiguous, larger ones cross depth edges."""
 LEVELS, LEVELS_FROM_SHIFT = 4, 2
 """Of the image pyramid, beyond the images themselves: reach of 100 pixels, and of 25 around the translation."""
 REDUCTION = 4

@@ -34,7 +34,9 @@ MAX_DISTANCE = 0.15
 MIN_DEPTH = 0.1
 """Smallest depth that is projected, metres: where depth sensors begin."""
 MIN_COSINE = 0.7
+"""Smallest cosine between the normals of cells of one surface."""
 MIN_SAMPLES = 60
+"""Samples of a term that count as overlap: ten for each of the six unknowns."""
 CONVERGED = 1e-4
 """Convergence: step in metres and radians that ends the finest level; ten times that for coarser levels. A pose is
 known to a millimetre at best; a tenth of this takes twice the iterations (`benchmarks/alignment.py`)."""

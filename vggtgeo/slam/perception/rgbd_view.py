@@ -12,6 +12,7 @@ from vggtgeo.geometry import pinhole, rigid
 WIDTH = 300
 """Images are reduced by a whole factor to about this width for the brightness, pixels."""
 LEVELS = 3
+"""Of the image pyramid: the coarsest has 1/16 of the pixels."""
 BACKGROUND = 6.0
 """Standard deviation of the blur whose result is subtracted as local mean, pixels of each level: it changes with
 exposure and shading."""

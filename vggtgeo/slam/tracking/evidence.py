@@ -23,15 +23,16 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import POSE_GATE, inverse_information
 
 NAN = float("nan")
-MIN_INLIERS = 12
-STRONG_INLIERS = 30
+MIN_INLIERS, STRONG_INLIERS = 12, 30
+"""Number of points that are inliers."""
 MIN_SHARE, STRONG_SHARE = 0.4, 0.5
 """Share of the matches, of points or of lines, that are inliers."""
 MIN_LINES, STRONG_LINES = 8, 12
-MIN_CORRELATION, STRONG_CORRELATION = 0.4, 0.6
-CONTRADICTION = 0.1
-MIN_SURFACE = 0.85
-MIN_OVERLAP = 0.2
+"""Number of segments that are matched in agreement with the pose."""
+MIN_CORRELATION, STRONG_CORRELATION, CONTRADICTION = 0.4, 0.6, 0.1
+"""Correlation of the brightness at edges; below the last one it contradicts the pose, whatever else agrees."""
+MIN_SURFACE, MIN_OVERLAP = 0.85, 0.2
+"""Share of the surface that agrees, and overlap, beside a correlation."""
 BARE_SURFACE, BARE_OVERLAP, BARE_SIGMA = 0.95, 0.5, 0.03
 """Evidence of surfaces alone, for images without texture: share that agrees, overlap, and largest standard deviation in
 the worst direction, metres."""

@@ -29,6 +29,7 @@ MIN_FOLLOWED = 0.4
 MIN_INLIER_SHARE = 0.7
 """Minimum inlier share of the followed points; wrong poses have at most 0.5, see `evidence.py`."""
 MIN_INLIERS = 60
+"""Above it a frame does not become a keyframe for want of matches (`KeyframeSettings.min_inliers`)."""
 MAX_KEPT = 128
 """Largest number of matches that a frame keeps for the final resection, 1.5 kB: with a pixel of noise they place it to
 a tenth of one."""

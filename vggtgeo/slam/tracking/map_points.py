@@ -24,10 +24,13 @@ from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.following import MAX_POINTS
 
 MAX_KEYFRAMES = 4
+"""Further keyframes that are searched: each costs a search in the frame's key points."""
 MAX_TURN = np.deg2rad(45.0)
 """Largest angle between a keyframe and a frame: descriptors of key points change too much beyond."""
 MIN_POINTS = 8
+"""Minimum number of matches with a keyframe that count: few agree with a wrong pose by chance."""
 STEPS = 4
+"""Of Gauss-Newton, from a tracked pose."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,9 @@ from vggtgeo.slam.window.adjustment import MIN_INVERSE_DEPTH
 MAX_SIGMA = 0.05
 """Largest relative standard deviation of a depth that counts as known."""
 MIN_VIEWS = 2
+"""The second view confirms the depth of the first."""
 CHANCE = 0.99
+"""Quantile of the chi-square distribution up to which views agree on a depth."""
 
 
 def with_segment_depths(
