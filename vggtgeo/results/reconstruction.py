@@ -205,32 +205,26 @@ def reconstruct(
             **prior_summary(slam, perception.roles),
             **({} if overlay.found is None else {"static_overlay": round(overlay.found.share, 4)}),
         }
-        warned = (*options.warned, *(collected if before is None else before.merge_warnings(collected)))
-        began -= 0.0 if before is None else before.whole
-        recorders = windows, evidence, overlay
-        return _conclude(slam, source, perception, settings, options, summary_facts, warned, began, hooks, recorders)
+        return _conclude(slam, loop, options, summary_facts, (windows, evidence, overlay))
 
 
 def _conclude(
     slam: Slam,
-    source: Source,
-    perception: Perception,
-    settings: SlamSettings,
+    loop: TrackingLoop,
     options: RunOptions,
     facts: Mapping[str, Any],
-    warned: tuple[Warning | str, ...],
-    began: float,
-    hooks: RunCallbacks,
     recorders: tuple[WindowRecorder, EvidenceRecorder, StaticOverlaySearch],
 ) -> Result:
     """Build the dense map and, in a thread beside it, the verdict; then the summary."""
-    clock, (windows, evidence, overlay) = hooks.clock, recorders
-    report = compare_with_truth(slam, source.truth)
+    source, hooks, before, (windows, evidence, overlay) = loop.source, loop.hooks, loop.before, recorders
+    clock, report = hooks.clock, compare_with_truth(slam, source.truth)
+    earlier = 0.0 if before is None else before.whole
+    warned = (*options.warned, *(loop.collected if before is None else before.merge_warnings(loop.collected)))
 
     @in_double_precision
     def judge() -> Verdict:
         with clock.measure("verdict (own thread)"):
-            of_images = check_refusals(perception.refusals) + overlay.findings()
+            of_images = check_refusals(loop.perception.refusals) + overlay.findings()
             return judge_or_report(slam, evidence.frames, check_input(warned, len(slam.frames)) + of_images)
 
     hooks.each("on_stage", "dense map and verdict")
@@ -245,8 +239,11 @@ def _conclude(
         **summarise(
             slam,
             verdict,
-            settings=changed(settings),
-            seconds={**clock.seconds, "all": time.perf_counter() - began},
+            settings=changed(loop.settings),
+            seconds={
+                **clock.seconds,
+                "all": time.perf_counter() - loop.began + (0.0 if before is None else before.whole),
+            },
             report=report,
             truth_in_metres=source.truth_in_metres,
             recorded=facts.get("pose_prior", {}).get("used", False),

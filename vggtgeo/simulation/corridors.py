@@ -85,11 +85,11 @@ def _plain_wall(b: RoomBuilder, start: Vector, end: Vector, doors: bool = True) 
     if not doors:
         return
     for along in np.arange(1.6, length - 0.7, 3.2):
-        b.hang(start, end, float(along), 0.0, (1.02, 2.10), _GREY, 0.03, _GREY)
+        b.hang((start, end), float(along), 0.0, (1.02, 2.10), _GREY, 0.03, _GREY)
         leaf = Look("white", 1.0, tint=(0.55, 0.58, 0.60), detail=0.02)
-        b.hang(start, end, float(along), 0.01, (0.90, 2.03), leaf, 0.045, _GREY)
-        b.hang(start, end, float(along) + 0.36, 1.02, (0.14, 0.03), METAL, 0.09, METAL)
-        b.hang(start, end, float(along) + 0.72, 1.50, (0.16, 0.12), Look("sign:1", None), 0.015)
+        b.hang((start, end), float(along), 0.01, (0.90, 2.03), leaf, 0.045, _GREY)
+        b.hang((start, end), float(along) + 0.36, 1.02, (0.14, 0.03), METAL, 0.09, METAL)
+        b.hang((start, end), float(along) + 0.72, 1.50, (0.16, 0.12), Look("sign:1", None), 0.015)
 
 
 def _meeting_room(b: RoomBuilder, start: float) -> None:
@@ -104,7 +104,7 @@ def _meeting_room(b: RoomBuilder, start: float) -> None:
         b.box((x, 0.0, 0.0), (0.06, 0.06, _CEILING), DARK)
     b.box((start + 0.5 * _PANE, 0.0, 0.0), (_PANE, 0.06, 0.08), DARK)
     b.table((start + 1.5, -1.6), 0.0, (1.6, 0.9, 0.74))
-    b.hang((start + _PANE, -3.0), low, 1.5, 1.0, (1.5, 0.95), Look("whiteboard:2", None), 0.03)
+    b.hang(((start + _PANE, -3.0), low), 1.5, 1.0, (1.5, 0.95), Look("whiteboard:2", None), 0.03)
     b.light((start + 1.5, -1.6, _CEILING - 0.1), (0.6, 0.6), 2.2, 4.0)
 
 
@@ -113,15 +113,15 @@ def _landmarks(b: RoomBuilder) -> None:
     for x, y in ((6.1, 0.12), (18.6, _AISLE_WIDTH - 0.12), (31.5, 0.12)):
         b.cylinder((x, y, 0.35), 0.08, 0.48, Look("fabric", 0.4, tint=(0.75, 0.05, 0.04)))
     north = ((0.0, _AISLE_WIDTH), (_LONG - _AISLE_WIDTH, _AISLE_WIDTH))
-    b.hang(*north, 13.0, 1.15, (1.1, 0.8), Look("board:4", None))
-    b.hang(*north, 28.9, 1.20, (0.6, 0.85), Look("poster:8", None))
+    b.hang(north, 13.0, 1.15, (1.1, 0.8), Look("board:4", None))
+    b.hang(north, 28.9, 1.20, (0.6, 0.85), Look("poster:8", None))
     east = ((_LONG, _SHORT), (_LONG, 0.0))
-    b.hang(*east, 10.0, 1.20, (0.6, 0.85), Look("poster:9", None))
-    b.hang(*east, _SHORT - 1.0, 1.10, (0.9, 1.1), Look("painting:4", None))
-    b.hang((0.0, 0.0), (0.0, _AISLE_WIDTH), 1.1, 0.9, (1.3, 1.2), Look("window:5", None, emission=0.9), 0.06, METAL)
+    b.hang(east, 10.0, 1.20, (0.6, 0.85), Look("poster:9", None))
+    b.hang(east, _SHORT - 1.0, 1.10, (0.9, 1.1), Look("painting:4", None))
+    b.hang(((0.0, 0.0), (0.0, _AISLE_WIDTH)), 1.1, 0.9, (1.3, 1.2), Look("window:5", None, emission=0.9), 0.06, METAL)
     top = ((_LONG - _AISLE_WIDTH, _SHORT), (_LONG, _SHORT))
-    b.hang(*top, 1.1, 0.0, (1.5, 2.15), Look("door:6", None), 0.05)
-    b.hang(*top, 1.1, 2.25, (0.45, 0.2), Look("sign:2", None, emission=0.6), 0.05)
+    b.hang(top, 1.1, 0.0, (1.5, 2.15), Look("door:6", None), 0.05)
+    b.hang(top, 1.1, 2.25, (0.45, 0.2), Look("sign:2", None, emission=0.6), 0.05)
     p = Place((_LONG - 0.35, 3.0), 0.0)
     b.cylinder(p(0, 0), 0.17, 0.55, METAL)
     exit_sign = Look("sign:3", None, tint=(0.5, 1.4, 0.7), emission=0.6)
@@ -221,14 +221,14 @@ def _walls(b: RoomBuilder, base: float, floor: int) -> None:
     for start, end in (west, north, east, south):
         b.wall(start, end, 1.2, paint, base, edges=True)
         b.wall(start, end, _STOREY - 1.2, Look("plaster", 2.3, detail=0.04), base + 1.2)
-    b.hang(*south, 0.9, base, (0.95, 2.05), Look("door:7", None), 0.05, DARK)
-    b.hang(*south, 1.8, base + 1.5, (0.35, 0.35), Look(f"sign:{floor + 10}", None), 0.02)
-    b.hang(*west, 0.6, base + 1.3, (0.5, 0.7), Look(f"poster:{70 + floor}", None))
+    b.hang(south, 0.9, base, (0.95, 2.05), Look("door:7", None), 0.05, DARK)
+    b.hang(south, 1.8, base + 1.5, (0.35, 0.35), Look(f"sign:{floor + 10}", None), 0.02)
+    b.hang(west, 0.6, base + 1.3, (0.5, 0.7), Look(f"poster:{70 + floor}", None))
     if floor < _FLOORS - 1:
         half = base + 0.5 * _STOREY
         view = Look(f"window:{floor}", None, emission=0.7)
-        b.hang(*north, 0.5 * _WIDTH, half + 0.95, (1.2, 1.1), view, 0.06, METAL)
-        b.hang(*east, 0.7, half + 1.2, (0.5, 0.7), Look(f"painting:{floor + 5}", None))
+        b.hang(north, 0.5 * _WIDTH, half + 0.95, (1.2, 1.1), view, 0.06, METAL)
+        b.hang(east, 0.7, half + 1.2, (0.5, 0.7), Look(f"painting:{floor + 5}", None))
 
 
 _STOREYS = 3
@@ -313,14 +313,16 @@ def _dress_corridor(b: RoomBuilder, start: Vector, end: Vector, base: float, num
             continue
         kind, variant = (number + place) % 4, 7 * number + place
         if kind == 0:
-            b.hang(start, end, float(along), base, (0.95, 2.05), Look(f"door:{variant % 12}", None), 0.05)
-            b.hang(start, end, float(along) + 0.68, base + 1.5, (0.2, 0.14), Look(f"sign:{variant % 20}", None), 0.015)
+            b.hang((start, end), float(along), base, (0.95, 2.05), Look(f"door:{variant % 12}", None), 0.05)
+            b.hang(
+                (start, end), float(along) + 0.68, base + 1.5, (0.2, 0.14), Look(f"sign:{variant % 20}", None), 0.015
+            )
         elif kind == 1:
-            b.hang(start, end, float(along), base + 1.2, (0.6, 0.85), Look(f"poster:{variant % 24}", None))
+            b.hang((start, end), float(along), base + 1.2, (0.6, 0.85), Look(f"poster:{variant % 24}", None))
         elif kind == 2:
-            b.hang(start, end, float(along), base + 1.15, (1.0, 0.75), Look(f"board:{variant % 8}", None))
+            b.hang((start, end), float(along), base + 1.15, (1.0, 0.75), Look(f"board:{variant % 8}", None))
         else:
-            b.hang(start, end, float(along), base + 1.25, (0.9, 0.7), Look(f"painting:{variant % 16}", None))
+            b.hang((start, end), float(along), base + 1.25, (0.9, 0.7), Look(f"painting:{variant % 16}", None))
 
 
 def _with_opening(b: RoomBuilder, start: Vector, end: Vector, height: float, look: Look, base: float) -> None:
@@ -344,14 +346,14 @@ def _stairs(b: RoomBuilder, floor: int) -> None:
     for side in (-0.5, 0.5):
         b.box((_DOOR + side * (_OPENING[0] + 0.08), -0.06, base), (0.08, 0.16, _OPENING[1]), METAL)
     b.box((_DOOR, -0.06, base + _OPENING[1]), (_OPENING[0] + 0.16, 0.16, 0.08), METAL)
-    b.hang(*west, 0.7, base + 1.3, (0.5, 0.7), Look(f"poster:{10 + floor}", None))
-    b.hang(*east, _LENGTH - 0.7, base + 1.3, (0.45, 0.45), Look(f"sign:{floor + 5}", None))
+    b.hang(west, 0.7, base + 1.3, (0.5, 0.7), Look(f"poster:{10 + floor}", None))
+    b.hang(east, _LENGTH - 0.7, base + 1.3, (0.45, 0.45), Look(f"sign:{floor + 5}", None))
     if floor:
         _landing(b, base)
     b.lamp_panel(0.5 * _WIDTH, 0.7, base + _STOREY - 0.19, (0.8, 0.3), 2.4, 5.0)
     if floor < _STOREYS - 1:
         _flights(b, base, half)
         view = Look(f"window:{floor}", None, emission=0.7)
-        b.hang(*north, 0.5 * _WIDTH, half + 0.95, (1.2, 1.1), view)
-        b.hang(*east, 0.7, half + 1.2, (0.5, 0.7), Look(f"painting:{floor + 5}", None))
+        b.hang(north, 0.5 * _WIDTH, half + 0.95, (1.2, 1.1), view)
+        b.hang(east, 0.7, half + 1.2, (0.5, 0.7), Look(f"painting:{floor + 5}", None))
         b.lamp_panel(0.5 * _WIDTH, _LENGTH - 0.7, half + _STOREY - 0.19, (0.8, 0.3), 2.4, 7.0)

@@ -61,13 +61,12 @@ class RoomBuilder(SceneBuilder):
     ) -> float:
         """Add a skirting board along a wall; return the length of the wall."""
         length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-        self.hang(start, end, 0.5 * length, base, (length, height), look, depth, look)
+        self.hang((start, end), 0.5 * length, base, (length, height), look, depth, look)
         return length
 
     def hang(
         self,
-        start: Vector,
-        end: Vector,
+        wall: tuple[Vector, Vector],
         along: float,
         base: float,
         size: tuple[float, float],
@@ -75,10 +74,10 @@ class RoomBuilder(SceneBuilder):
         depth: float = 0.025,
         frame: Look = DARK,
     ) -> None:
-        """Add a flat thing of `size` (width, height) on a wall, its middle `along` metres from `start`."""
-        way = np.subtract(end, start)
+        """Add a flat thing of `size` (width, height) on a wall, its middle `along` metres from its start."""
+        way = np.subtract(wall[1], wall[0])
         yaw = float(np.arctan2(way[1], way[0]))
-        place = Place(start, yaw)
+        place = Place(wall[0], yaw)
         centre = place(along, -0.5 * depth, base)
         self.box(centre, (size[0], depth, size[1]), frame, yaw, front=look, shadow=depth > 0.05)
 

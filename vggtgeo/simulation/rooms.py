@@ -89,10 +89,10 @@ def _dress_office(b: RoomBuilder, start: Vector, end: Vector, length: float, sid
         kind = str(b.rng.choice(list(_ON_THE_WALL), p=list(_ON_THE_WALL.values())))
         look = Look(f"{kind}:{number}", None, emission=0.7 if kind == "window" else 0.0)
         if kind == "door":
-            b.hang(start, end, along, 0.0, (0.95, 2.05), look, 0.05)
+            b.hang((start, end), along, 0.0, (0.95, 2.05), look, 0.05)
         else:
             width, height = b.rng.uniform([0.6, 0.6], [1.4, 1.1]) * (0.75 if kind == "poster" else 1.0)
-            b.hang(start, end, along, 1.05 + float(b.rng.uniform(0, 0.35)), (width, height), look, 0.03)
+            b.hang((start, end), along, 1.05 + float(b.rng.uniform(0, 0.35)), (width, height), look, 0.03)
         along += float(b.rng.uniform(1.5, 2.3))
         number += 1
 
@@ -156,16 +156,16 @@ def build_room(seed: int) -> Scene:
         b.skirting(start, end, 0.09, 0.02, Look("wood", 1.3))
     b.rectangle((1.6, 1.3, 0.008), (2.4, 0, 0), (0, 1.7, 0), Look("rug", 2.4, detail=0.2), edges=True)
 
-    b.hang(*west, 1.25, 1.25, (0.9, 1.15), Look("painting:1", None))
-    b.hang(*west, 2.75, 1.30, (0.7, 0.95), Look("poster:1", None))
-    b.hang(*west, 3.85, 1.45, (0.55, 0.75), Look("poster:2", None))
-    b.hang(*north, 1.5, 1.0, (1.6, 1.35), Look("window:1", None, emission=0.8), 0.06, Look("white", 1.0))
-    b.hang(*north, 3.3, 1.35, (1.0, 0.75), Look("painting:2", None))
-    b.hang(*east, 1.05, 1.25, (1.4, 0.95), Look("whiteboard:1", None), 0.03)
-    b.hang(*east, 3.9, 0.0, (0.95, 2.05), Look("door:1", None), 0.05, Look("wood", 1.0))
-    b.hang(*south, 1.3, 1.2, (1.2, 0.9), Look("board:1", None), 0.03)
-    b.hang(*south, 3.0, 1.35, (0.6, 0.85), Look("poster:3", None))
-    b.hang(*south, 5.1, 1.40, (0.8, 0.6), Look("painting:3", None))
+    b.hang(west, 1.25, 1.25, (0.9, 1.15), Look("painting:1", None))
+    b.hang(west, 2.75, 1.30, (0.7, 0.95), Look("poster:1", None))
+    b.hang(west, 3.85, 1.45, (0.55, 0.75), Look("poster:2", None))
+    b.hang(north, 1.5, 1.0, (1.6, 1.35), Look("window:1", None, emission=0.8), 0.06, Look("white", 1.0))
+    b.hang(north, 3.3, 1.35, (1.0, 0.75), Look("painting:2", None))
+    b.hang(east, 1.05, 1.25, (1.4, 0.95), Look("whiteboard:1", None), 0.03)
+    b.hang(east, 3.9, 0.0, (0.95, 2.05), Look("door:1", None), 0.05, Look("wood", 1.0))
+    b.hang(south, 1.3, 1.2, (1.2, 0.9), Look("board:1", None), 0.03)
+    b.hang(south, 3.0, 1.35, (0.6, 0.85), Look("poster:3", None))
+    b.hang(south, 5.1, 1.40, (0.8, 0.6), Look("painting:3", None))
 
     b.desk((4.6, 0.55), np.pi, 1)
     b.chair((4.55, 1.25), np.pi + 2.7)
@@ -241,20 +241,20 @@ def _dress_hall(b: RoomBuilder, start: Vector, end: Vector, length: float, side:
     number = 20 * side
     for along in np.arange(3.0, length - 1.5, 6.0):
         look = Look(f"window:{number % 4}", None, emission=0.9)
-        b.hang(start, end, float(along), 4.6, (2.6, 2.8), look, 0.06, METAL)
+        b.hang((start, end), float(along), 4.6, (2.6, 2.8), look, 0.06, METAL)
         banner = Look(f"poster:{40 + number % 6}", None)
         if side != 1:
-            b.hang(start, end, float(along) + 3.0, 3.6, (1.3, 3.2), banner, 0.03)
+            b.hang((start, end), float(along) + 3.0, 3.6, (1.3, 3.2), banner, 0.03)
         number += 1
     along = 1.8
     while along < length - 1.2:
         kind = b.rng.choice(["door", "poster", "painting", "board", "sign"])
         look = Look(f"{kind}:{int(b.rng.integers(0, 5))}", None)
         if kind == "door":
-            b.hang(start, end, along, 0.0, (1.0, 2.1), look, 0.06, WOOD)
+            b.hang((start, end), along, 0.0, (1.0, 2.1), look, 0.06, WOOD)
         else:
             size = (0.5, 0.35) if kind == "sign" else (1.2, 1.5)
-            b.hang(start, end, along, 1.1 if kind != "sign" else 1.7, size, look, 0.03)
+            b.hang((start, end), along, 1.1 if kind != "sign" else 1.7, size, look, 0.03)
         along += float(b.rng.uniform(2.0, 3.4))
 
 

@@ -268,7 +268,7 @@ def test_matches_of_two_images_without_the_readout_of_either() -> None:
         return seen
 
     before, after = read(still, inverse, motions[0]), read(there, inverse_there, motions[1])
-    found = pair_to_global_shutter(before, after, depth, relative, (motions[0], motions[1]), camera, size, readout)
+    found = pair_to_global_shutter((before, after), depth, relative, (motions[0], motions[1]), camera, size, readout)
     for image, true, moved in zip(found, (still, there), (before, after), strict=True):
         assert np.abs(moved - true).max() > 2.0
         assert np.abs(image - true).max() < 0.1

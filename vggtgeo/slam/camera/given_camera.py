@@ -165,7 +165,7 @@ def keyframe_pairs(
         if readout is not None:
             moving = moving_at[edge.host], moving_at[edge.target]
             before, after = pair_to_global_shutter(
-                before, after, depth, relative, moving, camera.intrinsics, host.size, readout
+                (before, after), depth, relative, moving, camera.intrinsics, host.size, readout
             )
         found.append(CameraPair(before, after, depth, relative, block))
     return found

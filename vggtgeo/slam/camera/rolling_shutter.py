@@ -136,8 +136,7 @@ def to_global_shutter(
 
 
 def pair_to_global_shutter(
-    before: np.ndarray,
-    after: np.ndarray,
+    matches: tuple[np.ndarray, np.ndarray],
     depth: np.ndarray,
     relative: np.ndarray,
     motions: tuple[np.ndarray, np.ndarray],
@@ -145,10 +144,10 @@ def pair_to_global_shutter(
     size: tuple[int, int],
     readout: Readout,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return matches [m, 2] of two images as by global shutters. depth: [m], in the first; relative: [4, 4], first
+    """Return matches, [m, 2] in either image, as by global shutters. depth: [m], in the first; relative: [4, 4], first
     camera -> second; motions: [6] of each, see `camera_motions`.
     """
-    inverse = 1.0 / depth
+    (before, after), inverse = matches, 1.0 / depth
     _, there = carried(before[None], inverse[None], relative[None], camera)
     return (
         to_global_shutter(before, inverse, motions[0], camera, size, readout),
