@@ -240,10 +240,7 @@ def _conclude(
             slam,
             verdict,
             settings=changed(loop.settings),
-            seconds={
-                **clock.seconds,
-                "all": time.perf_counter() - loop.began + (0.0 if before is None else before.whole),
-            },
+            seconds={**clock.seconds, "all": time.perf_counter() - loop.began + earlier},
             report=report,
             truth_in_metres=source.truth_in_metres,
             recorded=facts.get("pose_prior", {}).get("used", False),

@@ -16,6 +16,11 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.joining import join_submaps
 from vggtgeo.slam.keyframe_decision import becomes_keyframe, track_by_old_keyframe, view_change
 from vggtgeo.slam.manhattan import constrain_rotation
+from vggtgeo.slam.map_initialisation import (
+    begin_again_with_depth,
+    start_without_depth,
+    without_depth,
+)
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.recorded_prior import RecordedPrior, recorded_prior
@@ -24,11 +29,6 @@ from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.sparse_map.map import Map, submap_of
-from vggtgeo.slam.start import (
-    begin_again_with_depth,
-    start_without_depth,
-    without_depth,
-)
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
