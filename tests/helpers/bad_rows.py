@@ -137,11 +137,6 @@ def newer(file: Path) -> None:
     with_header(file, lambda header: header.update(version=99))
 
 
-def with_unknown_field(file: Path) -> None:
-    """Add a field that this version does not have."""
-    with_header(file, lambda header: header["classes"][1][1].append("weather"))
-
-
 def smaller(number: int) -> np.ndarray:
     """Return an image of a bag, the second one smaller than the others."""
     pixels = bags.image()[1](number)["data"].reshape(*bags.SIZE[::-1], 3)  # type: ignore[index, call-overload]
@@ -239,7 +234,6 @@ ROWS = (
     runs("missing", "map that does not exist", ("office.map",), images, *WITH_MAP),
     runs("truncated", "half a map", ("office.map",), with_map(cut), *WITH_MAP),
     runs("wrong", "map of a newer version", ("office.map", "99"), with_map(newer), *WITH_MAP),
-    runs("inconsistent", "map with an unknown field", ("office.map",), with_map(with_unknown_field), *WITH_MAP),
     # Clouds.
     Row("wrong", "text as a cloud", ("map.ply", "1"), bad.file("map.ply", "no cloud"), call=PointCloud.load_ply),
     Row("truncated", "10^15 points", ("map.ply", "vertex"), bad.ply(MANY_POINTS, bytes(999)), call=PointCloud.load_ply),

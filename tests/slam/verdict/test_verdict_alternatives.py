@@ -9,6 +9,7 @@ import pytest
 from corner_walk import SIZE, K, Walk, walk
 
 from vggtgeo.geometry import rigid
+from vggtgeo.slam.verdict import corner_findings
 from vggtgeo.slam.verdict.alternatives import TABLE, explain, second_motion
 from vggtgeo.slam.verdict.claim import extent
 from vggtgeo.slam.verdict.corner_adjustment import solve, start_of
@@ -213,3 +214,15 @@ def test_what_the_run_states_as_its_error_contradicts_nothing() -> None:
     assert confident.cause == "poses"
     assert confident.size > 1
     assert doubtful is None
+
+
+@pytest.mark.parametrize(("apart", "told"), [(0.3, True), (0.08, False)])
+def test_halves_that_disagree_determine_nothing(monkeypatch: pytest.MonkeyPatch, apart: float, told: bool) -> None:
+    """Poses that the corners reject are doubted, even if no difference from them is confirmed, where the halves' own
+    deviation is twice what matters. Oracle: the limit of 5 cm.
+    """
+    poses = walk(COUNT).claim.poses.copy()
+    poses[8:14, 0, 3] += 0.12
+    found = walk(COUNT).explanation(poses=poses)
+    monkeypatch.setattr(corner_findings, "confirmed", lambda best: (np.zeros(2), np.array([apart, 0.0])))
+    assert (contradiction(found, True) is not None) == told
