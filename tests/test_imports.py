@@ -37,7 +37,7 @@ SLAM_STAIR = (
     ("state",),
     ("callback", "keyframe_decision", "window_steps"),
     ("global_map",),
-    ("manhattan", "recorded_prior", "start"),
+    ("manhattan", "recorded_prior", "map_initialisation"),
     ("pipeline",),
     ("state_file",),
     ("known_map",),

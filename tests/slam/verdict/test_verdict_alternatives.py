@@ -218,11 +218,11 @@ def test_what_the_run_states_as_its_error_contradicts_nothing() -> None:
 
 @pytest.mark.parametrize(("apart", "told"), [(0.3, True), (0.08, False)])
 def test_halves_that_disagree_determine_nothing(monkeypatch: pytest.MonkeyPatch, apart: float, told: bool) -> None:
-    """Poses that the corners reject are doubted, even if no difference from them is confirmed, where the halves' own
-    deviation is twice what matters. Oracle: the limit of 5 cm.
+    """Poses that the corners reject are doubted where the halves' difference from them matters, and is significant or
+    has a deviation of twice what matters. Oracle: the limit of 5 cm.
     """
     poses = walk(COUNT).claim.poses.copy()
     poses[8:14, 0, 3] += 0.12
     found = walk(COUNT).explanation(poses=poses)
-    monkeypatch.setattr(corner_findings, "confirmed", lambda best: (np.zeros(2), np.array([apart, 0.0])))
+    monkeypatch.setattr(corner_findings, "confirmed", lambda best: (np.array([0.1, 0.0]), np.array([apart, 0.0])))
     assert (contradiction(found, True) is not None) == told

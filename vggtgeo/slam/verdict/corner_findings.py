@@ -97,9 +97,9 @@ def contradiction(one: Explanation, metric: bool, stated: float = 0.0) -> Contra
     if cause or np.any(off >= limits):  # else small even with its noise
         off, sigma = confirmed(one.best)
         doubt = np.hypot(sigma, [stated * extent(tracks.poses), 0.0])
-        size = float(np.max(off / limits, where=off > SIGMAS * doubt, initial=0.0))
-        # Halves of the tracks that disagree by more than what matters: nothing determines where the camera was.
-        size = max(size, float(np.max(sigma / limits, where=sigma > SIGMAS * limits, initial=0.0)))
+        # Where the halves disagree by more than what matters, nothing determines where the camera was.
+        counts = (off > SIGMAS * doubt) | (sigma > SIGMAS * limits)
+        size = float(np.max(off / limits, where=counts, initial=0.0))
         if size >= 1.0 and not preferred(one.best):
             size = 0.0
     if cause:
