@@ -74,7 +74,7 @@ def _build(seed: int, sections: int) -> Scene:
         b.lamp_panel(low[0] + 0.5 * SECTION, 0.5 * _WIDTH, _HEIGHT, (0.9, 0.3), power=2.6, reach=6.0)
     for start, end, which in (((0.0, 0.0), (0.0, _WIDTH), 1), ((length, _WIDTH), (length, 0.0), 2)):
         b.wall(start, end, _HEIGHT, _PLAIN)
-        b.hang(start, end, 0.5 * _WIDTH, 0.7, (1.4, 1.2), Look(f"painting:{which}", None))
+        b.hang((start, end), 0.5 * _WIDTH, 0.7, (1.4, 1.2), Look(f"painting:{which}", None))
     return finish(b, "repeated corridor", ambient=0.42, exposure=0.72, texel=0.16)
 
 
@@ -83,4 +83,4 @@ def _section(b: RoomBuilder, start: Vector, end: Vector, side: str) -> None:
     b.wall(start, end, _HEIGHT, Look("plaster", None, detail=0.0), edges=False)
     for number, along in enumerate(_POSTERS):
         variant = number + (10 if side == "b" else 0)
-        b.hang(start, end, along, 1.0 + 0.12 * number, (0.45, 0.62), Look(f"poster:{variant}", None, detail=0.0))
+        b.hang((start, end), along, 1.0 + 0.12 * number, (0.45, 0.62), Look(f"poster:{variant}", None, detail=0.0))
