@@ -32,10 +32,10 @@ class Callback:
     """
 
     def on_warm_up(self, problem: Problem, state: State) -> None:
-        """Called before the first frame, to compile for windows of the shape of `problem`."""
+        """Called in another thread while the first frames are tracked, to compile for windows shaped as `problem`."""
 
     def on_begin(self, name: str, total: int | None) -> None:
-        """Called after compilation, before the first frame. total: number of frames, None if unknown."""
+        """Called before the first frame. total: number of frames, None if unknown."""
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         """Called with the state after `frame` (as read, before undistortion)."""

@@ -26,7 +26,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.threads import map_in_threads
 
 MIN_PAIRS = 8
-"""Minimum number of pairs, twice that of the parameters."""
+"""Half of the minimum number of pairs: each half determines the parameters, with two pairs for each of them."""
 PARAMETERS = 4
 """Logarithm of the focal length, principal point, k1."""
 MIN_BLOCKS = PARAMETERS + 2
