@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.results.result import Result
 from vggtgeo.slam.verdict import judge as judge_module
-from vggtgeo.slam.verdict.claim import WINDOW, Claim, linked, thinned, windows
+from vggtgeo.slam.verdict.claim import WINDOW, Claim, linked, thinned, tracks_of_windows, windows
 from vggtgeo.slam.verdict.corner_adjustment import Noise, solve, start_of
 from vggtgeo.slam.verdict.corner_findings import findings
 from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
-from vggtgeo.slam.verdict.judge import check_unit, judge, judge_or_report
+from vggtgeo.slam.verdict.judge import check_unit, check_unseen, judge, judge_or_report
 from vggtgeo.slam.verdict.thresholds import MAX_REASONS
 from vggtgeo.slam.verdict.verdict import Finding, Verdict, conclude
 
@@ -44,8 +44,7 @@ def test_a_run_is_judged_as_a_whole() -> None:
     stirred = judge(wrong, recorder.frames)
     assert stirred.level != "good"
     assert judge(wrong, recorder.frames[:-1]).level != "good"
-    again = Verdict.from_dict(json.loads(json.dumps(stirred.to_dict())), stirred.metric)
-    assert again == stirred
+    assert Verdict.from_dict(json.loads(json.dumps(stirred.to_dict())), stirred.metric) == stirred
 
 
 def test_an_error_in_the_verdict_loses_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,8 +69,7 @@ def test_a_cause_is_one_reason() -> None:
     """Windows with the same fault make one finding that spans them; there are at most `MAX_REASONS`. Oracle: what was
     planted: two windows whose depth grows, with the poses that fit it, and one of displaced poses.
     """
-    here = walk(20)
-    growing = walk(20, measured=lambda row, z: z * np.exp(0.5 * row / 19))
+    here, growing = walk(20), walk(20, measured=lambda row, z: z * np.exp(0.5 * row / 19))
     tracks = growing.tracks()
     fitted = solve(tracks, start_of(tracks), Noise(0.3, 0.02)).unknowns.poses
     wrong = growing.explanation(poses=fitted)
@@ -96,11 +94,13 @@ def test_windows_cover_all_linked_frames_and_break_where_nothing_is_common() -> 
     assert [(rows[0], rows[-1]) for rows in stretches] == [(0, 29), (30, 59)]
     chosen = thinned(evidence, stretches[1])
     assert (chosen[0], chosen[-1]) == (30, 59)
-    assert np.all(np.diff(chosen) > 0)
     parts = windows(np.arange(100))
     assert (parts[0][0], parts[-1][-1]) == (0, 99)
     assert all(len(part) == WINDOW for part in parts)
     assert all(second[0] < first[-1] for first, second in pairwise(parts))
+    seen = tracks_of_windows(replace(walk(60).claim, tracked=tracked), evidence, (320, 240))
+    assert check_unseen(walk(60).claim, seen) == []
+    assert [(note.check, note.level) for note in check_unseen(walk(60).claim, seen[:1])] == [("unseen", "good")]
 
 
 def test_a_wrong_unit_of_depth_is_reported() -> None:

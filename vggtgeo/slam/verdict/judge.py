@@ -17,7 +17,7 @@ from vggtgeo.slam.perception.static_overlay import StaticOverlay
 from vggtgeo.slam.state import Slam, stretches
 from vggtgeo.slam.verdict import thresholds
 from vggtgeo.slam.verdict.alternatives import explain
-from vggtgeo.slam.verdict.claim import Claim, extent, max_place_error, tracks_of_windows
+from vggtgeo.slam.verdict.claim import Claim, Tracks, extent, max_place_error, tracks_of_windows
 from vggtgeo.slam.verdict.corner_findings import findings
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks, FrameEvidence
 from vggtgeo.slam.verdict.verdict import Finding, Level, Verdict, conclude
@@ -33,8 +33,9 @@ def judge(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding
     corners = aligned(slam, claim, evidence) if claim.started and len(claim) > 1 else None
     if corners is not None:
         height, width = slam.keyframes[0].size
-        explanations = [explain(tracks) for tracks in tracks_of_windows(claim, corners, (width, height))]
-        found += check_unit(claim, corners) + check_frozen(claim, corners) + findings(claim, explanations, known)
+        windows = tracks_of_windows(claim, corners, (width, height))
+        found += check_unit(claim, corners) + check_frozen(claim, corners) + check_unseen(claim, windows)
+        found += findings(claim, [explain(tracks) for tracks in windows], known)
     return conclude(found, claim.frames.tolist(), claim.times.tolist(), claim.metric)
 
 
@@ -62,13 +63,9 @@ def aligned(slam: Slam, claim: Claim, evidence: CornerTracks) -> CornerTracks | 
 
 def check_refusals(refusals: Mapping[str, Refusals]) -> tuple[Finding, ...]:
     """Check for roles whose network gave invalid answers, or none."""
-    found = []
-    for role, counts in refusals.items():
-        bounds = f", and {counts.refused} of {counts.values} values were out of bounds" if counts.values else ""
-        text = f"the network of {role} gave no valid answer {counts.without} of {counts.asked} times{bounds}: ignored"
-        if counts.share > thresholds.MAX_LOST:
-            found.append(Finding("network", "degraded", text))
-    return tuple(found)
+    text = "the network of {} gave no valid answer {} of {} times: ignored"
+    bad = ((role, counts) for role, counts in refusals.items() if counts.share > thresholds.MAX_LOST)
+    return tuple(Finding("network", "degraded", text.format(role, c.without, c.asked)) for role, c in bad)
 
 
 def check_input(warned: Iterable[Warning | str], frames: int) -> tuple[Finding, ...]:
@@ -84,13 +81,8 @@ def check_static_overlay(seen: StaticOverlay | None, left_out: bool) -> tuple[Fi
     """Check for a static part of the picture that was not masked, or may not belong to the camera."""
     if seen is None or (left_out and seen.sure):
         return ()
-    text = f"{100 * seen.share:.0f} % of the picture stays in its place while the rest moves; "
-    if left_out:
-        text += "it was masked as the camera's own: if it is the scene, the poses follow what moves"
-    elif seen.separable:
-        text += "it was not masked, because frames came once or the search was off: the poses may follow it"
-    else:
-        text += "it is not clear which of them is the scene, and nothing was masked: the poses may follow either"
+    done = "masked" if left_out else "not masked"
+    text = f"{100 * seen.share:.0f} % of the picture stays still while the rest moves ({done}): either may be the scene"
     return (Finding("still parts", "degraded", text),)
 
 
@@ -119,9 +111,8 @@ def check_record(claim: Claim) -> list[Finding]:
     found += _lost(claim)
     if claim.submaps > 1:
         text = (
-            f"the map is in {claim.submaps} submaps whose relative position and scale are unknown: tracking was "
-            "lost between them; trajectory.txt and map.ply hold the one with most frames, trajectory-2.txt the next. "
-            "Film again with overlap, or use each submap by itself"
+            f"the map is in {claim.submaps} submaps whose relative position and scale are unknown: trajectory.txt and "
+            "map.ply hold the one with most frames. Film again with overlap, or use each submap by itself"
         )
         found.append(Finding("submaps", "degraded", text))
     return found
@@ -140,8 +131,7 @@ def _lost(claim: Claim) -> list[Finding]:
     count = len(claim) - np.count_nonzero(claim.tracked)
     if count > thresholds.MAX_LOST * len(claim) or np.sqrt(squares / len(claim)) > thresholds.MAX_PLACE_ERROR:
         start, end, _ = claim.span(*max(parts, key=lambda rows: claim.frames[rows[1]] - claim.frames[rows[0]]))
-        times = "once" if len(found) == 1 else f"{len(found)} times, longest"
-        text = f"{count} of {len(claim)} frames were lost and have no pose, {times} from frame {start} to {end}"
+        text = f"{count} of {len(claim)} frames were lost and have no pose, longest from frame {start} to {end}"
         level: Level = "failed" if len(claim) - count < thresholds.MIN_TRACKED * len(claim) else "degraded"
         found.append(Finding("lost", level, text, start, end))
     return found
@@ -159,11 +149,20 @@ def check_extent(claim: Claim, share: float) -> list[Finding]:
     if claim.metric or share < thresholds.MAX_UNKNOWN:
         return []
     text = (
-        f"the camera positions are uncertain by {min(100 * share, 100):.0f} % of the extent of the path: the camera "
-        "turns more than it moves, and without depth the path is not determined. Film more sideways motion, or record "
-        "depth"
+        f"the camera positions are uncertain by {min(100 * share, 100):.0f} % of the extent of the path: without depth "
+        "it is not determined. Film more sideways motion, or record depth"
     )
     return [Finding("extent", "degraded", text)]
+
+
+def check_unseen(claim: Claim, windows: list[Tracks]) -> list[Finding]:
+    """Note the frames that no window of corners tests. It is no reason against a result: photos share few corners."""
+    unseen = claim.tracked.copy()
+    for tracks in windows:
+        unseen[tracks.rows[0] : tracks.rows[-1] + 1] = False
+    count = np.count_nonzero(unseen)
+    text = f"the poses of {count} of {len(claim)} frames could not be tested: too few corners link them to the next"
+    return [Finding("unseen", "good", text)] if count > thresholds.MAX_LOST * len(claim) else []
 
 
 def check_unit(claim: Claim, corners: CornerTracks) -> list[Finding]:
