@@ -195,7 +195,7 @@ def free_coordinates(problem: Problem) -> Bool[Array, " c"]:
 
 def scale_direction(problem: Problem, state: State) -> Float[Array, "c 1"]:
     """Return the unit motion of the poses under a change of scale about the first fixed camera, or camera 0."""
-    rotations, translations = state.poses.rotation().as_matrix(), state.poses.translation()
+    rotations, translations = lie.rotation_matrix(state.poses), state.poses.translation()
     # 0 if no pose is fixed, which is as good a centre as any.
     held = jnp.argmax(problem.fixed_pose)
     anchor = -rotations[held].T @ translations[held]

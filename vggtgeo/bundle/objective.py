@@ -178,7 +178,7 @@ def edge_views(problem: Problem, state: State) -> tuple[Edge, SeenAlong]:
     cameras, hosts, relative = cameras_of(problem, state), _hosts_of(problem, state), relative_poses(problem, state)
     graph, terms = problem.edges, problem.edge_terms
     data = tuple({**term.data(), "weight": term.weight} for term in terms)
-    motions = relative, relative.rotation().as_matrix(), relative.translation()
+    motions = relative, lie.rotation_matrix(relative), relative.translation()
 
     def seen_along(edge: Edge) -> list[tuple[EdgeTerm, EdgeView]]:
         view = _view_of(cameras, hosts, edge)

@@ -237,6 +237,7 @@ def _solve_jit(
         solver,
         initial,
         args=BundleAdjustment(problem, initial),
+        options={"check_function": False},  # it would be compiled once more, for nothing
         max_steps=solver.max_iterations,
         adjoint=adjoint,
         # Failure is a value, `termination`: an exception inside `jit` would lose the state.

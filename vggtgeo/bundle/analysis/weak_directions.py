@@ -84,7 +84,7 @@ def _anchor(problem: Problem, state: State) -> jaxlie.SE3:
 def _scale(problem: Problem, state: State) -> Float[Array, " camera"]:
     """Return the motion of all camera centres away from the anchor's centre, by 100 %."""
     anchor = _anchor(problem, state).inverse().translation().astype(state.inverse_depth.dtype)
-    outward = state.poses.translation() + state.poses.rotation().as_matrix() @ anchor
+    outward = state.poses.translation() + lie.rotation_matrix(state.poses) @ anchor
     return jnp.concatenate([outward, jnp.zeros_like(outward)], 1).reshape(-1)
 
 

@@ -65,7 +65,7 @@ class View(eqx.Module):
     @property
     def scaled_point(self) -> Float[Array, "3"]:
         """The landmark in target coordinates times its inverse depth."""
-        return self.relative.rotation().as_matrix() @ self.ray + self.inverse_depth * self.relative.translation()
+        return lie.rotation_matrix(self.relative) @ self.ray + self.inverse_depth * self.relative.translation()
 
     @property
     def point(self) -> Float[Array, "3"]:

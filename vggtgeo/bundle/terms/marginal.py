@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Self
 
-import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
@@ -73,12 +72,7 @@ class MarginalPrior(DenseTerm):
         if exact:
             return super().model(poses, parameters, correction, exact)
         size = len(parameters)
-
-        def difference(pose: Array, base: Array) -> Array:
-            moved = lambda x: lie.boxminus(lie.move(jaxlie.SE3(pose), x), jaxlie.SE3(base))
-            return jax.jacfwd(moved)(jnp.zeros(lie.TANGENT, pose.dtype))
-
-        blocks = jax.vmap(difference)(poses.wxyz_xyz, self.poses.wxyz_xyz)
+        blocks = lie.log_derivative(lie.boxminus(poses, self.poses))
         by_pose = self.root[:, :-size].reshape(len(self.root), -1, lie.TANGENT)
         by_pose = jnp.einsum("cnb,nbd->cnd", by_pose, blocks).reshape(len(self.root), -1)
         jacobian = jnp.concatenate([by_pose, self.root[:, -size:]], 1)
