@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from degenerate_scenes import (
@@ -23,8 +25,8 @@ from degenerate_scenes import (
 from scenes import Scene
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 
-from vggtgeo.bundle.bundle_adjustment import MIN_INVERSE_DEPTH
-from vggtgeo.bundle.problem import Problem, State
+from vggtgeo.bundle.objective import relative_poses
+from vggtgeo.bundle.problem import MAX_INVERSE_DEPTH, MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.solution import Solution, solve
 
 NO_PRIOR = {"prior_sigma": None}
@@ -107,3 +109,16 @@ def test_undetermined_coordinates_hardly_move(solved: Solve, dtype: type) -> Non
     back = lambda state: np.asarray(state.poses.inverse().translation())[:, 0]
     moved = np.abs(back(solution.state) - back(start)).max()
     assert moved < 0.1, f"slid {moved:.3g} m along the lines"
+
+
+def test_a_match_at_the_epipole_ends_at_the_bound(solved: Solve) -> None:
+    # Proves that a landmark whose best place is in its host is bounded and counted. Oracle: the solve without it.
+    problem, start = packed(without(WELL, "depth"), **ALL_HELD)
+    x, y, z = np.asarray(relative_poses(problem, start).translation())[4]
+    fx, fy, cx, cy = start.intrinsics.reshape(-1)
+    points, matches = problem.points, lambda p: (p.points.target, p.points.weight)
+    weight, epipole = points.weight.at[5, 0].set(0.0), jnp.stack([fx * x / z + cx, fy * y / z + cy])
+    found = solved(eqx.tree_at(matches, problem, (points.target.at[4, 0].set(epipole), weight)), start)
+    without_it = solved(eqx.tree_at(matches, problem, (points.target, weight.at[4, 0].set(0.0))), start)
+    assert (int(found.at_bound), float(found.state.inverse_depth.max())) == (1, MAX_INVERSE_DEPTH)
+    assert float(found.energy) == pytest.approx(float(without_it.energy), rel=1e-5)

@@ -67,19 +67,6 @@ def test_a_run_in_metres_of_another_size_is_of_another_sequence(tmp_path: Path) 
     assert "NOT COMPARABLE" in found.output
 
 
-def test_the_table_has_every_metric(tmp_path: Path) -> None:
-    # Proves that a person reads ATE after either alignment and RPE, in centimetres and degrees.
-    files = _files(tmp_path)
-    files = files[0], files[1].rename(tmp_path / "groundtruth.txt")
-    result = CliRunner().invoke(app, list(map(str, files)))
-    assert result.exit_code == 0, result.output
-    report = evaluate_trajectory(*_load(files))
-    for value in (report.se3.statistics.rmse, report.sim3.statistics.rmse):
-        assert f"{100 * value:.3f} cm" in result.output
-    assert f"{np.degrees(report.relative.rotation_statistics.rmse):.3f} deg" in result.output
-    assert "30 poses matched, of 30 estimated and 30 true" in " ".join(result.output.split())
-
-
 def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None:
     # Proves that errors are called cm where the truth is known to be in metres, and bare numbers of the truth's unit
     # where it is a run's of free scale, or a file that says nothing; and that an estimate of free scale has no errors

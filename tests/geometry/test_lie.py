@@ -67,6 +67,17 @@ def by_step(pose: jaxlie.SE3, at: jax.Array) -> tuple[jax.Array, jax.Array]:
     return first(at), jax.jacfwd(first)(at)
 
 
+@pytest.mark.parametrize("angle", ANGLES)
+def test_products_and_the_derivative_of_log(angle: float) -> None:
+    # Proves the closed forms. Oracle: jaxlie; automatic differentiation of `log(exp(x) T)`.
+    pose, other = (jaxlie.SE3.exp(jnp.asarray(tangent(size, seed))) for seed, size in enumerate((angle, 0.9)))
+    exact = lambda found, expected: np.testing.assert_allclose(found, expected, atol=1e-13)
+    exact(lie.relative(other, pose).wxyz_xyz, (pose @ other.inverse()).wxyz_xyz)
+    exact(lie.move(pose, other.log()).as_matrix(), (other @ pose).as_matrix())
+    exact(lie.adjoint(pose), pose.adjoint())  # its blocks are the rotation matrix
+    np.testing.assert_allclose(lie.log_derivative(lie.log(pose)), by_step(pose, jnp.zeros(6))[0], atol=1e-11)
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.02, 0.5])
 def test_derivatives_of_log_are_finite_differences(angle: float) -> None:
     # Proves what a prior is linearised with, `d log(exp(x) T)` and its second derivative. Oracle: central differences

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from vggtgeo.bundle.linearise import energy_gradient, linearise, num_offsets, offsets_of
 from vggtgeo.bundle.objective import prepared, prepared_energy
-from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
+from vggtgeo.bundle.problem import MAX_INVERSE_DEPTH, MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector
 from vggtgeo.solvers.landmark_basis import slopes
@@ -59,10 +59,10 @@ class BundleAdjustment(AbstractArrowProblem[State]):
 
     def _bounded(self, depth: Float[Array, "h s"], moved: Float[Array, "h s"]) -> Float[Array, "h s"]:
         if self.problem.fraction is None:
-            return _positive(moved)
+            return _within_bounds(moved)
         first = self.problem.first_segment
         lines = _shortened(depth[:, first:], moved[:, first:], self.problem.fraction.shape[1])
-        return jnp.concatenate([_positive(moved[:, :first]), lines], 1)
+        return jnp.concatenate([_within_bounds(moved[:, :first]), lines], 1)
 
     def restore_fixed(self, point: State) -> State:
         initial = point if self.start is None else self.start
@@ -107,18 +107,20 @@ class BundleAdjustment(AbstractArrowProblem[State]):
 
 
 def _shortened(depth: Float[Array, "h l"], moved: Float[Array, "h l"], segments: int) -> Float[Array, "h l"]:
-    """Shorten the step of each segment by one factor, so that all its samples stay positive and on a line."""
+    """Shorten the step of each segment by one factor, so that all its samples stay in bounds and on a line."""
     # A landmark already below the bound may stay where it is, but not go farther.
     lowest = jnp.maximum(MIN_SHRINK * depth, jnp.minimum(depth, MIN_INVERSE_DEPTH))
-    change, room = moved - depth, depth - lowest
-    too_far = -change > room
-    share = jnp.where(too_far, room / jnp.where(too_far, -change, 1.0), 1.0)
+    change = moved - depth
+    room, size = jnp.where(change < 0, depth - lowest, jnp.maximum(MAX_INVERSE_DEPTH - depth, 0.0)), jnp.abs(change)
+    too_far = size > room
+    share = jnp.where(too_far, room / jnp.where(too_far, size, 1.0), 1.0)
     # One factor for all samples of a segment keeps them on a line.
     share = jnp.min(share.reshape(len(depth), segments, -1), 2, keepdims=True)
     share = jnp.broadcast_to(share, (*share.shape[:2], depth.shape[1] // segments)).reshape(depth.shape)
     return jnp.where(share < 1, depth + share * change, moved)
 
 
-def _positive(moved: Float[Array, "h s"]) -> Float[Array, "h s"]:
-    # Not `maximum`, whose derivative is one half where a zero step meets the bound.
-    return jnp.where(moved < MIN_INVERSE_DEPTH, MIN_INVERSE_DEPTH, moved)
+def _within_bounds(moved: Float[Array, "h s"]) -> Float[Array, "h s"]:
+    # Not `clip`, whose derivative is one half where a zero step meets a bound.
+    bounded = jnp.where(moved < MIN_INVERSE_DEPTH, MIN_INVERSE_DEPTH, moved)
+    return jnp.where(bounded > MAX_INVERSE_DEPTH, MAX_INVERSE_DEPTH, bounded)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.objective import Edge, SeenAlong, cameras_of, edge_views, pixel_observations
-from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, State
+from vggtgeo.bundle.problem import MAX_INVERSE_DEPTH, MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
@@ -339,7 +339,8 @@ def _landmarks_at_bound(problem: Problem, state: State, gradient: Float[Array, "
         return None
     alone = jnp.arange(gradient.shape[1]) < problem.first_segment
     # Karush-Kuhn-Tucker: active only if the energy falls towards the bound, so that a landmark can leave it again.
-    held = (state.inverse_depth <= MIN_INVERSE_DEPTH) & (gradient > 0) & alone
+    far, near = state.inverse_depth <= MIN_INVERSE_DEPTH, state.inverse_depth >= MAX_INVERSE_DEPTH
+    held = ((far & (gradient > 0)) | (near & (gradient < 0))) & alone
     return jnp.pad(held, ((0, 0), (num_offsets(state), 0)))
 
 

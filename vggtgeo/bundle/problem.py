@@ -28,8 +28,9 @@ from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, SharedFocal
 from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.io.errors import InputError
 
-MIN_INVERSE_DEPTH = 1e-6
-"""Lower bound of positive inverse depths, 1/m (1000 km)."""
+MIN_INVERSE_DEPTH, MAX_INVERSE_DEPTH = 1e-6, 1e6
+"""Bounds of positive inverse depths, 1/m (1000 km, 1 micrometre). The optimum of a match at the epipole is in the
+host camera, beyond all numbers."""
 
 
 _ONE_OF_EACH = (PointTerm, LineTerm, DepthPrior, HostPixel, IntrinsicsPrior, MarginalPrior)
@@ -135,7 +136,7 @@ class Problem(eqx.Module):
             own inverse depth.
         camera_of: Camera of each keyframe, a row of the state's intrinsics; None: one camera for all.
         camera: Model of the cameras.
-        positive_depth: Whether inverse depths are bounded to be positive. Otherwise one may pass through infinity.
+        positive_depth: Whether inverse depths are between 1e-6 and 1e6. Otherwise one may pass through infinity.
         host: Keyframe that hosts each row of landmarks, ascending; None: row i belongs to keyframe i.
 
     Example:

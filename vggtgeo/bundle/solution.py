@@ -22,7 +22,7 @@ from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.checks import check_observed, check_pair
 from vggtgeo.bundle.diagnosis import MAJORITY, Diagnosis, diagnose, diagnosis_like
 from vggtgeo.bundle.objective import prepared
-from vggtgeo.bundle.problem import MIN_INVERSE_DEPTH, Problem, Readable, State
+from vggtgeo.bundle.problem import MAX_INVERSE_DEPTH, MIN_INVERSE_DEPTH, Problem, Readable, State
 from vggtgeo.bundle.solver_choice import default_solver
 from vggtgeo.io.argument_checks import check_kind, check_whole, real_numbers
 from vggtgeo.io.errors import InputError
@@ -115,7 +115,7 @@ class Solution(Readable):
     """`gradient_norm` at `state` if it was polished; above `vggtgeo.solvers.adjoint.STATIONARY` the derivatives are not
     those of an optimum."""
     at_bound: Int[Array, ""]
-    """Number of landmarks at the bound of positive inverse depths; their optimum is beyond infinity."""
+    """Number of landmarks at a bound of positive inverse depths; their optimum is beyond infinity, or in the camera."""
     diagnosis: Diagnosis | None
     """Faulty observations, term by term; `message` describes them. None without `diagnosis=True`."""
     record: IterationRecord | None = None
@@ -255,6 +255,7 @@ def _solve_jit(
         beyond = jnp.any(faults.unresolved > MAJORITY)
         termination = codes.where(beyond, codes.beyond_precision, termination)
     alone = fixed[2].inverse_depth[:, : problem.first_segment]
+    beyond = (alone <= MIN_INVERSE_DEPTH) | (alone >= MAX_INVERSE_DEPTH)
     return Solution(
         state=found.value,
         energy=_energy_at(last.energy, BundleAdjustment(problem), found.value),
@@ -265,7 +266,7 @@ def _solve_jit(
         termination=termination,
         polished=last.polished,
         gradient_residual=last.gradient_residual,
-        at_bound=jnp.sum(alone <= MIN_INVERSE_DEPTH) if problem.positive_depth else jnp.asarray(0),
+        at_bound=jnp.sum(beyond) if problem.positive_depth else jnp.asarray(0),
         diagnosis=faults,
         record=last.record,
     )
