@@ -211,6 +211,9 @@ def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) ->
     """
     safe = _balance(quadratic)
     values, vectors = jnp.linalg.eigh(quadratic / safe[:, None] / safe[None, :])
+    # Eigenvectors have rounding errors where the quadratic has no information at all: those entries would hold the
+    # linearisation point of a keyframe that nothing is known of.
+    vectors = jnp.where(jnp.diagonal(quadratic)[:, None] > 0, vectors, 0.0)
     floor = len(values) * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), initial=0.0)
     # A hundred times the rounding error: noise in the null space would become information along the gauge.
     kept = values > 100 * floor
