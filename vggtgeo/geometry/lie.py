@@ -62,10 +62,11 @@ def _parts(pose: jaxlie.SE3) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 3"]
 
 
 def _rotation(wxyz: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    # R = u u^T + (w + [u])^2 = v -> q v q^-1, for `q = (w, u)` of unit length.
+    # v -> q v q^-1 with `q = (w, u)`: R = (u u^T + (w + [u])^2) / |q|^2, for quaternions of text files, too.
     axis = wxyz[..., 1:]
     half = _matrix(SKEW, axis) + wxyz[..., :1, None] * np.eye(3, dtype=wxyz.dtype)
-    return axis[..., :, None] * axis[..., None, :] + jnp.matmul(half, half, precision=jax.lax.Precision.HIGHEST)
+    scaled = axis[..., :, None] * axis[..., None, :] + jnp.matmul(half, half, precision=jax.lax.Precision.HIGHEST)
+    return scaled / jnp.sum(wxyz * wxyz, -1)[..., None, None]
 
 
 def _compose(left: jaxlie.SE3, right: jaxlie.SE3) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 3"]]:
@@ -181,7 +182,7 @@ def log_derivative(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 6 6"]:
     adjoint = _matrix(ADJOINT, tangent)
     square = jnp.matmul(adjoint, adjoint, precision=jax.lax.Precision.HIGHEST)
     even = second * square + fourth * jnp.matmul(square, square, precision=jax.lax.Precision.HIGHEST)
-    return np.eye(TANGENT, dtype=tangent.dtype) - adjoint / 2 + even
+    return jnp.eye(TANGENT, dtype=tangent.dtype) - adjoint / 2 + even
 
 
 _log_jit = jax.jit(log)
