@@ -147,7 +147,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt with Schur elimination of the landmarks.
 
     Use with `optimistix.least_squares(energy_of, solver, y0, args=problem)`: `args` is an `AbstractArrowProblem`, `y0`
-    one of its points. Any other function than its energy is an error. Failures are also optimistix results.
+    one of its points. Any other function than its energy is an error; `options={"check_function": False}` saves the
+    compilation of this check. Failures are also optimistix results.
 
     Fields:
         rtol: Relative decrease of the energy that ends the iteration.

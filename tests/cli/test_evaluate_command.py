@@ -72,13 +72,14 @@ def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None
     # where it is a run's of free scale, or a file that says nothing; and that an estimate of free scale has no errors
     # after SE(3). Oracle: the summary of the run, the file's name.
     estimate, truth = _files(tmp_path)
+    report = evaluate_trajectory(*_load((estimate, truth)))
+    value, degrees = report.sim3.statistics.rmse, np.degrees(report.relative.rotation_statistics.rmse)
     for scale in ("free (no metric depth): lengths have no unit", "metric"):
         (tmp_path / "summary.json").write_text(json.dumps({"scale": scale}))
         printed = CliRunner().invoke(app, [str(tmp_path), str(truth)]).output
-        assert f"scale of the estimate: {scale}" in printed
+        assert all(part in printed for part in (f"scale of the estimate: {scale}", f"{degrees:.3f} deg"))
         assert [name in printed for name in ("ATE, SE(3)", "ATE, Sim(3)")] == [scale == "metric", True]
     (tmp_path / "summary.json").unlink()
-    value = evaluate_trajectory(*_load((estimate, truth))).sim3.statistics.rmse
     (tmp_path / "run").mkdir()
     of_run = truth.rename(tmp_path / "run" / "trajectory.txt")
     said = {

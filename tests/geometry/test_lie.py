@@ -74,7 +74,8 @@ def test_products_and_the_derivative_of_log(angle: float) -> None:
     exact = lambda found, expected: np.testing.assert_allclose(found, expected, atol=1e-13)
     exact(lie.relative(other, pose).wxyz_xyz, (pose @ other.inverse()).wxyz_xyz)
     exact(lie.move(pose, other.log()).as_matrix(), (other @ pose).as_matrix())
-    exact(lie.adjoint(pose), pose.adjoint())  # its blocks are the rotation matrix
+    exact(lie.adjoint(pose), pose.adjoint())
+    exact(lie.rotation_matrix(jaxlie.SE3(1.0005 * pose.wxyz_xyz)), pose.rotation().as_matrix())  # as of a text file
     np.testing.assert_allclose(lie.log_derivative(lie.log(pose)), by_step(pose, jnp.zeros(6))[0], atol=1e-11)
 
 

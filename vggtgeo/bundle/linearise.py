@@ -212,13 +212,9 @@ def lie_curvature(gradient: Float[Array, "e 6"]) -> Float[Array, "e 6 6"]:
     `exp(x_j) M exp(-x_i) = exp(eta) M` with `eta = x_j - A x_i + 1/2 [x_j, -A x_i] + O(3)` (Baker-Campbell-Hausdorff),
     and the bracket of se(3) is `[(v, w), (v', w')] = (w x v' + v x w', w x w')`.
     """
-    force, torque = (_skew(half) for half in (gradient[:, :3], gradient[:, 3:]))
+    force, torque = (lie.skew(half) for half in (gradient[:, :3], gradient[:, 3:]))
     upper = jnp.concatenate([jnp.zeros_like(force), force], 2)
     return -0.5 * jnp.concatenate([upper, jnp.concatenate([force, torque], 2)], 1)
-
-
-def _skew(v: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
-    return jnp.cross(v[:, None, :], jnp.eye(3, dtype=v.dtype)[None]).swapaxes(1, 2)
 
 
 Seen = Sequence[tuple[EdgeTerm, EdgeView]]

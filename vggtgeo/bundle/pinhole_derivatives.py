@@ -39,6 +39,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import MIN_RELATIVE_DEPTH
 
 
@@ -243,7 +244,7 @@ def _curvature_of_point(moments: _Moments, edge: OneEdge) -> Float[Array, "10 10
     rotation = edge.rotation
     outer = moments.point
     rotations = (outer + outer.T) / 2 - jnp.trace(outer) * jnp.eye(3, dtype=outer.dtype)
-    lever = -0.5 * _skew(moments.depth)
+    lever = -0.5 * lie.skew(moments.depth)
     x_axis, y_axis = rotation[:, 0], rotation[:, 1]
     turned = jnp.stack(
         [
@@ -257,12 +258,6 @@ def _curvature_of_point(moments: _Moments, edge: OneEdge) -> Float[Array, "10 10
     zero2, zero3, zero34 = (jnp.zeros(shape, outer.dtype) for shape in ((2, 2), (3, 3), (3, 4)))
     intrinsics = jnp.block([[focal, centre], [centre, zero2]])
     return jnp.block([[zero3, lever.T, zero34], [lever, rotations, turned], [zero34.T, turned.T, intrinsics]])
-
-
-def _skew(v: Sequence[Array] | Array) -> Float[Array, "3 3"]:
-    x, y, z = v
-    zero = jnp.zeros_like(x)
-    return jnp.stack([jnp.stack(line) for line in ([zero, -z, y], [z, zero, -x], [-y, x, zero])])
 
 
 def _cross_product(u: Array, v: Sequence[Array]) -> tuple[Array, Array, Array]:

@@ -37,6 +37,9 @@ from vggtgeo.solvers.levenberg_marquardt import (
 )
 from vggtgeo.solvers.problem import energy_of
 
+OF_THE_PROBLEM = {"check_function": False}
+"""Options of solves of `energy_of`: without the check that it is the problem's energy, which is not compiled, then."""
+
 
 class Graduation(eqx.Module):
     """A few iterations with each of these wider kernels before the solve.
@@ -73,6 +76,7 @@ class Graduation(eqx.Module):
                 brief,
                 state,
                 args=BundleAdjustment(wide),
+                options=OF_THE_PROBLEM,
                 max_steps=self.iterations,
                 # A stage that ends early still leaves a better start.
                 throw=False,
@@ -237,7 +241,7 @@ def _solve_jit(
         solver,
         initial,
         args=BundleAdjustment(problem, initial),
-        options={"check_function": False},  # it would be compiled once more, for nothing
+        options=OF_THE_PROBLEM,
         max_steps=solver.max_iterations,
         adjoint=adjoint,
         # Failure is a value, `termination`: an exception inside `jit` would lose the state.

@@ -8,7 +8,7 @@ here the result keeps the dtype of the first argument.
 
 from __future__ import annotations
 
-from itertools import permutations
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -25,14 +25,7 @@ NEAR = 4e-3
 """Squared angles below which series replace closed forms that cancel, rad^2; neither errs by more than 1e-14."""
 
 
-def _skew_tensor() -> np.ndarray:
-    tensor = np.zeros((3, 3, 3))
-    for a, b, c in permutations(range(3)):
-        tensor[c, a, b] = -np.linalg.det(np.eye(3)[[a, b, c]])
-    return tensor
-
-
-SKEW = _skew_tensor()
+SKEW = rigid.skew(np.eye(3))
 """[3, 3, 3]: `w` contracted with the first axis is the matrix of `w x`."""
 PRODUCT = np.zeros((4, 4, 4))
 """[4, 4, 4]: a quaternion contracted with the first axis is the matrix of the product with it from the left."""
@@ -45,16 +38,23 @@ ADJOINT = np.zeros((6, 6, 6))
 ADJOINT[3:, :3, :3] = ADJOINT[3:, 3:, 3:] = ADJOINT[:3, :3, 3:] = SKEW
 
 
+# GPUs would multiply single precision by ten bits.
+_matmul = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+
+
 def _matrix(tensor: np.ndarray, vector: Float[Array, "*n k"]) -> Float[Array, "*n a b"]:
     """Contract the first axis of a constant [k, a, b]."""
     flat = tensor.reshape(len(tensor), -1).astype(vector.dtype)
-    # GPUs would multiply single precision by ten bits.
-    product = jnp.matmul(vector, flat, precision=jax.lax.Precision.HIGHEST)
-    return product.reshape(*vector.shape[:-1], *tensor.shape[1:])
+    return _matmul(vector, flat).reshape(*vector.shape[:-1], *tensor.shape[1:])
+
+
+def skew(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
+    """Return the matrix of the cross product with a vector from the left: `rigid.skew` of JAX's arrays."""
+    return _matrix(SKEW, vector)
 
 
 def _times(matrix: Float[Array, "*n a b"], vector: Float[Array, "*n b"]) -> Float[Array, "*n a"]:
-    return jnp.matmul(matrix, vector[..., None], precision=jax.lax.Precision.HIGHEST)[..., 0]
+    return _matmul(matrix, vector[..., None])[..., 0]
 
 
 def _parts(pose: jaxlie.SE3) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 3"]]:
@@ -64,8 +64,8 @@ def _parts(pose: jaxlie.SE3) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 3"]
 def _rotation(wxyz: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
     # v -> q v q^-1 with `q = (w, u)`: R = (u u^T + (w + [u])^2) / |q|^2, for quaternions of text files, too.
     axis = wxyz[..., 1:]
-    half = _matrix(SKEW, axis) + wxyz[..., :1, None] * np.eye(3, dtype=wxyz.dtype)
-    scaled = axis[..., :, None] * axis[..., None, :] + jnp.matmul(half, half, precision=jax.lax.Precision.HIGHEST)
+    half = skew(axis) + wxyz[..., :1, None] * np.eye(3, dtype=wxyz.dtype)
+    scaled = axis[..., :, None] * axis[..., None, :] + _matmul(half, half)
     return scaled / jnp.sum(wxyz * wxyz, -1)[..., None, None]
 
 
@@ -98,7 +98,7 @@ def exp(tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
     # `(1 - cos a) / a^2` and `(a - sin a) / a^3` cancel for small angles: by their series there.
     first = jnp.where(tiny, 1 / 2 - squared / 24 + squared**2 / 720, (1 - jnp.cos(angle)) / safe)
     second = jnp.where(tiny, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - jnp.sin(angle)) / (safe * angle))
-    across = _matrix(SKEW, w)
+    across = skew(w)
     turned = _times(across, v)
     translation = v + first * turned + second * _times(across, turned)
     rotation = jaxlie.SO3.exp(w).wxyz
@@ -128,7 +128,7 @@ def move_at_zero(pose: jaxlie.SE3, tangent: Float[Array, "*n 6"]) -> jaxlie.SE3:
     """
     v, w = tangent[..., :3], tangent[..., 3:]
     scalar = 1 - jnp.sum(w * w, -1, keepdims=True) / 8
-    step = jaxlie.SE3(jnp.concatenate([scalar, w / 2, v + _times(_matrix(SKEW, w), v) / 2], -1))
+    step = jaxlie.SE3(jnp.concatenate([scalar, w / 2, v + _times(skew(w), v) / 2], -1))
     return jaxlie.SE3(jnp.concatenate(_compose(step, pose), -1).astype(pose.wxyz_xyz.dtype))
 
 
@@ -154,7 +154,7 @@ def log(pose: jaxlie.SE3) -> Float[Array, "*n 6"]:
     near = 1 / 12 + angle2 / 720 + angle2**2 / 30240 + angle2**3 / 1209600
     safe = jnp.where(angle2 < NEAR, 1.0, angle2)
     factor = jnp.where(angle2 < NEAR, near, (1 - _half_cotangent(safe)) / safe)
-    across = _matrix(SKEW, w)
+    across = skew(w)
     turned = _times(across, t)
     v = t - turned / 2 + factor * _times(across, turned)
     return jnp.concatenate([v, w], -1)
@@ -180,8 +180,8 @@ def log_derivative(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 6 6"]:
     second = jnp.where(near, 1 / 12 - squared**2 / 30240, (2 * short) / safe + slope)
     fourth = jnp.where(near, -1 / 720 - squared / 15120 - squared**2 / 403200, (short / safe + slope) / safe)
     adjoint = _matrix(ADJOINT, tangent)
-    square = jnp.matmul(adjoint, adjoint, precision=jax.lax.Precision.HIGHEST)
-    even = second * square + fourth * jnp.matmul(square, square, precision=jax.lax.Precision.HIGHEST)
+    square = _matmul(adjoint, adjoint)
+    even = second * square + fourth * _matmul(square, square)
     return jnp.eye(TANGENT, dtype=tangent.dtype) - adjoint / 2 + even
 
 
@@ -203,6 +203,6 @@ def adjoint(pose: jaxlie.SE3) -> Float[Array, "*n 6 6"]:
     """Return `Ad(T)`: `T exp(x) = exp(Ad(T) x) T`."""
     wxyz, t = _parts(pose)
     rotation = _rotation(wxyz)
-    lever = jnp.matmul(_matrix(SKEW, t), rotation, precision=jax.lax.Precision.HIGHEST)
+    lever = _matmul(skew(t), rotation)
     rows = [jnp.concatenate([rotation, lever], -1), jnp.concatenate([jnp.zeros_like(rotation), rotation], -1)]
     return jnp.concatenate(rows, -2)

@@ -131,7 +131,7 @@ def _lost(claim: Claim) -> list[Finding]:
     count = len(claim) - np.count_nonzero(claim.tracked)
     if count > thresholds.MAX_LOST * len(claim) or np.sqrt(squares / len(claim)) > thresholds.MAX_PLACE_ERROR:
         start, end, _ = claim.span(*max(parts, key=lambda rows: claim.frames[rows[1]] - claim.frames[rows[0]]))
-        text = f"{count} of {len(claim)} frames were lost and have no pose, longest from frame {start} to {end}"
+        text = f"{count} of {len(claim)} frames were lost and have no pose; the longest gap is frames {start} to {end}"
         level: Level = "failed" if len(claim) - count < thresholds.MIN_TRACKED * len(claim) else "degraded"
         found.append(Finding("lost", level, text, start, end))
     return found

@@ -48,7 +48,7 @@ class Verdict:
 
     level: "good"; "degraded", something contradicts the result or is missing from it; "failed", it is not to be used.
     reasons: one sentence each, the worst first. segments: the run by time, in order, without gaps. metric: False where
-    lengths are not metres, or doubtful. noted: what is significant and without consequence, one sentence each.
+    lengths are not metres, or doubtful. noted: what is significant and without consequence, or could not be tested.
 
     Example:
         >>> import vggtgeo as vg
