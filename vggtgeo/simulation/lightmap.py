@@ -131,29 +131,33 @@ def _shadowed(points: np.ndarray, rays: np.ndarray, blockers: Blockers, starts: 
     reach = np.stack([reach, reach, blockers.half[:, 2]], axis=1)
     low, high = blockers.centre - reach, blockers.centre + reach
     for first, last in pairwise(np.unique([*starts, *range(0, len(points), _GROUP)]).tolist()):
-        at = points[first:last, None]
-        end = at + rays[first:last]
-        bottom = np.minimum(at.min(axis=(0, 1)), end.min(axis=(0, 1)))
-        top = np.maximum(at.max(axis=(0, 1)), end.max(axis=(0, 1)))
+        at, towards = points[first:last], rays[first:last]
+        end = at[:, None] + towards
+        bottom = np.minimum(at.min(axis=0), end.min(axis=(0, 1)))
+        top = np.maximum(at.max(axis=0), end.max(axis=(0, 1)))
         boxes = np.nonzero(np.all((low <= top) & (high >= bottom), axis=1))[0]
         batch = max(1, _BATCH // (end.shape[0] * end.shape[1]))
         for some in np.split(boxes, np.arange(batch, len(boxes), batch)):
-            blocked[first:last] |= _meets(at, rays[first:last], blockers, some)
+            blocked[first:last] |= _meets(at, towards, blockers, some)
     return blocked
 
 
 def _meets(points: np.ndarray, rays: np.ndarray, blockers: Blockers, some: np.ndarray) -> np.ndarray:
-    """Test segments points [n, 1, 3], rays [n, S, 3] against the boxes `some` [B], slab by slab: bool [n, S]."""
+    """Test segments points [n, 3], rays [n, S, 3] against the boxes `some` [B], slab by slab: bool [n, S].
+
+    The rays are the last axis, which numpy's loops run along.
+    """
     yaw = blockers.yaw[some]
-    cos, sin = np.cos(yaw).astype(np.float32), np.sin(yaw).astype(np.float32)
-    half = blockers.half[some].astype(np.float32)
-    local = points[..., None, :] - blockers.centre[some].astype(np.float32)
-    turned = (cos * local[..., 0] + sin * local[..., 1], cos * local[..., 1] - sin * local[..., 0], local[..., 2])
-    x, y, z = (rays[..., k, None] for k in range(3))
+    cos, sin = (part.astype(np.float32)[:, None, None] for part in (np.cos(yaw), np.sin(yaw)))
+    half = blockers.half[some].astype(np.float32)[:, None, None]
+    local = points[None, :, None] - blockers.centre[some].astype(np.float32)[:, None, None]
+    px, py, pz = (local[..., k] for k in range(3))
+    x, y, z = (np.ascontiguousarray(rays[..., k]) for k in range(3))
     enter, leave = np.float32(1e-4), np.float32(1.0)
-    for position, way, side in zip(turned, (cos * x + sin * y, cos * y - sin * x, z), half.T, strict=True):
+    slabs = (cos * px + sin * py, cos * x + sin * y), (cos * py - sin * px, cos * y - sin * x), (pz, z)
+    for axis, (position, way) in enumerate(slabs):
         inverse = np.float32(1.0) / np.where(np.abs(way) < 1e-9, np.float32(1e-9), way)
-        middle, reach = -position * inverse, side * np.abs(inverse)
+        middle, reach = -position * inverse, half[..., axis] * np.abs(inverse)
         enter = np.maximum(enter, middle - reach)
         leave = np.minimum(leave, middle + reach)
-    return np.any(enter < leave, axis=-1)
+    return np.any(enter < leave, axis=0)
