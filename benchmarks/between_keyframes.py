@@ -22,8 +22,8 @@ from vggtgeo.datasets import Sequence, open_sequence, without_depth
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.evaluation.association import associate
 from vggtgeo.geometry import rigid
-from vggtgeo.slam.global_map.carried_poses import carried_poses
 from vggtgeo.slam.global_map.frame_poses import frame_poses
+from vggtgeo.slam.global_map.propagated_poses import propagated_poses
 from vggtgeo.slam.state import Slam
 
 Poses = Callable[[Slam], tuple[np.ndarray, np.ndarray]]
@@ -42,7 +42,7 @@ def main() -> None:
         record = vg.reconstruct(without_depth(sequence), options=vg.RunOptions(end=options.frames, dense="none")).record
         assert record is not None
         slam = record.slam
-        cells = [f"{value:.2f}" for poses in (carried_poses, frame_poses) for value in errors(slam, sequence, poses)]
+        cells = [f"{value:.2f}" for poses in (propagated_poses, frame_poses) for value in errors(slam, sequence, poses)]
         print(f"| {path.name} | {len(slam.frames)} | {' | '.join(cells)} |", flush=True)
 
 

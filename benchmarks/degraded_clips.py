@@ -50,7 +50,7 @@ def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> t
 
 def evidence(sequence: SequenceView) -> CornerTracks:
     """What the verdict looks at, of each frame."""
-    recorder = vg.callbacks.EvidenceRecorder(sequence.camera)
+    recorder = vg.callbacks.CornerRecorder(sequence.camera)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         for frame in sequence.frames():

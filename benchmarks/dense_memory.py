@@ -61,10 +61,10 @@ def _row(state: Path, count: int) -> list[str]:
     slam = load_map(state)
     own = slam.keyframes
     keyframes = tuple(_beside(own[row % len(own)], row, row // len(own)) for row in range(count))
-    ties = tuple(MeasuredRelativePose(row, row + 1, np.eye(4), np.eye(6)) for row in range(count - 1))
+    factors = tuple(MeasuredRelativePose(row, row + 1, np.eye(4), np.eye(6)) for row in range(count - 1))
     longer = replace(
         slam,
-        map=replace(slam.map, keyframes=keyframes, pairs=(), factors=ties, roots=(0,)),
+        map=replace(slam.map, keyframes=keyframes, pairs=(), factors=factors, roots=(0,)),
         tracker=replace(slam.tracker, frames=()),
     )
     before = _megabytes()

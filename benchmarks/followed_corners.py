@@ -22,8 +22,8 @@ from camera_errors import in_bands_of_light
 import vggtgeo as vg
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.degradations import Recording, with_images
-from vggtgeo.slam.perception.followed_corners import common_to_rows
-from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
+from vggtgeo.slam.perception.klt_corners import common_to_rows
+from vggtgeo.slam.verdict.corner_recorder import FrameCorners
 from vggtgeo.slam.verdict.thresholds import MIN_COMMON
 
 AGREE = 3.0
@@ -59,7 +59,7 @@ def main() -> None:
 
 def _steps(recording: Recording) -> tuple[list[np.ndarray], list[float]]:
     """How far corners are from where the truth carries them, step by step, and the bands of light."""
-    recorder, images = vg.callbacks.EvidenceRecorder(recording.camera), []
+    recorder, images = vg.callbacks.CornerRecorder(recording.camera), []
     for frame in recording.frames:
         recorder.add(frame)
         images.append(recorder.so_far()[1])
@@ -72,7 +72,7 @@ def _steps(recording: Recording) -> tuple[list[np.ndarray], list[float]]:
 
 
 def _off(
-    first: FrameEvidence, before: np.ndarray, second: FrameEvidence, after: np.ndarray, inner: np.ndarray
+    first: FrameCorners, before: np.ndarray, second: FrameCorners, after: np.ndarray, inner: np.ndarray
 ) -> np.ndarray:
     rows, others = first.common(second)
     points = rigid.unproject(first.pixels[rows].astype(np.float64), 1.0 / first.depth[rows], before, inner)

@@ -47,7 +47,7 @@ from vggtgeo.simulation.degradations import Recording, with_depths
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
 from vggtgeo.slam.global_map.pose_uncertainty import CENTRE, DEPTH_SCALE, MOMENT
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.pose_acceptance import tangent
 
 HEADER = (
     "| clip | frames | within 3 sigma: translation | rotation | median error, mm | stated | median error, deg | stated "
@@ -100,16 +100,16 @@ def _row(name: str, slam: Slam, true: np.ndarray, row_of: dict[int, int]) -> str
     for record in slam.frames:
         reference = row_of[slam.keyframes[record.reference].frame]
         arrived = record.arrival is not None or row_of[record.frame] == reference
-        if record.tracked and not arrived and np.isfinite(record.evidence.sigma_translation):
+        if record.tracked and not arrived and np.isfinite(record.quality.sigma_translation):
             off = _error(record.relative, true[reference], true[row_of[record.frame]])
-            stated = record.evidence.sigma_translation, record.evidence.sigma_rotation
+            stated = record.quality.sigma_translation, record.quality.sigma_rotation
             frames.append((np.linalg.norm(off[:3]), np.linalg.norm(off[3:]), *stated))
     moved, turned, sigma_moved, sigma_turned = np.array(frames).T
     distances = []
-    for tie in slam.map.odometry_factors:
-        first, second = (row_of[slam.keyframes[number].frame] for number in tie.keyframes)
-        off = _error(tie.pose, true[first], true[second])
-        distances.append(off @ tie.information @ off)
+    for factor in slam.map.odometry_factors:
+        first, second = (row_of[slam.keyframes[number].frame] for number in factor.keyframes)
+        off = _error(factor.pose, true[first], true[second])
+        distances.append(off @ factor.information @ off)
     typical = float(np.median(distances))
     cells = (
         *(

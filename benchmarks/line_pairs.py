@@ -4,9 +4,9 @@
 
 Every n-th frame is a keyframe at its true pose, and the frames 1, 3 and 5 after it are placed from it, from where a
 constant velocity leads. Printed as Markdown: the share of poses within 5 cm and 2 degrees of the truth; the median and
-the 90th percentile of the distance, cm; and how many poses by lines alone are believed
-(`vggtgeo/slam/tracking/evidence.py`), of those that are right and of those that are more than 15 cm or 5 degrees off.
-For the latter, segments are also started 0.7 m and 14 degrees away. `few`: pairs of fewer than 100 matches.
+the 90th percentile of the distance, cm; and how many poses by lines alone are accepted
+(`vggtgeo/slam/tracking/pose_acceptance.py`), of those that are right and of those that are more than 15 cm or 5 degrees
+off. For the latter, segments are also started 0.7 m and 14 degrees away. `few`: pairs of fewer than 100 matches.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
-from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, track
+from vggtgeo.slam.tracking.frame_tracking import FrameData, MotionPrior, TrackedFrame, TrackingInput, track
 
 GAPS, FEW = (1, 3, 5), 100
 NEAR, FAR = (0.05, np.deg2rad(2.0)), (0.15, np.deg2rad(5.0))
@@ -84,7 +84,7 @@ class Pair:
     expected: MotionPrior
     gap: int
 
-    def by(self, method: str, keyframe: Keyframe, expected: MotionPrior | None = None) -> Track:
+    def by(self, method: str, keyframe: Keyframe, expected: MotionPrior | None = None) -> TrackedFrame:
         """The second shot's pose from the first."""
         points, lines, picture = METHODS[method]
         view = self.second.view if picture else None
@@ -144,7 +144,7 @@ def place(
         0, first.frame, first.pose, Description.of(first.features), ROLES, SETTINGS, first.intrinsics, first.lines
     )
     found = {method: pair.by(method, keyframe) for method in METHODS}
-    few = found["points"].evidence.matches < FEW
+    few = found["points"].quality.matches < FEW
     own = {"motion so far": pair.expected.pose} | {method: one.pose for method, one in found.items()}
     for method, pose in own.items():
         for group in (str(pair.gap), *(["few"] if few else [])):

@@ -26,7 +26,7 @@ import cv2
 import jax
 import numpy as np
 import pycolmap
-from vggtgeo.models.classical import SiftMatcher, place_vector
+from vggtgeo.models.classical import SiftMatcher, global_descriptor
 
 from vggtgeo.datasets import Sequence, open_sequence
 from vggtgeo.datasets.frame import Frame
@@ -147,7 +147,7 @@ def _pairs(frames: list[Frame]) -> set[tuple[int, int]]:
     """Frames near each other, and those farther apart that look alike."""
     count, matcher = len(frames), SiftMatcher()
     pairs = {(row, other) for row in range(count) for other in range(row + 1, min(row + NEIGHBOURS + 1, count))}
-    vectors = [place_vector(matcher.describe(frame.image)) for frame in frames]
+    vectors = [global_descriptor(matcher.describe(frame.image)) for frame in frames]
     length = next((len(vector) for vector in vectors if vector is not None), 1)
     places = np.stack([np.zeros(length) if vector is None else vector for vector in vectors])
     alike = places @ places.T

@@ -29,7 +29,7 @@ from vggtgeo.evaluation.pose_errors import absolute_error
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.recorded_prior import prior_summary
+from vggtgeo.slam.pose_prior import prior_summary
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run
 from vggtgeo.slam.state import submaps_by_size
 

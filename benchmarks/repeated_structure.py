@@ -21,12 +21,12 @@ from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
 from vggtgeo.simulation.sequence import SyntheticSequence
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.map import loop_edges
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.window_steps import merge_pending_window
 
 HEADER = (
     "| seed | returns | frames | keyframes | odometry, cm | adjusted, cm | loops | false | verdict |\n"

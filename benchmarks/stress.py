@@ -46,7 +46,7 @@ from vggtgeo.simulation.degradations import DEGRADATIONS
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
 ORDER = ("good", "alarm", "mild", "told", "SILENT", "error", "crash", "hang")
-MOST_TURN = 2.5
+MAX_TURN = 2.5
 """Degrees, RMS from frame to frame, beyond which poses are wrong whatever the ATE is."""
 
 
@@ -128,7 +128,7 @@ def judge(outcome: Outcome, base: float) -> str:
         return "error" if outcome.code == 2 else "crash"
     told = outcome.level != "good"
     complete = outcome.written >= 0.98 * outcome.given and outcome.tracked >= 0.9 * outcome.written
-    complete = complete and not outcome.turn > MOST_TURN
+    complete = complete and not outcome.turn > MAX_TURN
     if outcome.ate <= max(2 * base, 0.04) and complete:
         return "alarm" if told else "good"
     if told:

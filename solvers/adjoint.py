@@ -46,7 +46,7 @@ from vggtgeo.solvers.arrow import (
     inverse_landmark_hessian,
     moving_landmarks,
 )
-from vggtgeo.solvers.flat_directions import at_least
+from vggtgeo.solvers.gauge import at_least
 from vggtgeo.solvers.levenberg_marquardt import LevenbergMarquardtState, SchurLevenbergMarquardt
 from vggtgeo.solvers.problem import AbstractArrowProblem, Point
 from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, DenseCholesky

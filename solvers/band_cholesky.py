@@ -20,7 +20,7 @@ from vggtgeo.solvers.block_elimination import (
     selected_inverse,
     solve_eliminated,
 )
-from vggtgeo.solvers.flat_directions import free_gauge, pinned_update, solve_pinned
+from vggtgeo.solvers.gauge import free_gauge, pinned_update, solve_pinned
 from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, predicted_decrease
 from vggtgeo.solvers.schur_complement import (
     LocalInverse,

@@ -25,7 +25,7 @@ import jax.scipy as jsp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from vggtgeo.solvers.arrow import ArrowSystem, carry_to_nodes, dense_gradient, inverse_landmark_hessian
-from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, pins
+from vggtgeo.solvers.gauge import at_least, flat_stiffness, pins
 from vggtgeo.solvers.schur_complement import (
     AbstractLayout,
     Blocks,

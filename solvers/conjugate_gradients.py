@@ -29,7 +29,7 @@ from vggtgeo.solvers.arrow import (
     to_relative,
 )
 from vggtgeo.solvers.block_band import Bands, band_layout, band_solver, prepare_bands
-from vggtgeo.solvers.flat_directions import at_least, flat_stiffness, free_gauge
+from vggtgeo.solvers.gauge import at_least, flat_stiffness, free_gauge
 from vggtgeo.solvers.minres import minres
 from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, predicted_decrease
 from vggtgeo.solvers.schur_complement import (

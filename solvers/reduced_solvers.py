@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, back_substitute
-from vggtgeo.solvers.flat_directions import at_least, free_gauge, gauge_stiffness
+from vggtgeo.solvers.gauge import at_least, free_gauge, gauge_stiffness
 from vggtgeo.solvers.schur_complement import (
     LocalInverse,
     Reduced,

@@ -51,6 +51,6 @@ from .slam.run import run as run
 from .slam.settings.presets import perception as perception
 from .slam.settings.slam_settings import Roles as Roles
 from .slam.settings.slam_settings import SlamSettings as SlamSettings
-from .slam.verdict.verdict import Verdict as Verdict
+from .slam.verdict.findings import Verdict as Verdict
 from .solvers.adjoint import ArrowAdjoint as ArrowAdjoint
 from .solvers.levenberg_marquardt import SchurLevenbergMarquardt as SchurLevenbergMarquardt

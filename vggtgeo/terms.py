@@ -11,11 +11,11 @@ Ready terms: `PointTerm`, `LineTerm`, `DepthPrior`, `HostPixel`, `BaselinePrior`
 """
 
 from vggtgeo.bundle.observations import FlatTerm as FlatTerm
-from vggtgeo.bundle.terms.edge import EdgeTerm as EdgeTerm
-from vggtgeo.bundle.terms.edge import View as View
 from vggtgeo.bundle.terms.landmark import DepthPrior as DepthPrior
 from vggtgeo.bundle.terms.landmark import HostPixel as HostPixel
 from vggtgeo.bundle.terms.landmark import SlotTerm as SlotTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm as EdgeTerm
+from vggtgeo.bundle.terms.landmark_edge import View as View
 from vggtgeo.bundle.terms.marginal import MarginalPrior as MarginalPrior
 from vggtgeo.bundle.terms.measured_pose import BaselinePrior as BaselinePrior
 from vggtgeo.bundle.terms.measured_pose import RelativePose as RelativePose
@@ -25,8 +25,8 @@ from vggtgeo.bundle.terms.node import DenseTerm as DenseTerm
 from vggtgeo.bundle.terms.node import IntrinsicsPrior as IntrinsicsPrior
 from vggtgeo.bundle.terms.node import PairTerm as PairTerm
 from vggtgeo.bundle.terms.node import PoseTerm as PoseTerm
-from vggtgeo.bundle.terms.points_and_lines import ImageTerm as ImageTerm
-from vggtgeo.bundle.terms.points_and_lines import LineTerm as LineTerm
-from vggtgeo.bundle.terms.points_and_lines import PointTerm as PointTerm
+from vggtgeo.bundle.terms.reprojection import ImageTerm as ImageTerm
+from vggtgeo.bundle.terms.reprojection import LineTerm as LineTerm
+from vggtgeo.bundle.terms.reprojection import PointTerm as PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm as AbstractTerm
 from vggtgeo.bundle.terms.term import shared_field as shared_field

@@ -11,7 +11,7 @@ from vggtgeo.models.classical.manhattan import nearest_frame as nearest_frame
 from vggtgeo.models.classical.pixel_matcher import OrbMatcher as OrbMatcher
 from vggtgeo.models.classical.pixel_matcher import SiftMatcher as SiftMatcher
 from vggtgeo.models.classical.pixel_matcher import can_search as can_search
-from vggtgeo.models.classical.pixel_matcher import place_vector as place_vector
+from vggtgeo.models.classical.pixel_matcher import global_descriptor as global_descriptor
 from vggtgeo.models.classical.pixel_matcher import search_around as search_around
 from vggtgeo.models.classical.pixel_matcher import search_near as search_near
 from vggtgeo.models.classical.pixel_matcher import search_tree as search_tree

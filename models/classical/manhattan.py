@@ -37,15 +37,15 @@ class ManhattanEstimator:
     """Estimates the Manhattan frame of a view.
 
     end_error: standard deviation of a segment's end across it, pixels. gate: maximum angle between a segment and its
-    axis, seen from the segment's middle, radians. least_share: minimum share of the segments' length along an axis.
-    least_segments: minimum number on two axes each. clear: minimum deviation of a segment from all other axes,
+    axis, seen from the segment's middle, radians. min_share: minimum share of the segments' length along an axis.
+    min_segments: minimum number on two axes each. clear: minimum deviation of a segment from all other axes,
     standard deviations. floor: minimum standard deviation of the result, radians (walls are not exactly straight).
     """
 
     end_error: float = 0.7
     gate: float = float(np.deg2rad(3.0))
-    least_share: float = 0.85
-    least_segments: int = 4
+    min_share: float = 0.85
+    min_segments: int = 4
     clear: float = 3.0
     floor: float = float(np.deg2rad(0.1))
 
@@ -58,7 +58,7 @@ class ManhattanEstimator:
         endpoints: float [L, 2, 2], pixels. intrinsics: float [4]. predicted: float [3, 3], frame -> camera; without it
         order and signs of the axes are arbitrary.
         """
-        if len(endpoints) < 2 * self.least_segments:
+        if len(endpoints) < 2 * self.min_segments:
             return None
         planes = _Planes.of(endpoints, np.asarray(intrinsics, float))
         start = _search(planes, np.sin(self.gate)) if predicted is None else predicted
@@ -97,7 +97,7 @@ class ManhattanEstimator:
         good = fit.near & (np.abs(fit.off) < 3 * fit.sigma)
         share = float(planes.lengths[good].sum() / planes.lengths.sum())
         axes = np.bincount(fit.axis[good], minlength=3)
-        if share < self.least_share or np.sort(axes)[1] < self.least_segments:
+        if share < self.min_share or np.sort(axes)[1] < self.min_segments:
             return None
         information = (fit.rows[good] / fit.sigma[good, None] ** 2).T @ fit.rows[good]
         covariance = np.linalg.inv(information) + self.floor**2 * np.eye(3)

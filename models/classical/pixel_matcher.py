@@ -263,7 +263,7 @@ def _vectors(features: Features) -> np.ndarray:
 _BITS = 5
 
 
-def place_vector(features: Features) -> np.ndarray | None:
+def global_descriptor(features: Features) -> np.ndarray | None:
     """Return the global descriptor of an image, a unit vector, float32 `[2^bits * D]`: aggregated local descriptors
     (VLAD, Jegou et al. 2010). None for descriptors without vectors, or fewer than 20 points.
 

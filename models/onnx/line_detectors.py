@@ -119,14 +119,14 @@ _MAP = 256
 class MlsdDetector:
     """A `LineDetector`. The image is stretched to 512 x 512, as in training.
 
-    score: minimum value of a centre, in [0, 1]. least_length: minimum length in the 256 x 256 map, pixels. shortest:
+    score: minimum value of a centre, in [0, 1]. min_length: minimum length in the 256 x 256 map, pixels. shortest:
     minimum length in the image, pixels. count: maximum number of segments.
     """
 
     session: Session
     cache: OutputCache = field(default_factory=MemoryCache)
     score: float = 0.10
-    least_length: float = 20.0
+    min_length: float = 20.0
     shortest: float = 20.0
     count: int = 200
 
@@ -134,7 +134,7 @@ class MlsdDetector:
         """Return segments of `image` (uint8 [H, W, 3]), best first."""
         run = lambda: {"maps": self.session.run({"image": prepare(image)[None]})["maps"][0, :5]}
         outputs = self.cache.get((self.session,), ("lines",), (image,), run)
-        ends, scores = decode_maps(outputs["maps"], self.score, self.least_length, self.count)
+        ends, scores = decode_maps(outputs["maps"], self.score, self.min_length, self.count)
         # A pixel k of the map is the pixel 2 k of the input; the input is stretched by its edges, not its centres.
         stretch = np.array(image.shape[1::-1], np.float64) / _SIDE
         return tidy(image, (2.0 * ends + 0.5) * stretch - 0.5, scores, self.shortest, self.count)
@@ -146,11 +146,11 @@ def prepare(image: np.ndarray) -> np.ndarray:
     return np.concatenate([colours, np.full((1, _SIDE, _SIDE), 1.0 / 127.5 - 1.0, np.float32)])
 
 
-def decode_maps(maps: np.ndarray, score: float, least_length: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+def decode_maps(maps: np.ndarray, score: float, min_length: float, count: int) -> tuple[np.ndarray, np.ndarray]:
     """End points float64 [L, 2, 2] in pixels of the map, and scores float64 [L], best first.
 
     maps: float [5, 256, 256], logit of a centre, displacements of both ends. Of the `count` strongest centres that
-    are greatest among their 3 x 3 neighbours, those above `score` and longer than `least_length` are segments.
+    are greatest among their 3 x 3 neighbours, those above `score` and longer than `min_length` are segments.
     """
     heat = 1.0 / (1.0 + np.exp(-np.clip(maps[0].astype(np.float64), -700.0, 700.0)))
     peak = heat == cv2.dilate(heat, np.ones((3, 3), np.uint8))
@@ -158,5 +158,5 @@ def decode_maps(maps: np.ndarray, score: float, least_length: float, count: int)
     order = np.argsort(-flat, kind="stable")[:count]
     y, x = np.divmod(order, _MAP)
     ends = np.stack([x, y], axis=1)[:, None, :] + maps[1:5, y, x].T.astype(np.float64).reshape(-1, 2, 2)
-    keep = (flat[order] > score) & (np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > least_length)
+    keep = (flat[order] > score) & (np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > min_length)
     return ends[keep], flat[order][keep]

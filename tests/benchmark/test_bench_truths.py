@@ -22,7 +22,7 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.results.result import Result
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
-from vggtgeo.slam.verdict.verdict import Verdict
+from vggtgeo.slam.verdict.findings import Verdict
 
 SUMMARY = {"frames": 8, "frames_tracked": 8, "keyframes": 8, "frames_per_second": 1.0, "seconds_by_stage": {}}
 

@@ -16,8 +16,8 @@ from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import energy, energy_terms
 from vggtgeo.bundle.padding import PaddedSize
 from vggtgeo.bundle.problem import State
-from vggtgeo.bundle.terms.edge import View
-from vggtgeo.bundle.terms.points_and_lines import PointTerm
+from vggtgeo.bundle.terms.landmark_edge import View
+from vggtgeo.bundle.terms.reprojection import PointTerm
 from vggtgeo.geometry.camera_models import MIN_RELATIVE_DEPTH, Pinhole
 
 EnergyTerms = dict[str, float]

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from vggtgeo.cli import progress
 from vggtgeo.cli.progress import ProgressBar, duration, verdict_line
-from vggtgeo.slam.verdict.verdict import Level, Segment, Verdict
+from vggtgeo.slam.verdict.findings import Level, Segment, Verdict
 
 
 @pytest.mark.parametrize("terminal", [False, True])

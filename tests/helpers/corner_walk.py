@@ -1,4 +1,4 @@
-"""Corners of a room of points as an `EvidenceRecorder` would follow them, with known truth: tests of the verdict."""
+"""Corners of a room of points as an `CornerRecorder` would follow them, with known truth: tests of the verdict."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.alternatives import Explanation, explain
 from vggtgeo.slam.verdict.claim import Claim, Tracks, tracks_of
-from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
+from vggtgeo.slam.verdict.corner_recorder import FrameCorners
 
 K = np.array([500.0, 500.0, 319.5, 239.5])
 SIZE = (640, 480)
@@ -24,7 +24,7 @@ class Walk:
     """The truth as the claim of a run, and what was seen."""
 
     claim: Claim
-    evidence: list[FrameEvidence]
+    evidence: list[FrameCorners]
 
     def tracks(self, claim: Claim | None = None) -> Tracks:
         """Of all frames, with another claim where one is given."""
@@ -72,8 +72,6 @@ def walk(
         z = measured(row, z) if measured else z
         shown = pixels[there] + noise * rng.standard_normal((len(there), 2))
         evidence.append(
-            FrameEvidence(
-                row, float(times[row]), there.astype(np.int32), shown.astype(np.float32), z.astype(np.float32)
-            )
+            FrameCorners(row, float(times[row]), there.astype(np.int32), shown.astype(np.float32), z.astype(np.float32))
         )
     return Walk(Claim(np.arange(count), times, poses, np.ones(count, bool), K.copy(), True), evidence)

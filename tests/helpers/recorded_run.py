@@ -18,11 +18,11 @@ from vggtgeo.mapping.dense import dense_depths
 from vggtgeo.simulation import SyntheticSequence, simulate
 from vggtgeo.slam.callback import WindowRecorder
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.groups import GlobalMapSettings, WindowSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.window_steps import merge_pending_window
 
 FRAMES = 9
 # One small window shape for the tests of runs, so that the solver is compiled once a process.

@@ -25,7 +25,7 @@ from vggtgeo.report import RunRecord, has_viewer, map_scene, view_html, write_pa
 from vggtgeo.results.summary import summarise
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.verdict.verdict import Finding, Verdict, conclude
+from vggtgeo.slam.verdict.findings import Finding, Verdict, conclude
 from vggtgeo.slam.window.sliding_window import MAX_ITERATIONS
 
 

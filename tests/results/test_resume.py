@@ -31,7 +31,7 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
+from vggtgeo.slam.verdict.corner_recorder import FrameCorners
 from vggtgeo.slam.verdict.judge import judge
 
 TIMES = ("seconds_by_stage", "frames_per_second", "peak_memory_gb")
@@ -57,7 +57,7 @@ class Run:
     """What a run left, and what was noted of its frames for the verdict."""
 
     result: Result
-    evidence: tuple[FrameEvidence, ...]
+    evidence: tuple[FrameCorners, ...]
 
 
 @cache
@@ -71,7 +71,7 @@ def run(
     options: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Run:
-    seen: list[FrameEvidence] = []
+    seen: list[FrameCorners] = []
 
     def judged(slam: Slam, evidence: Any, *rest: Any) -> Any:
         seen.extend(evidence)

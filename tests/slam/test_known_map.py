@@ -24,8 +24,8 @@ from vggtgeo.geometry import rigid
 from vggtgeo.results.result import Result
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.known_map import as_map, entered, save_map
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.state import Slam, submaps_by_size
-from vggtgeo.slam.window_steps import merge_pending_window
 
 FRAMES, HALF = 14, 7
 FIXED = replace(SETTINGS, keyframes=replace(SETTINGS.keyframes, localise_only=True))

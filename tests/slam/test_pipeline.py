@@ -28,13 +28,13 @@ from vggtgeo.slam.global_map.compile_ahead import expected_keyframes
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.loops import close_loops
+from vggtgeo.slam.local_mapping import adjust_window, camera_prior
 from vggtgeo.slam.run import finish, frame_trajectory
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.sparse_map.factors import FREE_LENGTH
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.sliding_window import window_problem
-from vggtgeo.slam.window_steps import adjust_window, camera_prior
 
 SIZE = (320, 240)
 Room = tuple[list[Frame], Camera, Trajectory]
@@ -162,9 +162,9 @@ def _visited_twice(slam: Slam, motion: np.ndarray) -> Slam:
     count = len(slam.keyframes)
     again = tuple(replace(k, number=k.number + count, pose=k.pose @ rigid.invert(motion)) for k in slam.keyframes)
     pairs = tuple(replace(p, first=p.first + count, second=p.second + count) for p in slam.map.pairs)
-    ties = tuple(replace(t, first=t.first + count, second=t.second + count) for t in slam.map.odometry_factors)
+    factors = tuple(replace(t, first=t.first + count, second=t.second + count) for t in slam.map.odometry_factors)
     twice = slam.with_map(keyframes=(*slam.keyframes, *again), pairs=(*slam.map.pairs, *pairs), roots=(0, count))
-    return twice.with_factors(*ties)
+    return twice.with_factors(*factors)
 
 
 @pytest.mark.long
@@ -201,8 +201,8 @@ def test_rgb_recovers_the_shape(room: Room) -> None:
     for keyframe in slam.keyframes:
         assert np.array_equal(poses[keyframe.frame], keyframe.pose)  # the second one began the map with the first
     numbers = {keyframe.frame for keyframe in slam.keyframes}
-    between = [record.evidence for record in slam.frames if record.frame not in numbers]
-    assert all(np.isfinite(evidence.sigma_translation) for evidence in between)  # and of those that waited for the map
+    between = [record.quality for record in slam.frames if record.frame not in numbers]
+    assert all(np.isfinite(quality.sigma_translation) for quality in between)  # and of those that waited for the map
     assert len(slam.map.odometry_factors) >= len(slam.keyframes) - 2
     prior = camera_prior(slam)
     adjustment, _ = window_problem(slam.map, slam.window, slam.intrinsics, prior, SETTINGS)
@@ -243,7 +243,7 @@ def test_a_map_begins_where_depth_does(room: Room) -> None:
     assert all(record.tracked for record in slam.frames)
     assert any("the map begins at frame 3" in note for note in slam.notes), slam.notes
     assert error < 0.015, f"ATE {error:.4f} m"
-    assert all(0 < record.evidence.sigma_translation < 0.05 for record in slam.frames[:3])  # those that waited
+    assert all(0 < record.quality.sigma_translation < 0.05 for record in slam.frames[:3])  # those that waited
 
 
 @pytest.mark.long

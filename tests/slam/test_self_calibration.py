@@ -19,11 +19,11 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.slam import self_calibration
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.local_mapping import camera_prior
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.window_steps import camera_prior
 
 GUESS = Camera.guess(320, 240)
 FEW = vg.RunOptions(end=3, dense="none")

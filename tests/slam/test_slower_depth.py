@@ -7,7 +7,7 @@ import numpy as np
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.run import with_own_depth
-from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
+from vggtgeo.slam.verdict.corner_recorder import CornerRecorder
 
 rng = np.random.default_rng(0)
 
@@ -40,7 +40,7 @@ def test_depth_of_another_picture_is_not_used() -> None:
     for begun in range(1, len(frames)):
         rest = with_own_depth(frames[begun:], frames[max(begun - 2, 0) : begun])
         assert [frame.depth is not None for frame in rest] == own[begun:], "a run that goes on there"
-    recorder = EvidenceRecorder(Camera((150.0, 150.0, 79.5, 59.5), 160, 120))
+    recorder = CornerRecorder(Camera((150.0, 150.0, 79.5, 59.5), 160, 120))
     for frame in frames[:7]:
         recorder.add(frame)
     assert [bool(np.isfinite(noted.depth).any()) for noted in recorder.frames] == own[:7]

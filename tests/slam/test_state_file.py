@@ -21,15 +21,15 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRotation
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION
-from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality
 from vggtgeo.slam.tracking.tracking_state import SeenPoints, UnplacedFrame
 from vggtgeo.slam.window.sliding_window import WindowPrior
-from vggtgeo.slam.window_steps import merge_pending_window
 
 STATE = Format("state", VERSION, by_name(STATE_CLASSES))
 MIDDLE = 4
@@ -144,7 +144,7 @@ def test_any_value_comes_back(name: str, tmp_path: Path) -> None:
     assert facts == BOX.facts(tmp_path / "box") == {"why": name}
 
 
-@pytest.mark.parametrize("value", [object(), {1: 2}, np.array([None]), Evidence(), Keyframe])
+@pytest.mark.parametrize("value", [object(), {1: 2}, np.array([None]), TrackingQuality(), Keyframe])
 def test_what_is_not_listed_is_not_written(value: Any, tmp_path: Path) -> None:
     """A class that nobody listed ends the writing with the way to it, and leaves no file; oracle: the error."""
     with raises("content[1]", error=TypeError):

@@ -16,7 +16,7 @@ import vggtgeo as vg
 from vggtgeo.slam import threads as module
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
-from vggtgeo.slam.threads import made_ahead, map_in_threads
+from vggtgeo.slam.threads import map_in_threads, prefetched
 
 INTRINSICS = np.array([260.0, 255.0, 159.5, 119.5])
 
@@ -68,7 +68,7 @@ def test_all_come_in_their_order_and_few_before_they_are_asked_for() -> None:
         made.append(1)
         return next(numbers, None)
 
-    taken = made_ahead(make, 3)
+    taken = prefetched(make, 3)
     assert next(taken) == 0
     time.sleep(0.2)
     assert len(made) <= 4
@@ -84,7 +84,7 @@ def test_what_is_raised_in_the_thread_is_raised_where_it_is_waited_for() -> None
             raise OSError("unplugged")
         return item
 
-    taken = made_ahead(make, 3)
+    taken = prefetched(make, 3)
     assert [next(taken), next(taken)] == [1, 2]
     with pytest.raises(OSError, match="unplugged"):
         next(taken)

@@ -18,7 +18,7 @@ from vggtgeo.solvers.conjugate_gradients import (
     BlockJacobi,
     ConjugateGradients,
 )
-from vggtgeo.solvers.flat_directions import flat_stiffness
+from vggtgeo.solvers.gauge import flat_stiffness
 from vggtgeo.solvers.kernels import Square
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky

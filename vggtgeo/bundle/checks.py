@@ -17,11 +17,11 @@ import numpy as np
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.padding import COUNTED, PaddedSize
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.landmark import DepthPrior, SlotTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.measured_pose import UNIT
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, IntrinsicsPrior, NodeTerm
-from vggtgeo.bundle.terms.points_and_lines import LineTerm, PointTerm
+from vggtgeo.bundle.terms.reprojection import LineTerm, PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.io.argument_checks import check_kind, real_numbers
 from vggtgeo.io.errors import InputError

@@ -28,9 +28,9 @@ from vggtgeo.bundle.linearise import free_coordinates
 from vggtgeo.bundle.objective import Edge, cameras_of, edge_views, prepared, prepared_energy
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residual_values import count_rows, term_residuals, used_slots
-from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.node import NodeTerm, node_derivatives
-from vggtgeo.bundle.terms.points_and_lines import ImageTerm
+from vggtgeo.bundle.terms.reprojection import ImageTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import lie
 from vggtgeo.io.errors import InputError

@@ -1,10 +1,10 @@
 """Normal equations, gradient and exact Hessian of any sum of terms, in the arrow's shape.
 
-One pass over the edges, sorted by row: every edge term gives columns `[6 + c + 2, m p]` (see `terms/edge.py`). Their
-Gram matrix is kept in relative coordinates. Their products with the depth column are added in place to the row's cross
-terms: relative pose and target camera in separate rows for each edge, the host camera (or the shared one) in rows that
-all edges of the row add to. Slot terms are on the diagonal of the landmarks, terms on poses and pairs become blocks,
-camera and dense terms one small matrix (layout chosen by measurement on CPU, see `benchmarks/solver.py`).
+One pass over the edges, sorted by row: every edge term gives columns `[6 + c + 2, m p]` (`terms/landmark_edge.py`).
+Their Gram matrix is kept in relative coordinates. Their products with the depth column are added in place to the row's
+cross terms: relative pose and target camera in separate rows for each edge, the host camera (or the shared one) in rows
+that all edges of the row add to. Slot terms are on the diagonal of the landmarks, terms on poses and pairs become
+blocks, camera and dense terms one small matrix (layout chosen by measurement on CPU, see `benchmarks/solver.py`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtgeo.bundle.objective import Edge, SeenAlong, cameras_of, edge_views, pixel_observations
 from vggtgeo.bundle.problem import MAX_INVERSE_DEPTH, MIN_INVERSE_DEPTH, Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, products
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm, EdgeView, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
 from vggtgeo.geometry import lie
 from vggtgeo.solvers.arrow import (

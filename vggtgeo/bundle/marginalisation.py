@@ -33,8 +33,8 @@ from vggtgeo.bundle.diagnosis import check_linearisation, is_finite, nan_unless_
 from vggtgeo.bundle.linearise import free_coordinates, linearise
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.landmark import HostPixel, SlotTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float, Int
 from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
 from vggtgeo.bundle.checks import check_pair
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm, EdgeView, pinhole_parameters
 from vggtgeo.bundle.terms.landmark import HostPixel, SlotTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm, EdgeView, pinhole_parameters
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm, node_residuals
 from vggtgeo.bundle.terms.term import AbstractTerm, robust_energy
 from vggtgeo.geometry import lie

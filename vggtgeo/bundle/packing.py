@@ -43,10 +43,10 @@ from vggtgeo.bundle.padding import (
     rows_of_keyframes,
 )
 from vggtgeo.bundle.problem import Edges, Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.landmark import DepthPrior, HostPixel, SlotTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.node import DenseTerm, IntrinsicsPrior
-from vggtgeo.bundle.terms.points_and_lines import LineTerm, PointTerm
+from vggtgeo.bundle.terms.reprojection import LineTerm, PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.io.argument_checks import check_kind, real_numbers

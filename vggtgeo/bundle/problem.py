@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtgeo.bundle.terms.edge import EdgeTerm
 from vggtgeo.bundle.terms.landmark import DepthPrior, HostPixel, SlotTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, IntrinsicsPrior, NodeTerm
-from vggtgeo.bundle.terms.points_and_lines import LineTerm, PointTerm
+from vggtgeo.bundle.terms.reprojection import LineTerm, PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import AbstractCamera, Pinhole, SharedFocal

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.bundle.checks import check_kinds, check_pair
 from vggtgeo.bundle.objective import Edge, edge_views, prepared, residuals_without_edges
 from vggtgeo.bundle.problem import Problem, Readable, State
-from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.node import DenseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.compilation.program_cache import CachedProgram

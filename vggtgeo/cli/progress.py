@@ -21,7 +21,7 @@ from vggtgeo.io.errors import one_line
 from vggtgeo.results.result import Result
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.verdict.verdict import Verdict
+from vggtgeo.slam.verdict.findings import Verdict
 
 LOG_INTERVAL = 20.0
 """Seconds between two log lines."""

@@ -23,7 +23,7 @@ from vggtgeo.slam.callback import WindowRecord
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.verdict.verdict import Verdict
+from vggtgeo.slam.verdict.findings import Verdict
 
 SAMPLES = 4
 """Keyframes whose image, depth and confidence are shown."""

@@ -32,7 +32,7 @@ from vggtgeo.slam.callback import WindowRecord
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
-from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
+from vggtgeo.slam.verdict.corner_recorder import FrameCorners
 
 SHARE = 0.025
 """Maximum share of a run's time for checkpoints."""
@@ -114,7 +114,7 @@ class RunSoFar:
             vars(refusals[role]).update(vars(Refusals(*counts)))
 
 
-KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, FrameEvidence, WindowRecord)
+KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, FrameCorners, WindowRecord)
 CHECKPOINT = Format("checkpoint", VERSION, by_name(KEPT_CLASSES))
 
 

@@ -36,16 +36,16 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.compile_ahead import CompileAhead
 from vggtgeo.slam.known_map import entered
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.recorded_prior import prior_summary
+from vggtgeo.slam.pose_prior import prior_summary
 from vggtgeo.slam.run import check_run_arguments, default_roles, finish
 from vggtgeo.slam.self_calibration import CALIBRATION_FRAMES, MAX_PASSES, self_calibrate
 from vggtgeo.slam.settings.presets import Perception
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
+from vggtgeo.slam.verdict.corner_recorder import CornerRecorder
+from vggtgeo.slam.verdict.findings import Verdict
 from vggtgeo.slam.verdict.judge import check_input, check_refusals, judge_or_report
-from vggtgeo.slam.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def reconstruct(
         before = load_checkpoint(source.resumable(options.checkpoints), identity)
         # Corners for the verdict are undistorted by the known map's camera, or later by the one of this run.
         evidence_camera = source.camera if first is None or first.camera.lens is None else source.camera.pinhole
-        windows, evidence, overlay = WindowRecorder(), EvidenceRecorder(evidence_camera), StaticOverlaySearch()
+        windows, evidence, overlay = WindowRecorder(), CornerRecorder(evidence_camera), StaticOverlaySearch()
         hooks = RunCallbacks((windows, evidence, overlay, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles, source.camera)
@@ -213,7 +213,7 @@ def _conclude(
     loop: TrackingLoop,
     options: RunOptions,
     facts: Mapping[str, Any],
-    recorders: tuple[WindowRecorder, EvidenceRecorder, StaticOverlaySearch],
+    recorders: tuple[WindowRecorder, CornerRecorder, StaticOverlaySearch],
 ) -> Result:
     """Build the dense map and, in a thread beside it, the verdict; then the summary."""
     source, hooks, before, (windows, evidence, overlay) = loop.source, loop.hooks, loop.before, recorders
@@ -320,7 +320,7 @@ def _without_overlay(
     selection: tuple[int, int | None, int],
     hooks: RunCallbacks,
     overlay: StaticOverlaySearch,
-    evidence: EvidenceRecorder,
+    evidence: CornerRecorder,
 ) -> Perception:
     """Search for a static overlay; mask it in perception and in the verdict's evidence."""
     hooks.each("on_stage", "searching for a static overlay in the images")

@@ -43,12 +43,12 @@ from vggtgeo.results.scene import depth_of_frames, write_scene
 from vggtgeo.results.summary import add_writing_time, compare_with_truth, read_summary, summarise
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty, frame_uncertainty
 from vggtgeo.slam.known_map import save_map
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.slam.verdict.corner_recorder import CornerTracks
+from vggtgeo.slam.verdict.findings import Verdict
 from vggtgeo.slam.verdict.judge import judge
-from vggtgeo.slam.verdict.verdict import Verdict
-from vggtgeo.slam.window_steps import merge_pending_window
 
 DepthChoice = bool | Literal["every"]
 """Which depth images to save: none, those of the keyframes, or those of every frame."""
@@ -115,7 +115,7 @@ class Result:
     def of(cls, slam: Slam, evidence: CornerTracks = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
         """Return the result of a state of `vggtgeo.run` or `vggtgeo.finish`.
 
-        evidence: frame data of an `EvidenceRecorder`; without it the verdict uses the state alone. truth: ground truth,
+        evidence: frame data of an `CornerRecorder`; without it the verdict uses the state alone. truth: ground truth,
         camera -> world. dense: source of the dense depth, as in `vggtgeo.RunOptions`.
         """
         check_kind("slam", slam, Slam, "a state of `vggtgeo.run`")

@@ -39,8 +39,8 @@ from vggtgeo.slam.perception.static_overlay import (
 )
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.state import Slam
+from vggtgeo.slam.verdict.findings import Finding
 from vggtgeo.slam.verdict.judge import check_static_overlay
-from vggtgeo.slam.verdict.verdict import Finding
 
 MIN_SIDE = 32
 """Pixels: the windows of features and of the image pyramid need as many."""

@@ -23,7 +23,7 @@ from vggtgeo.results.files import submap_file
 from vggtgeo.slam.global_map.pose_uncertainty import frame_uncertainty
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.state import Slam, submaps_by_size
-from vggtgeo.slam.verdict.verdict import Verdict
+from vggtgeo.slam.verdict.findings import Verdict
 
 
 def compare_with_truth(slam: Slam, truth: Trajectory | None) -> TrajectoryReport | None:

@@ -19,6 +19,7 @@ from vggtgeo.results.checkpoints import Checkpoints, CheckpointWriter, RunSoFar,
 from vggtgeo.results.source import Source
 from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.clock import Clock
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.perception.rgbd_alignment import compile_alignment
 from vggtgeo.slam.run import run_frames
 from vggtgeo.slam.settings.presets import Perception
@@ -26,7 +27,6 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracking_state import FramePose
 from vggtgeo.slam.window.sliding_window import warm_up
-from vggtgeo.slam.window_steps import merge_pending_window
 
 
 class PendingFrames:

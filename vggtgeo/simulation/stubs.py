@@ -261,7 +261,7 @@ class SimulatedVggt:
     Each view hangs on the earlier or later view with which it shares most (a tree of largest overlaps from the first
     view). The motion between the two has a normal error, per axis, of `rotation` (radians) and of `translation` times
     the distance moved plus `jitter` times the median depth; both grow by 1 / sqrt(overlap) and by 1 + weak w, w the
-    mean lack of texture. Errors add up along the tree. A view that shares less than `least_overlap` of its pixels with
+    mean lack of texture. Errors add up along the tree. A view that shares less than `min_overlap` of its pixels with
     all others is not found: a fast turn costs nothing as long as views overlap. The window's unit is the median depth
     of its first view, times a normal relative error `scale`. Depth has a smooth relative error sigma(u) =
     depth_error (1 + weak w(u)), `cycles` waves a picture, alike over `memory` seconds. Without given intrinsics the
@@ -279,7 +279,7 @@ class SimulatedVggt:
     cycles: float = 1.0
     memory: float = 2.0
     focal: float = 0.01
-    least_overlap: float = 0.10
+    min_overlap: float = 0.10
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
         """Return simulated geometry of `images`; the first camera is the world."""
@@ -315,7 +315,7 @@ class SimulatedVggt:
         found = np.zeros(count, bool)
         found[0] = True
         errors = rng.standard_normal((count, 6))
-        for view, parent, share in _tree(self._overlaps(indices), self.least_overlap):
+        for view, parent, share in _tree(self._overlaps(indices), self.min_overlap):
             motion = truth[view] @ np.linalg.inv(truth[parent])
             growth = (1 + self.weak * lacking[view]) / np.sqrt(share)
             step = self.translation * float(np.linalg.norm(motion[:3, 3])) + self.jitter * middle

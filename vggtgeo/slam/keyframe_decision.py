@@ -14,8 +14,16 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import SAMPLES, share_inside
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.relocalisation import close_loop_while_tracking, view_of
-from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_between, track
+from vggtgeo.slam.tracking.frame_tracking import (
+    FrameData,
+    MotionPrior,
+    TrackedFrame,
+    TrackingInput,
+    factor_between,
+    track,
+    view_of,
+)
+from vggtgeo.slam.tracking.relocalisation import close_loop_while_tracking
 
 MIN_OVERLAP, MAX_PARALLAX = 0.8, math.radians(10.0)
 """Least share of a keyframe's key points in the image, and largest angle between a point's rays, of a frame that needs
@@ -28,10 +36,10 @@ THIRD_VIEW = 0.25
 """Share of these limits at which a map gets its third keyframe."""
 
 
-def becomes_keyframe(slam: Slam, found: Track, settings: KeyframeSettings) -> bool:
+def becomes_keyframe(slam: Slam, found: TrackedFrame, settings: KeyframeSettings) -> bool:
     """Return whether a tracked frame needs a keyframe of its own (`needs_keyframe`); one placed by rays always does."""
-    evidence = found.evidence
-    return evidence.by_rays or needs_keyframe(slam, found.pose, found.keyframe, evidence.inliers, settings)
+    quality = found.quality
+    return quality.by_two_view or needs_keyframe(slam, found.pose, found.keyframe, quality.inliers, settings)
 
 
 def needs_keyframe(slam: Slam, pose: np.ndarray, keyframe: Keyframe, inliers: int, settings: KeyframeSettings) -> bool:
@@ -88,8 +96,8 @@ def nearest_keyframe(
 
 
 def track_by_old_keyframe(
-    slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings
-) -> tuple[Slam, Track]:
+    slam: Slam, data: FrameData, found: TrackedFrame, roles: Roles, settings: SlamSettings
+) -> tuple[Slam, TrackedFrame]:
     """Track a frame by an old keyframe of the same place, if it shows the frame as well as the current keyframe does.
 
     So the map grows with space, not with time. A relative-pose factor by this frame connects both keyframes. Without
@@ -102,7 +110,7 @@ def track_by_old_keyframe(
         prior = MotionPrior(found.pose, slam.tracker.velocity)
         given = TrackingInput(data, slam.intrinsics, roles, prior)
         again = track(given, near, view_of(near, slam.tracker, slam.intrinsics, roles))
-        if not (again.accepted and again.evidence.certain) or becomes_keyframe(slam, again, settings.keyframes):
+        if not (again.accepted and again.quality.certain) or becomes_keyframe(slam, again, settings.keyframes):
             again = None  # drift may have put another keyframe there
     if again is None:
         given = TrackingInput(data, slam.intrinsics, roles)
@@ -110,10 +118,12 @@ def track_by_old_keyframe(
     if (
         again is None
         or becomes_keyframe(slam, again, settings.keyframes)
-        or not again.evidence.shows_as_well(found.evidence)
+        or not again.quality.shows_as_well(found.quality)
     ):
         return slam, found
     near = again.keyframe
-    if any({tie.first, tie.second} == {found.keyframe.number, near.number} for tie in slam.map.odometry_factors):
+    if any(
+        {factor.first, factor.second} == {found.keyframe.number, near.number} for factor in slam.map.odometry_factors
+    ):
         return slam, again
-    return slam.with_factors(tie_between(found, again)), again
+    return slam.with_factors(factor_between(found, again)), again

@@ -22,9 +22,9 @@ from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatcher
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.state_file import STATE_CLASSES, VERSION, checked_state
-from vggtgeo.slam.window_steps import merge_pending_window
 
 MAP = Format("map", VERSION, by_name(STATE_CLASSES))
 MIN_REDESCRIBED = 0.2

@@ -10,16 +10,15 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import NoDepth
 from vggtgeo.models.roles import Features, GeometryResult, PointMatches, StartGuess
+from vggtgeo.slam.local_mapping import adjust_window, insert_keyframe
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH, longer
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.relocalisation import record_of
-from vggtgeo.slam.tracking.track import FrameData, TrackingInput, track
+from vggtgeo.slam.tracking.frame_tracking import FrameData, TrackingInput, record_of, track
 from vggtgeo.slam.tracking.tracking_state import MAX_UNPLACED, FramePose, UnplacedFrame, given_up
 from vggtgeo.slam.window.sliding_window import scale_anchor
-from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 MIN_SHARED = 100
 """Matches that a lost frame must share with the current one to start the map instead of the first keyframe:

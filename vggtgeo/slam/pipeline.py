@@ -15,6 +15,7 @@ from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.joining import join_submaps
 from vggtgeo.slam.keyframe_decision import becomes_keyframe, track_by_old_keyframe, view_change
+from vggtgeo.slam.local_mapping import adjust_window, begin_window, insert_keyframe, is_due, merge_pending_window
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.map_initialisation import (
     begin_again_with_depth,
@@ -23,33 +24,35 @@ from vggtgeo.slam.map_initialisation import (
 )
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
-from vggtgeo.slam.recorded_prior import RecordedPrior, recorded_prior
+from vggtgeo.slam.pose_prior import RecordedPrior, recorded_prior
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
 from vggtgeo.slam.sparse_map.map import Map, submap_of
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.evidence import Evidence
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
-from vggtgeo.slam.tracking.lost_tracking import begins_submap, place_waiting, wait
-from vggtgeo.slam.tracking.relocalisation import frame_data, record_of, relocalise, view_of
-from vggtgeo.slam.tracking.track import (
+from vggtgeo.slam.tracking.frame_tracking import (
     FrameData,
     MotionPrior,
-    Track,
+    TrackedFrame,
     TrackingInput,
+    factor_to,
+    frame_data,
     moved_with,
+    record_of,
     refined_by_map,
-    tie_to,
     track,
     track_by_map,
-    track_by_rays,
+    track_by_two_view,
     unless_contradicted,
+    view_of,
 )
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality
+from vggtgeo.slam.tracking.relocalisation import relocalise
 from vggtgeo.slam.tracking.tracking_state import FramePose
 from vggtgeo.slam.tracking.two_view_motion import usual_step
-from vggtgeo.slam.window_steps import adjust_window, begin_window, insert_keyframe, is_due, merge_pending_window
+from vggtgeo.slam.tracking.waiting_frames import begins_submap, place_waiting, wait
 
 NEIGHBOURS = 3
 """Keyframes before and after an old one that make up the window when the camera comes back to it."""
@@ -82,7 +85,7 @@ def step(
     slam, data, found = _track(slam, frame, description, recorded, roles, settings, clock)
     if found is None or not found.accepted:
         return _handle_lost_frame(
-            slam, data, Evidence() if found is None else found.evidence, recorded, roles, settings, clock
+            slam, data, TrackingQuality() if found is None else found.quality, recorded, roles, settings, clock
         )
     was_lost = bool(slam.tracker.lost)
     slam = _moved(slam, frame, found)
@@ -138,7 +141,7 @@ def _track(
     roles: Roles,
     settings: SlamSettings,
     clock: Clock,
-) -> tuple[Slam, FrameData, Track | None]:
+) -> tuple[Slam, FrameData, TrackedFrame | None]:
     """Track a frame in the map; return the state that the pose belongs to, the frame's data and the track.
 
     A pending window is taken up first where the frame has no pose, or becomes a keyframe.
@@ -168,11 +171,11 @@ def _track(
             if found.accepted:
                 found = unless_contradicted(found, given, newest, length)
             else:
-                found = track_by_rays(given, newest, length) or found
+                found = track_by_two_view(given, newest, length) or found
     return slam, data, found
 
 
-def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
+def _moved(slam: Slam, frame: Frame, found: TrackedFrame) -> Slam:
     """Set the motion to a tracked frame; it is unknown after tracking was lost."""
     if slam.tracker.lost:
         slam = _noted_found(slam, frame)
@@ -183,8 +186,8 @@ def _moved(slam: Slam, frame: Frame, found: Track) -> Slam:
 
 
 def _decide(
-    slam: Slam, data: FrameData, found: Track, roles: Roles, settings: SlamSettings, clock: Clock
-) -> tuple[Slam, Track, bool]:
+    slam: Slam, data: FrameData, found: TrackedFrame, roles: Roles, settings: SlamSettings, clock: Clock
+) -> tuple[Slam, TrackedFrame, bool]:
     """Decide whether a tracked frame becomes a keyframe.
 
     It does not where an old keyframe shows it as well; that one is then its keyframe.
@@ -196,19 +199,21 @@ def _decide(
     return slam, found, not settings.keyframes.localise_only and becomes_keyframe(slam, found, settings.keyframes)
 
 
-def _find(slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Roles, settings: SlamSettings) -> Track:
+def _find(
+    slam: Slam, data: FrameData, recorded: RecordedPrior | None, roles: Roles, settings: SlamSettings
+) -> TrackedFrame:
     """Track a frame against the reference, or against another keyframe that sees more of it."""
     prior = _prior(slam, data.frame, recorded)
     first = slam.tracker.reference[0] if slam.tracker.reference is not None else slam.window.members[-1]
     others = [number for number in reversed(slam.window.members) if number != first][:2]
     window = tuple(slam.keyframes[number] for number in (first, *others))
     given = TrackingInput(data, slam.intrinsics, roles, prior, window)
-    best: Track | None = None
+    best: TrackedFrame | None = None
     for keyframe in window:
         found = track(given, keyframe, view_of(keyframe, slam.tracker, slam.intrinsics, roles))
         if best is None or _rank(found) > _rank(best):
             best = found
-        if best.accepted and (best.evidence.inliers >= settings.keyframes.min_inliers or best.evidence.dense_strong):
+        if best.accepted and (best.quality.inliers >= settings.keyframes.min_inliers or best.quality.dense_strong):
             break
     assert best is not None
     # A frame that flow has placed is not described for the sake of points that other keyframes see, too.
@@ -235,14 +240,14 @@ def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameD
     return replace(data, find_lines=lambda: find_lines(data.frame.image, roles, settings))
 
 
-def _rank(found: Track) -> tuple[bool, int]:
-    return found.accepted, found.evidence.inliers
+def _rank(found: TrackedFrame) -> tuple[bool, int]:
+    return found.accepted, found.quality.inliers
 
 
 def _insert_and_adjust(
     slam: Slam,
     data: FrameData,
-    found: Track,
+    found: TrackedFrame,
     recorded: RecordedPrior | None,
     roles: Roles,
     settings: SlamSettings,
@@ -259,19 +264,19 @@ def _insert_and_adjust(
         )
     tracked = found.keyframe.number, found.relative
     record = FramePose(
-        *(frame.index, frame.timestamp, number, np.eye(4), True, found.evidence.inliers, found.evidence), tracked
+        *(frame.index, frame.timestamp, number, np.eye(4), True, found.quality.inliers, found.quality), tracked
     )
-    odometry = tie_to(found, number)
+    odometry = factor_to(found, number)
     if odometry.first not in slam.window.members:
         slam = _window_around(slam, odometry.first, settings)
     slam = replace(slam, tracker=replace(slam.tracker, reference=(number, data.view)))
 
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
-            measured = not found.evidence.by_rays
+            measured = not found.quality.by_two_view
             entered = insert_keyframe(slam, keyframe, roles, settings, tied_to=odometry.first, length_known=measured)
             entered = _with_odometry(entered, odometry)
-            entered = entered if recorded is None else recorded.with_tie(entered)
+            entered = entered if recorded is None else recorded.with_factor(entered)
             entered = constrain_rotation(entered, settings)
         with clock.measure("place frames" + own):
             entered = replace(entered, tracker=against_reference(entered.map, entered.tracker))
@@ -344,7 +349,7 @@ def _noted_found(slam: Slam, frame: Frame) -> Slam:
 def _handle_lost_frame(
     slam: Slam,
     data: FrameData,
-    evidence: Evidence,
+    quality: TrackingQuality,
     recorded: RecordedPrior | None,
     roles: Roles,
     settings: SlamSettings,
@@ -362,7 +367,7 @@ def _handle_lost_frame(
         return _insert_and_adjust(slam, data, carried, recorded, roles, settings, clock)
     if slam.tracker.lost == 0:
         slam = slam.with_notes(f"tracking was lost at frame {frame.index} ({frame.name})")
-    lost = replace(slam, tracker=wait(slam.tracker, frame, features, evidence))
+    lost = replace(slam, tracker=wait(slam.tracker, frame, features, quality))
     if not begins_submap(lost.tracker, features, settings.keyframes):
         return lost
     note = (

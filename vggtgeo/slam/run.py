@@ -27,17 +27,17 @@ from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import ROUNDS, adjust_all
 from vggtgeo.slam.global_map.joining import join_at_end
 from vggtgeo.slam.global_map.loops import close_loops
-from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
+from vggtgeo.slam.global_map.lost_frame_recovery import place_lost_without_depth
 from vggtgeo.slam.known_map import entered
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pipeline import begin, step
-from vggtgeo.slam.recorded_prior import with_recorded_ties
+from vggtgeo.slam.pose_prior import with_recorded_factors
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer
 from vggtgeo.slam.state import Slam, submaps_by_size
-from vggtgeo.slam.threads import made_ahead
+from vggtgeo.slam.threads import prefetched
 from vggtgeo.slam.tracking.frame_refinement import against_nearest
-from vggtgeo.slam.window_steps import merge_pending_window
 
 AHEAD = 3
 """Frames that are prepared before they are needed."""
@@ -171,7 +171,7 @@ def finish(
         slam = replace(slam, tracker=against_nearest(slam.map, slam.tracker, slam.intrinsics, roles))
     with clock.measure("loops"):
         slam = place_lost_without_depth(join_at_end(slam, roles), roles, settings)
-        slam = with_recorded_ties(join_at_end(slam, roles), roles)
+        slam = with_recorded_factors(join_at_end(slam, roles), roles)
         slam = close_loops(slam, roles, settings)
     with clock.measure("global adjustment"):
         return adjust_all(slam, settings, rounds=rounds, uncertainty=uncertainty)
@@ -285,4 +285,4 @@ def _described(
             frame = next(frames, None)
         return None if frame is None else prepare(frame)
 
-    yield from made_ahead(read_and_prepare, AHEAD, waiting)
+    yield from prefetched(read_and_prepare, AHEAD, waiting)

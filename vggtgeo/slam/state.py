@@ -19,7 +19,7 @@ from vggtgeo.slam.window.sliding_window import Window
 
 @dataclass(frozen=True, eq=False)
 class PendingWindow:
-    """An adjustment of the window that runs beside tracking, see `window_steps.py`.
+    """An adjustment of the window that runs beside tracking, see `local_mapping.py`.
 
     due: number of frames at which the state takes its result. begun: the state that it started from. result: that
     state, adjusted.

@@ -17,7 +17,7 @@ from vggtgeo.bundle.terms.landmark import DepthPrior
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.measured_pose import BaselinePrior, RelativePose, RotationPrior, SurfaceAlignment
 from vggtgeo.bundle.terms.node import IntrinsicsPrior
-from vggtgeo.bundle.terms.points_and_lines import LineTerm, PointTerm
+from vggtgeo.bundle.terms.reprojection import LineTerm, PointTerm
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.errors import InputError
@@ -32,7 +32,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePo
 from vggtgeo.slam.sparse_map.keyframe import CompressedImage, Keyframe, KeyframeImages, Slots
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import PendingWindow, Slam
-from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality
 from vggtgeo.slam.tracking.tracking_state import FramePose, SecondMotion, SeenPoints, Tracker, UnplacedFrame
 from vggtgeo.slam.window.adjustment import Adjustment
 from vggtgeo.slam.window.sliding_window import Window, WindowPrior
@@ -41,7 +41,7 @@ from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 STATE_CLASSES: tuple[type, ...] = (
     *(Slam, Map, CameraEstimate, Readout, Camera, Keyframe, Slots, KeyframeImages, CompressedImage),
-    *(Tracker, FramePose, SecondMotion, SeenPoints, UnplacedFrame, Evidence, Window, WindowPrior, PendingWindow),
+    *(Tracker, FramePose, SecondMotion, SeenPoints, UnplacedFrame, TrackingQuality, Window, WindowPrior, PendingWindow),
     *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
     *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, MarginalPrior),
     *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
@@ -49,7 +49,7 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All classes that a file may have; a state with any other (descriptors of a user's matcher) is not written."""
-VERSION = 20
+VERSION = 21
 """Of the content: a file of another one is refused."""
 
 

@@ -35,7 +35,7 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item],
         return list(pool.map(function, todo))
 
 
-def made_ahead(
+def prefetched(
     make: Callable[[], _Result | None],
     count: int,
     waiting: Callable[[], AbstractContextManager[Any]] = nullcontext,

@@ -28,7 +28,7 @@ from vggtgeo.solvers.schur_complement import dense_schur_complement
 import vggtgeo as vg
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.objective import Edge, edge_views, prepared
-from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.measured_pose import quadratic
 from vggtgeo.bundle.terms.node import DenseTerm, node_derivatives, node_residuals
 from vggtgeo.geometry import lie

@@ -27,12 +27,12 @@ from vggtgeo.slam.camera.lens import RADIAL, FoundLens, can_undistort, find_lens
 from vggtgeo.slam.global_map import global_adjustment
 from vggtgeo.slam.global_map.global_adjustment import _apply_lens, undistorted
 from vggtgeo.slam.known_map import as_map, entered
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracking_state import SeenPoints
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.corner_recorder import FrameEvidence
+from vggtgeo.slam.verdict.corner_recorder import FrameCorners
 from vggtgeo.slam.verdict.judge import aligned
-from vggtgeo.slam.window_steps import merge_pending_window
 
 
 def packed(window: vg.data.SimulatedWindow, camera: vg.cameras.Intrinsics | None = None) -> tuple[Any, Any, Any]:
@@ -230,7 +230,7 @@ def test_corners_of_the_verdict_go_through_the_lens() -> None:
     slam = undistorted(run_of_room(), LENS)
     seen = np.array([[10.0, 10.0], [80.0, 58.0], [150.0, 100.0]], np.float32)
     nothing = np.zeros(3, np.float32)
-    noted = [FrameEvidence(r.frame, r.timestamp, np.arange(3), seen, nothing) for r in slam.frames]
+    noted = [FrameCorners(r.frame, r.timestamp, np.arange(3), seen, nothing) for r in slam.frames]
     given = aligned(slam, Claim.of(slam), noted)
     assert len(given) == len(slam.frames) > 1
     np.testing.assert_allclose(redrawn(given[0].pixels), seen, atol=1e-3)

@@ -25,7 +25,7 @@ from vggtgeo.slam.camera.rolling_shutter import (
     pair_to_global_shutter,
     problem_to_global_shutter,
 )
-from vggtgeo.slam.global_map.carried_poses import camera_motions, carried_poses, frame_interval
+from vggtgeo.slam.global_map.propagated_poses import camera_motions, frame_interval, propagated_poses
 from vggtgeo.slam.sparse_map.covisibility import Directed, directions
 
 WIDTH, HEIGHT = SIZE
@@ -182,7 +182,7 @@ def test_the_motion_of_a_keyframe_is_that_between_its_neighbours() -> None:
     """For the time between the frames beside a keyframe it leads from one pose to the other; oracle: these poses."""
     slam = recorded_run().slam
     motions = camera_motions(slam, len(slam.keyframes) + 2)
-    times, poses = carried_poses(slam)
+    times, poses = propagated_poses(slam)
     assert np.all(motions[len(slam.keyframes) :] == 0)
     assert frame_interval(slam) == pytest.approx(0.1)
     for keyframe, motion in zip(slam.keyframes, motions, strict=False):
@@ -201,7 +201,7 @@ def test_frames_far_apart_say_nothing_of_the_motion() -> None:
         camera_motions(slam, len(slam.keyframes)),
         camera_motions(changed(slam, "tracker", frames=paused), 3),
     )
-    times, poses = carried_poses(slam)
+    times, poses = propagated_poses(slam)
     there = lie.exp(jnp.asarray(short[1] * (times[second] - times[second - 1]))).as_matrix() @ poses[second - 1]
     assert np.allclose(there, poses[second], atol=1e-6)
     assert not np.allclose(short[1], whole[1], atol=1e-6)

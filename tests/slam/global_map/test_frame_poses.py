@@ -14,14 +14,14 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.camera.rolling_shutter import image_shift
 from vggtgeo.slam.global_map import frame_poses as module
-from vggtgeo.slam.global_map.carried_poses import carried_poses, frame_motions
 from vggtgeo.slam.global_map.frame_poses import MIN_POINTS, frame_poses
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.global_map.propagated_poses import frame_motions, propagated_poses
 from vggtgeo.slam.sparse_map.keyframe import Slots
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.following import MAX_KEPT, Located
+from vggtgeo.slam.tracking.flow_tracking import MAX_KEPT, Located
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality
 from vggtgeo.slam.tracking.tracking_state import FramePose, SeenPoints, Tracker
 
 POINTS = 60
@@ -44,7 +44,7 @@ def walked(rng: np.random.Generator, points: int = POINTS) -> tuple[Slam, np.nda
     pose = motion @ first.pose
     there = rigid.project(rigid.unproject(pixels, inverse, first.pose, INTRINSICS), pose, INTRINSICS)
     seen = SeenPoints(np.arange(points, dtype=np.int32), there.astype(np.float32))
-    unsure = Evidence(sigma_translation=0.3, sigma_rotation=0.1)
+    unsure = TrackingQuality(sigma_translation=0.3, sigma_rotation=0.1)
     records = (
         FramePose(0, 0.0, 0, np.eye(4), True, points),
         FramePose(1, 0.1, 0, exponential(AWAY) @ motion, True, points, unsure, seen=seen),
@@ -76,7 +76,7 @@ def test_a_frame_goes_to_where_the_finished_map_explains_what_it_shows() -> None
     noise[::6] += rng.uniform(3, 5, (POINTS // 6, 2))
     slam = with_second(slam, seen=replace(seen, pixels=seen.pixels + noise.astype(np.float32)))
     times, poses = frame_poses(slam)
-    before = carried_poses(slam)[1]
+    before = propagated_poses(slam)[1]
     assert np.linalg.norm(rigid.centre(before[1]) - rigid.centre(pose)) > 0.02
     assert off(slam, pose) < 0.003
     np.testing.assert_array_equal(poses[[0, 2]], before[[0, 2]])
@@ -88,7 +88,7 @@ def test_without_depth_what_tracking_knew_counts_less() -> None:
     than where depths were measured; oracle: the true pose, which the points show without noise.
     """
     slam, pose = walked(np.random.default_rng(0))
-    slam = with_second(slam, evidence=Evidence(sigma_translation=0.02, sigma_rotation=0.01))
+    slam = with_second(slam, quality=TrackingQuality(sigma_translation=0.02, sigma_rotation=0.01))
     left, measured = off(slam, pose), off(slam.with_map(metric=True), pose)
     assert 4 * left < measured
 
@@ -110,7 +110,7 @@ def test_without_enough_points_a_pose_stays() -> None:
     """One point too few, points whose depth is gone, or that came to lie behind the camera, a frame without a pose, a
     map that is not finished; and nothing known of its tracking: as it was carried, to the bit.
     """
-    slam = with_second(walked(np.random.default_rng(2), MIN_POINTS)[0], evidence=Evidence())
+    slam = with_second(walked(np.random.default_rng(2), MIN_POINTS)[0], quality=TrackingQuality())
     few = slam.frames[1].seen
     first = slam.keyframes[0]
     gone = replace(first, points=replace(first.points, inverse_depth=np.full(MIN_POINTS, np.nan)))
@@ -121,8 +121,8 @@ def test_without_enough_points_a_pose_stays() -> None:
         with_second(slam, tracked=False),
         slam.with_map(pose_sigma=None),
     ):
-        np.testing.assert_array_equal(frame_poses(wrong)[1], carried_poses(wrong)[1])
-    assert not np.array_equal(frame_poses(slam)[1], carried_poses(slam)[1])
+        np.testing.assert_array_equal(frame_poses(wrong)[1], propagated_poses(wrong)[1])
+    assert not np.array_equal(frame_poses(slam)[1], propagated_poses(slam)[1])
 
 
 @pytest.mark.parametrize("columns", [False, True])

@@ -51,8 +51,8 @@ def keyframe(number: int, right: float) -> Keyframe:
 
 def known(*keyframes: Keyframe, pairs: tuple[Pair, ...] = ()) -> Map:
     """A map in one piece: tracked motions join each keyframe to the one before."""
-    ties = tuple(MeasuredRelativePose(k, k + 1, np.eye(4), np.eye(6)) for k in range(len(keyframes) - 1))
-    return Map(False, keyframes, pairs, ties, roots=(0,))
+    factors = tuple(MeasuredRelativePose(k, k + 1, np.eye(4), np.eye(6)) for k in range(len(keyframes) - 1))
+    return Map(False, keyframes, pairs, factors, roots=(0,))
 
 
 def right_share(pair: Pair, keyframes: tuple[Keyframe, ...], within: float = 0.5) -> float:

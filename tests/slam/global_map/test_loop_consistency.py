@@ -13,14 +13,14 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
 from vggtgeo.slam.global_map.pose_graph import LOOP_GATE
+from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import loop_edges
-from vggtgeo.slam.tracking.odometry import Odometry
+from vggtgeo.slam.tracking.accumulated_odometry import Odometry
 from vggtgeo.slam.tracking.pose_fusion import with_systematic
-from vggtgeo.slam.window_steps import merge_pending_window
 
 corridor = benchmark("repeated_corridor")
 

@@ -121,7 +121,9 @@ def test_units_that_drift_are_brought_back(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "uncertain", [{"by_rays": True}, {"information": np.diag([1.0 / 0.15**2] * 3 + [1e6] * 3)}], ids=["guess", "noise"]
+    "uncertain",
+    [{"by_two_view": True}, {"information": np.diag([1.0 / 0.15**2] * 3 + [1e6] * 3)}],
+    ids=["guess", "noise"],
 )
 def test_an_uncertain_length_takes_the_jump_of_the_scale(uncertain: dict[str, Any]) -> None:
     """Where one of 59 motions had to guess its length, or measured it to half of itself only, three times too long, and

@@ -22,7 +22,7 @@ from vggtgeo.slam.global_map import global_adjustment, pose_uncertainty
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma, sparse_worst
 from vggtgeo.slam.settings.groups import WindowSettings
 from vggtgeo.slam.settings.slam_settings import SlamSettings
-from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.pose_acceptance import tangent
 
 loop = benchmark("simulated_loop")
 

@@ -19,7 +19,7 @@ from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.perception.static_overlay import StaticOverlay, find_static_overlay
 from vggtgeo.slam.pipeline import begin
 from vggtgeo.slam.run import run_frames
-from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
+from vggtgeo.slam.verdict.corner_recorder import CornerRecorder
 from vggtgeo.slam.verdict.judge import check_static_overlay
 
 WIDTH, HEIGHT = 320, 240
@@ -166,7 +166,7 @@ def test_nothing_is_looked_for_there(matcher: SiftMatcher | OrbMatcher) -> None:
     assert parts.without_segments(segments).endpoints[:, 0, 1].tolist() == [10.0]
     depth = parts.without_depth(np.ones((HEIGHT, WIDTH), np.float32))
     np.testing.assert_array_equal(np.isnan(depth), mask)
-    recorder = EvidenceRecorder(CAMERA)
+    recorder = CornerRecorder(CAMERA)
     recorder.leave_out(mask)
     for row, image in enumerate(moving(3, (3, 2))):
         recorder.add(vg.data.Frame(row, row / 15, image, None, str(row)))

@@ -50,8 +50,8 @@ def moved(slam: Slam, rows: list[int], away: np.ndarray, sigma: float) -> Slam:
     frames = list(slam.frames)
     for number, row in enumerate(rows):
         record, sign = frames[row], (-1) ** number
-        evidence = replace(record.evidence, sigma_translation=sigma, sigma_rotation=sigma / 2)
-        frames[row] = replace(record, relative=exponential(sign * away) @ record.relative, evidence=evidence)
+        quality = replace(record.quality, sigma_translation=sigma, sigma_rotation=sigma / 2)
+        frames[row] = replace(record, relative=exponential(sign * away) @ record.relative, quality=quality)
     return changed(slam, "tracker", frames=tuple(frames))
 
 
@@ -141,5 +141,5 @@ def test_in_a_larger_world_frames_are_placed_as_before(run: RecordedRun) -> None
 
 
 def _known_as_well(record: FramePose, ratio: float) -> FramePose:
-    evidence = replace(record.evidence, sigma_translation=ratio * record.evidence.sigma_translation)
-    return replace(record, evidence=evidence)
+    quality = replace(record.quality, sigma_translation=ratio * record.quality.sigma_translation)
+    return replace(record, quality=quality)

@@ -16,8 +16,8 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.covisibility import Directed, match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.tracking.evidence import MAX_SIGMA, tangent, worst_sigma
 from vggtgeo.slam.tracking.line_alignment import END_SIGMA, align_lines
+from vggtgeo.slam.tracking.pose_acceptance import MAX_SIGMA, tangent, worst_sigma
 from vggtgeo.slam.window.line_triangulation import with_segment_depths
 
 INTRINSICS = np.array([400.0, 400.0, 239.5, 179.5])

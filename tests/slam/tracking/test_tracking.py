@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from changed import changed
 from recorded_run import ROLES, SETTINGS, black, run_over
-from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, place_vector
+from vggtgeo.models.classical import NoDepth, PatchFlow, PnpGeometry, SiftMatcher, global_descriptor
 from vggtgeo.models.roles import DepthEstimate, Features, GeometryResult, PoseGuess, PoseQuery, Segments
 
 from vggtgeo.datasets.frame import Frame
@@ -30,8 +30,8 @@ from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking import relocalisation
-from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, track
+from vggtgeo.slam.tracking.frame_tracking import FrameData, MotionPrior, TrackedFrame, TrackingInput, track
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality
 
 SIZE = (320, 240)
 FREE_ROLES = replace(ROLES, depth=NoDepth())
@@ -160,7 +160,7 @@ def test_frames_are_described_where_flow_fails(room: Room) -> None:
     assert errors[0] < max(1.5 * errors[2], 0.01), f"{100 * errors[0]:.2f} cm by flow, {100 * errors[2]:.2f} without"
 
 
-def _by_lines(room: Room, keep: Callable[[np.ndarray], np.ndarray]) -> tuple[Track, np.ndarray]:
+def _by_lines(room: Room, keep: Callable[[np.ndarray], np.ndarray]) -> tuple[TrackedFrame, np.ndarray]:
     """Frame 2 against a keyframe at frame 0 by its segments alone, those that `keep` says of their ends [l, 2, 2], from
     4 cm and 2 degrees off; and the true pose.
     """
@@ -186,7 +186,7 @@ def test_lines_alone_hold_a_frame(room: Room) -> None:
     off = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(true))
     assert off < 0.01, f"{1000 * off:.1f} mm"
     assert rigid.angle_between(found.pose, true) < np.deg2rad(0.3)
-    assert found.accepted, found.evidence
+    assert found.accepted, found.quality
 
 
 def test_lines_that_leave_a_direction_open_are_not_believed(room: Room) -> None:
@@ -197,7 +197,7 @@ def test_lines_that_leave_a_direction_open_are_not_believed(room: Room) -> None:
         return along[:, 1] > 5 * along[:, 0]
 
     found, _ = _by_lines(room, upright)
-    assert not found.accepted, found.evidence
+    assert not found.accepted, found.quality
 
 
 class _Mirage:
@@ -233,22 +233,22 @@ def test_a_step_that_no_hand_makes_is_not_believed(room: Room) -> None:
 
 
 @pytest.mark.parametrize(
-    ("evidence", "believed"),
+    ("quality", "believed"),
     [
-        (Evidence(matches=55, inliers=28, correlation=0.38, surface=0.99, overlap=0.5, chi2=300.0), False),
-        (Evidence(matches=51, inliers=12, chi2=4.0), False),
-        (Evidence(matches=20, inliers=14, correlation=0.7, surface=0.95, overlap=0.6, chi2=4.0), True),
-        (Evidence(matches=0, inliers=0, correlation=0.75, surface=0.97, overlap=0.6, chi2=4.0), True),
-        (Evidence(matches=300, inliers=280, correlation=-0.1, surface=0.5, overlap=0.5, chi2=4.0), False),
-        (Evidence(matches=90, inliers=80, sigma_translation=0.4, chi2=4.0), False),
-        (Evidence(lines=20, visible_lines=35, sigma_translation=0.02, chi2=4.0), True),
-        (Evidence(lines=20, visible_lines=35, sigma_translation=0.4, chi2=4.0), False),
-        (Evidence(lines=20, visible_lines=70, sigma_translation=0.02, chi2=4.0), False),
+        (TrackingQuality(matches=55, inliers=28, correlation=0.38, surface=0.99, overlap=0.5, chi2=300.0), False),
+        (TrackingQuality(matches=51, inliers=12, chi2=4.0), False),
+        (TrackingQuality(matches=20, inliers=14, correlation=0.7, surface=0.95, overlap=0.6, chi2=4.0), True),
+        (TrackingQuality(matches=0, inliers=0, correlation=0.75, surface=0.97, overlap=0.6, chi2=4.0), True),
+        (TrackingQuality(matches=300, inliers=280, correlation=-0.1, surface=0.5, overlap=0.5, chi2=4.0), False),
+        (TrackingQuality(matches=90, inliers=80, sigma_translation=0.4, chi2=4.0), False),
+        (TrackingQuality(lines=20, visible_lines=35, sigma_translation=0.02, chi2=4.0), True),
+        (TrackingQuality(lines=20, visible_lines=35, sigma_translation=0.4, chi2=4.0), False),
+        (TrackingQuality(lines=20, visible_lines=70, sigma_translation=0.02, chi2=4.0), False),
     ],
 )
-def test_what_is_believed(evidence: Evidence, believed: bool) -> None:
+def test_what_is_believed(quality: TrackingQuality, believed: bool) -> None:
     """Two witnesses or one beyond doubt; oracle: cases measured on real pairs of frames, right and wrong."""
-    assert evidence.accepted is believed
+    assert quality.accepted is believed
 
 
 @pytest.mark.parametrize(
@@ -256,7 +256,7 @@ def test_what_is_believed(evidence: Evidence, believed: bool) -> None:
 )
 def test_an_old_keyframe_shows_a_frame_as_well_as_the_present_one(old: float, present: float, well: bool) -> None:
     """Half the correlation is not as well; nothing to compare is no reason against. Oracle: the definition."""
-    assert Evidence(correlation=old).shows_as_well(Evidence(correlation=present)) is well
+    assert TrackingQuality(correlation=old).shows_as_well(TrackingQuality(correlation=present)) is well
 
 
 def test_black_frames_are_lost_and_the_map_goes_on(room: Room) -> None:
@@ -308,7 +308,7 @@ def test_a_place_is_recognised(room: Room) -> None:
     """The vector of a frame is nearer to that of its neighbour than to that of any distant one; oracle: time."""
     frames, _, _ = room
     matcher = SiftMatcher(count=500)
-    places = [place_vector(matcher.describe(frames[i].image)) for i in (0, 1, 10, 16, 23)]
+    places = [global_descriptor(matcher.describe(frames[i].image)) for i in (0, 1, 10, 16, 23)]
     similarity = [float(places[0] @ place) for place in places[1:]]
     assert int(np.argmax(similarity)) == 0, similarity
 
@@ -336,10 +336,12 @@ def test_a_place_that_drift_has_moved_is_used_again(
     drift[:3, 3] = 0.3, 0.0, 0.26
     away[2, 3] = 2.0
     moved = (replace(k, pose=k.pose @ drift) if k.number < old else k for k in slam.keyframes)
-    crossing = lambda tie: min(tie.keyframes) < old <= max(tie.keyframes)
+    crossing = lambda factor: min(factor.keyframes) < old <= max(factor.keyframes)
     # As if the way to here had been long, no motion ties the two parts directly; or one that puts them elsewhere.
     cut = tuple(
-        replace(tie, pose=away @ tie.pose) for tie in slam.map.odometry_factors if crossing(tie) and contradicted
+        replace(factor, pose=away @ factor.pose)
+        for factor in slam.map.odometry_factors
+        if crossing(factor) and contradicted
     )
     kept = (*(factor for factor in slam.map.factors if not crossing(factor)), *cut)
     slam = changed(slam, "map", keyframes=tuple(moved), factors=kept)
@@ -348,7 +350,7 @@ def test_a_place_that_drift_has_moved_is_used_again(
         frame = replace(frames[row], index=index, timestamp=index / 10)
         slam = step(slam, frame, Description.of(ROLES.points.describe(frame.image)), ROLES, SETTINGS)
     back = [record for record in slam.frames[len(frames) :] if record.tracked and record.reference < old]
-    new = [tie for tie in slam.map.odometry_factors if crossing(tie) and tie not in cut]
+    new = [factor for factor in slam.map.odometry_factors if crossing(factor) and factor not in cut]
     if contradicted:
         assert not back
         assert not new

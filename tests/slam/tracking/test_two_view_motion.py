@@ -21,8 +21,8 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.run import default_roles
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
-from vggtgeo.slam.tracking.evidence import Evidence, tangent
-from vggtgeo.slam.tracking.track import FrameData, Track, TrackingInput, track, unless_contradicted
+from vggtgeo.slam.tracking.frame_tracking import FrameData, TrackedFrame, TrackingInput, track, unless_contradicted
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality, tangent
 from vggtgeo.slam.tracking.two_view_motion import two_view_motion, usual_step
 
 INTRINSICS = np.array([400.0, 400.0, 239.5, 134.5])
@@ -88,7 +88,7 @@ def test_a_motion_by_wrong_depths_is_replaced() -> None:
     opposite = exponential(np.array([-0.30, -0.05, -0.10, 0.02, 0.62, -0.03]))
     found = unless_contradicted(_tracked(keyframe, matches, opposite), _given(keyframe), keyframe, 0.3)
     assert np.degrees(rigid.angle_between(found.relative, TRUE)) < 0.3
-    assert found.evidence.by_rays
+    assert found.quality.by_two_view
 
     noisy = replace(
         matches, pixels_j=matches.pixels_j + np.random.default_rng(4).normal(0, 1.2, matches.pixels_j.shape)
@@ -107,9 +107,9 @@ def test_matches_are_kept_where_no_depth_is_known() -> None:
     assert found.matches is matches
 
 
-def _tracked(keyframe: Keyframe, matches: PointMatches, motion: np.ndarray) -> Track:
+def _tracked(keyframe: Keyframe, matches: PointMatches, motion: np.ndarray) -> TrackedFrame:
     information = 1e6 * np.eye(6)
-    return Track(keyframe, motion, information, Evidence(), GeometryResult.SUCCESS, matches=matches)
+    return TrackedFrame(keyframe, motion, information, TrackingQuality(), GeometryResult.SUCCESS, matches=matches)
 
 
 def _given(keyframe: Keyframe) -> TrackingInput:

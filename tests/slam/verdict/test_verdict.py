@@ -10,7 +10,7 @@ from changed import changed
 import vggtgeo as vg
 from vggtgeo.slam.state import stretches
 from vggtgeo.slam.verdict.claim import Claim
-from vggtgeo.slam.verdict.verdict import Finding, conclude
+from vggtgeo.slam.verdict.findings import Finding, conclude
 
 
 def test_the_verdict_covers_the_run_without_gaps() -> None:

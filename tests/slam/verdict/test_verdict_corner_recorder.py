@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
+from vggtgeo.slam.verdict.corner_recorder import CornerRecorder
 
 
 def test_the_recorder_follows_a_real_picture() -> None:
@@ -63,15 +63,15 @@ def test_corners_are_followed_through_a_fast_turn() -> None:
     assert right.mean() > 0.8, f"{right.mean():.0%} of the tracks are right"
 
 
-def recorded(frames: list[Frame]) -> EvidenceRecorder:
+def recorded(frames: list[Frame]) -> CornerRecorder:
     """The evidence of frames of the recorded run."""
-    recorder = EvidenceRecorder(recorded_run().sequence.camera)
+    recorder = CornerRecorder(recorded_run().sequence.camera)
     for frame in frames:
         recorder.add(frame)
     return recorder
 
 
-def off_truth(recorder: EvidenceRecorder, later: int) -> np.ndarray:
+def off_truth(recorder: CornerRecorder, later: int) -> np.ndarray:
     """Pixels by which the first frame's corners are not where the true poses carry them in a later one."""
     run = recorded_run()
     first, last = recorder.frames[0], recorder.frames[later]
@@ -85,7 +85,7 @@ def off_truth(recorder: EvidenceRecorder, later: int) -> np.ndarray:
 def test_the_recorder_takes_what_there_is() -> None:
     """Black frames, frames without depth and a distorted lens leave evidence, and no error."""
     frame = recorded_run().frames[0]
-    recorder = EvidenceRecorder(Camera(recorded_run().sequence.camera.intrinsics, 320, 240, (-0.2, 0.0, 0.0, 0.0)))
+    recorder = CornerRecorder(Camera(recorded_run().sequence.camera.intrinsics, 320, 240, (-0.2, 0.0, 0.0, 0.0)))
     recorder.add(replace(frame, image=np.zeros_like(frame.image)))
     recorder.add(replace(frame, depth=None))
     recorder.add(replace(frame, depth=np.full_like(frame.depth, np.nan)))

@@ -18,10 +18,10 @@ from vggtgeo.slam.verdict import judge as judge_module
 from vggtgeo.slam.verdict.claim import WINDOW, Claim, linked, thinned, tracks_of_windows, windows
 from vggtgeo.slam.verdict.corner_adjustment import Noise, solve, start_of
 from vggtgeo.slam.verdict.corner_findings import findings
-from vggtgeo.slam.verdict.corner_recorder import EvidenceRecorder
+from vggtgeo.slam.verdict.corner_recorder import CornerRecorder
+from vggtgeo.slam.verdict.findings import Finding, Verdict, conclude
 from vggtgeo.slam.verdict.judge import check_unit, check_unseen, judge, judge_or_report
 from vggtgeo.slam.verdict.thresholds import MAX_REASONS
-from vggtgeo.slam.verdict.verdict import Finding, Verdict, conclude
 
 
 def _turn(degrees: float) -> np.ndarray:
@@ -33,7 +33,7 @@ def _turn(degrees: float) -> np.ndarray:
 def test_a_run_is_judged_as_a_whole() -> None:
     """A simulated run is good; with its keyframes turned it is not, and JSON keeps the verdict. Oracle: the turn."""
     run = recorded_run()
-    recorder = EvidenceRecorder(run.sequence.camera)
+    recorder = CornerRecorder(run.sequence.camera)
     for frame in run.frames:
         recorder.add(frame)
     assert judge(run.slam, recorder.frames).level == "good"

@@ -32,7 +32,7 @@ from vggtgeo.geometry.camera_models import Pinhole
 from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.covariance import covariance
-from vggtgeo.solvers.flat_directions import flat_stiffness
+from vggtgeo.solvers.gauge import flat_stiffness
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 DENSE_KEYFRAMES = 600

@@ -14,12 +14,12 @@ from vggtgeo.slam.callback import Callback
 from vggtgeo.slam.camera.pixel_aspect import aspect_prior
 from vggtgeo.slam.global_map.depth_alignment import align_pairs
 from vggtgeo.slam.global_map.global_adjustment import shares_focal
-from vggtgeo.slam.global_map.global_shape import (
+from vggtgeo.slam.global_map.padded_shapes import (
     EDGE_SHARES,
     MAX_DENSE,
     MAX_NEIGHBOURS,
     SMALL,
-    GlobalShape,
+    PaddedShape,
     global_solver,
     shape_for,
 )
@@ -48,7 +48,7 @@ class CompileAhead(Callback):
     def __init__(self, settings: SlamSettings) -> None:
         self._settings = settings
         self._total: int | None = None
-        self._asked: dict[GlobalShape, Future[None]] = {}
+        self._asked: dict[PaddedShape, Future[None]] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="compile")
 
     def on_begin(self, name: str, total: int | None) -> None:
@@ -69,7 +69,7 @@ class CompileAhead(Callback):
         if future is not None:
             wait([future])
 
-    def _shapes(self, slam: Slam, keyframes: int) -> list[GlobalShape]:
+    def _shapes(self, slam: Slam, keyframes: int) -> list[PaddedShape]:
         """Return the shapes of a map with so many keyframes: with as many edges for each as now, and without depth also
         with the further edges of guided matches.
         """
@@ -94,7 +94,7 @@ def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | 
 
 @in_double_precision
 def compile_global(
-    shape: GlobalShape, settings: SlamSettings, shared_focal: bool = False, *, metric: bool = True
+    shape: PaddedShape, settings: SlamSettings, shared_focal: bool = False, *, metric: bool = True
 ) -> None:
     """Compile the adjustment of maps of a shape and their uncertainties on a problem with one observation.
 

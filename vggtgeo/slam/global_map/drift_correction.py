@@ -25,7 +25,7 @@ from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion, submap_of
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.evidence import tangent
+from vggtgeo.slam.tracking.pose_acceptance import tangent
 from vggtgeo.slam.tracking.tracking_state import scaled_record
 
 MAX_LOOP_ERROR = 20.0
@@ -59,11 +59,13 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
 
     It is unchanged unless loops contradict it by more than its adjustment can correct.
     """
-    motions, closing = odometry(slam)
+    motions, closing = spanning_tree(slam)
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     drifted = [loop for loop in loops if not loop.agrees(slam)]
     broken = [
-        tie for tie in closing if squared_distance(tie, poses) > LOOP_GATE and _pixels(tie, slam) > MAX_LOOP_ERROR
+        factor
+        for factor in closing
+        if squared_distance(factor, poses) > LOOP_GATE and _pixels(factor, slam) > MAX_LOOP_ERROR
     ]
     if not drifted and not broken:
         return slam, list(loops)
@@ -87,20 +89,20 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     return _with_refused(moved.with_notes(note), len(loops) - len(accepted), len(loops)), accepted
 
 
-def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelativePose]]:
+def spanning_tree(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelativePose]]:
     """Return motions that make the map a tree, each keyframe after an earlier one, and all other tracked motions.
 
     A motion is that of the adjusted poses if they agree with the tracked one, else the tracked one.
     """
     tree: dict[int, MeasuredRelativePose] = {}
     others = []
-    for tie in slam.map.odometry_factors:
-        if tie.first < tie.second and tie.second not in tree and tie.second not in slam.map.roots:
-            tree[tie.second] = tie
+    for factor in slam.map.odometry_factors:
+        if factor.first < factor.second and factor.second not in tree and factor.second not in slam.map.roots:
+            tree[factor.second] = factor
         else:
-            others.append(tie)
+            others.append(factor)
     # Recorded motions are there where images agree with the recording, and drift less than tracked ones.
-    tree |= {tie.second: tie for tie in slam.map.recorded_factors if tie.second not in slam.map.roots}
+    tree |= {factor.second: factor for factor in slam.map.recorded_factors if factor.second not in slam.map.roots}
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
     between = lambda first, second: rigid.orthonormal(poses[second] @ rigid.invert(poses[first]))
     loose = np.diag(1.0 / np.repeat(UNTRACKED, 3) ** 2)
@@ -108,19 +110,19 @@ def odometry(slam: Slam) -> tuple[list[MeasuredRelativePose], list[MeasuredRelat
     matched = {pair.key for pair in slam.map.pairs if len(pair.points)}
     for number in range(1, len(slam.keyframes)):
         if number in tree:
-            tie = tree[number]
+            factor = tree[number]
             # Adjusted poses are more accurate than the tracked motion, unless an adjustment went wrong.
-            agrees = squared_distance(tie, poses) < LOOP_GATE
-            motions.append(replace(tie, pose=between(tie.first, tie.second)) if agrees else tie)
+            agrees = squared_distance(factor, poses) < LOOP_GATE
+            motions.append(replace(factor, pose=between(factor.first, factor.second)) if agrees else factor)
         elif (number - 1, number) in matched:
             motions.append(MeasuredRelativePose(number - 1, number, between(number - 1, number), loose))
     return motions, others
 
 
-def _pixels(tie: MeasuredRelativePose, slam: Slam) -> float:
+def _pixels(factor: MeasuredRelativePose, slam: Slam) -> float:
     """Return the image error of points at a usual distance for the error of a relative pose, pixels."""
-    first, second = (slam.keyframes[number].pose for number in tie.keyframes)
-    off = tangent(second @ rigid.invert(first) @ rigid.invert(tie.pose))
+    first, second = (slam.keyframes[number].pose for number in factor.keyframes)
+    off = tangent(second @ rigid.invert(first) @ rigid.invert(factor.pose))
     return float(slam.intrinsics[0] * (np.linalg.norm(off[:3]) / NOMINAL_DEPTH + np.linalg.norm(off[3:])))
 
 
@@ -146,9 +148,9 @@ def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[
     return solve_scales(len(slam.keyframes), motions, ratios)
 
 
-def _without(slam: Slam, ties: Sequence[MeasuredRelativePose]) -> Slam:
+def _without(slam: Slam, unwanted: Sequence[MeasuredRelativePose]) -> Slam:
     """Return the map without some of its tracked motions."""
-    gone = {id(tie) for tie in ties}
+    gone = {id(factor) for factor in unwanted}
     return slam.with_map(factors=tuple(factor for factor in slam.map.factors if id(factor) not in gone))
 
 

@@ -17,15 +17,15 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.robust import sigma_by_median
 from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
-from vggtgeo.slam.global_map.carried_poses import camera_motions, carried_poses, frame_motions
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
+from vggtgeo.slam.global_map.propagated_poses import camera_motions, frame_motions, propagated_poses
 from vggtgeo.slam.global_map.smooth_motion import smoothed
 from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
 from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.evidence import tangent
 from vggtgeo.slam.tracking.frame_refinement import tracked_information
+from vggtgeo.slam.tracking.pose_acceptance import tangent
 
 MIN_POINTS = 20
 """With fewer points the pose stays as tracked."""
@@ -56,13 +56,13 @@ def frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _frame_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
-    times, poses = carried_poses(slam)
+    times, poses = propagated_poses(slam)
     rows = [row for row, record in enumerate(slam.frames) if record.seen is not None and record.tracked]
     if not rows or not slam.map.finished:
         return times, poses
     # With metric depth the errors that frames share are in the tracked information already.
     as_one = 1.0 if slam.metric else SHARED_ERRORS
-    information = np.array([tracked_information(record.evidence) / as_one for record in slam.frames])
+    information = np.array([tracked_information(record.quality) / as_one for record in slam.frames])
     rolling = slam.camera.readout is not None
     motions = (camera_motions(slam, len(slam.keyframes)), frame_motions(slam)) if rolling else None
 

@@ -23,11 +23,11 @@ from vggtgeo.slam.camera.given_camera import (
 from vggtgeo.slam.camera.lens import FoundLens, can_undistort, composed, find_lens, undistorted_map, undistorted_pixels
 from vggtgeo.slam.camera.pixel_aspect import FoundAspect, are_square, aspect_prior, find_aspect
 from vggtgeo.slam.camera.rolling_shutter import FoundReadout, find_readout, problem_to_global_shutter
-from vggtgeo.slam.global_map.carried_poses import camera_motions, frame_interval
 from vggtgeo.slam.global_map.depth_alignment import Surface, align_pairs
-from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS, GlobalShape, global_solver, shape_of
 from vggtgeo.slam.global_map.guided_matches import guided_pairs
+from vggtgeo.slam.global_map.padded_shapes import MAX_NEIGHBOURS, PaddedShape, global_solver, shape_of
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
+from vggtgeo.slam.global_map.propagated_poses import camera_motions, frame_interval
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.factors import Factor, factor_terms
@@ -124,7 +124,7 @@ class _SharedByRounds:
     edges: list[Directed]
     surfaces: list[Surface]
     camera: CameraPrior
-    shape: GlobalShape
+    shape: PaddedShape
 
     @classmethod
     def of(cls, slam: Slam, settings: SlamSettings) -> _SharedByRounds:
@@ -297,7 +297,7 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
 
 
 def _terms(
-    slam: Slam, factors: Sequence[Factor], surfaces: list[Surface], shape: GlobalShape, settings: SlamSettings
+    slam: Slam, factors: Sequence[Factor], surfaces: list[Surface], shape: PaddedShape, settings: SlamSettings
 ) -> tuple[AbstractTerm, ...]:
     """Return the terms on poses besides matches: factors of the run, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}

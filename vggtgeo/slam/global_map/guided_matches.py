@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from vggtgeo.models.classical import PatchAlignment, can_search, search_near, search_tree
 from vggtgeo.models.roles import PointMatches
-from vggtgeo.slam.global_map.global_shape import MAX_NEIGHBOURS
+from vggtgeo.slam.global_map.padded_shapes import MAX_NEIGHBOURS
 from vggtgeo.slam.sparse_map.covisibility import (
     MIN_MATCHES,
     MIN_OVERLAP,
@@ -27,7 +27,7 @@ from vggtgeo.slam.sparse_map.covisibility import (
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map, submap_of
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.map_points import MAX_TURN, expected_pixels
+from vggtgeo.slam.tracking.local_map_tracking import MAX_TURN, expected_pixels
 
 RADIUS = 0.008
 """Largest distance of a match from its prediction, in focal lengths: errors of a map are angles, and in a small image a

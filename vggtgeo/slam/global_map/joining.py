@@ -31,8 +31,8 @@ from vggtgeo.slam.sparse_map.map import (
     submap_of,
 )
 from vggtgeo.slam.state import Slam, submaps_by_size
+from vggtgeo.slam.tracking.frame_tracking import FrameData, TrackingInput
 from vggtgeo.slam.tracking.relocalisation import relocalise
-from vggtgeo.slam.tracking.track import FrameData, TrackingInput
 from vggtgeo.slam.tracking.tracking_state import scaled_record
 from vggtgeo.slam.window.sliding_window import WindowPrior
 
@@ -67,10 +67,10 @@ def join_submaps(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettin
     motion = rigid.invert(slam.keyframes[-1].pose) @ place.pose
     prior = None if slam.window.prior is None else _moved_prior(slam.window.prior, motion)
     joined = moved_submap(slam, numbers, motion).with_window(held=fixed, prior=prior, solved=None)
-    tie = MeasuredRelativePose(old.number, new.number, place.relative, place.information)
+    factor = MeasuredRelativePose(old.number, new.number, place.relative, place.information)
     began = slam.keyframes[min(numbers)].frame
     note = f"the submap that began at frame {began} is joined to the one before at frame {new.frame}"
-    return joined.with_factors(tie).with_notes(note)
+    return joined.with_factors(factor).with_notes(note)
 
 
 def scale_submap(slam: Slam, ratio: float, numbers: Collection[int]) -> Slam:
@@ -149,11 +149,12 @@ def _look_alike(
     keyframes: tuple[Keyframe, ...], main: tuple[int, ...], other: tuple[int, ...]
 ) -> list[tuple[int, int]]:
     """Return pairs of keyframes of two submaps, the earlier first, that look most alike."""
-    place = {keyframe.number: keyframe.place for keyframe in keyframes if keyframe.place is not None}
-    ours, theirs = ([number for number in numbers if number in place] for numbers in (main, other))
+    descriptors = ((keyframe.number, keyframe.global_descriptor) for keyframe in keyframes)
+    known = {number: descriptor for number, descriptor in descriptors if descriptor is not None}
+    ours, theirs = ([number for number in numbers if number in known] for numbers in (main, other))
     if not ours or not theirs:
         return []
-    similarity = np.stack([place[number] for number in theirs]) @ np.stack([place[number] for number in ours]).T
+    similarity = np.stack([known[number] for number in theirs]) @ np.stack([known[number] for number in ours]).T
     best = np.argsort(-similarity, axis=1, kind="stable")[:, :TRIED]
     both = ((theirs[row], ours[column]) for row in range(len(theirs)) for column in best[row])
     return sorted({(min(pair), max(pair)) for pair in both})

@@ -25,7 +25,7 @@ from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.tracking.odometry import Odometry, squared_distance
+from vggtgeo.slam.tracking.accumulated_odometry import Odometry, squared_distance
 
 NEAR = 8
 """Largest distance of the ends of two loops of one place, keyframes: the ways between are short, so that their drift is

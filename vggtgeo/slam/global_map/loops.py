@@ -20,7 +20,7 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import measured_ratio, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.track import PIXEL_SIGMA
+from vggtgeo.slam.tracking.frame_tracking import PIXEL_SIGMA
 
 MIN_VISIBLE, MAX_TURN = 0.4, np.deg2rad(40)
 """Share of one keyframe's points inside the other's image, and angle between them, for a pair to be proposed."""
@@ -94,12 +94,13 @@ def _by_appearance(slam: Slam, settings: SlamSettings, known: set[tuple[int, int
 
     This threshold adapts to the image: a wall resembles any wall, a shelf no other.
     """
-    place = {keyframe.number: keyframe.place for keyframe in slam.keyframes if keyframe.place is not None}
-    if not place:
+    every = ((keyframe.number, keyframe.global_descriptor) for keyframe in slam.keyframes)
+    known_descriptors = {number: descriptor for number, descriptor in every if descriptor is not None}
+    if not known_descriptors:
         return []
-    numbers, places = np.array(list(place)), np.stack(list(place.values()))
+    numbers, descriptors = np.array(list(known_descriptors)), np.stack(list(known_descriptors.values()))
     similarity = np.full((len(slam.keyframes),) * 2, -np.inf)
-    similarity[np.ix_(numbers, numbers)] = places @ places.T
+    similarity[np.ix_(numbers, numbers)] = descriptors @ descriptors.T
     neighbours: dict[int, list[int]] = {}
     for first, second in known:
         neighbours.setdefault(second, []).append(first)

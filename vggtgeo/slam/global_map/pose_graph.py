@@ -37,9 +37,9 @@ from vggtgeo.bundle.terms.measured_pose import RelativePose
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import POSE_GATE
-from vggtgeo.slam.global_map.global_shape import padded_count
-from vggtgeo.slam.sparse_map.factors import TIE_WIDTH, MeasuredRelativePose, relative_pose_rows
-from vggtgeo.slam.tracking.evidence import STEP_GROWTH, tangent
+from vggtgeo.slam.global_map.padded_shapes import padded_count
+from vggtgeo.slam.sparse_map.factors import FACTOR_WIDTH, MeasuredRelativePose, relative_pose_rows
+from vggtgeo.slam.tracking.pose_acceptance import STEP_GROWTH, tangent
 from vggtgeo.solvers.kernels import Cauchy
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced_solvers import DenseCholesky
@@ -101,7 +101,7 @@ def solve_pose_graph(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
     motions = RelativePose(**relative_pose_rows(loosened, count + padding))
     # Rounded up to a multiple, so that graphs of about the same size share a compiled program.
     room = -(-max(len(graph.loops), 1) // ROOM) * ROOM
-    loops = LoopClosure(**relative_pose_rows(graph.loops, room), kernel=Cauchy(jnp.asarray(TIE_WIDTH)))
+    loops = LoopClosure(**relative_pose_rows(graph.loops, room), kernel=Cauchy(jnp.asarray(FACTOR_WIDTH)))
     problem, initial, _ = pack(
         _no_observations(),
         rigid.to_quaternion(np.concatenate([graph.poses, np.tile(np.eye(4), (padding, 1, 1))])),
@@ -221,7 +221,7 @@ def scale_drift(motion: MeasuredRelativePose) -> float:
     Points triangulated by the motion inherit the relative error of its length.
     """
     length = float(np.linalg.norm(motion.pose[:3, 3]))
-    if motion.by_rays or length == 0:
+    if motion.by_two_view or length == 0:
         return GUESSED
     along = motion.pose[:3, 3] / length
     sigma = float(np.sqrt(along @ np.linalg.inv(motion.information)[:3, :3] @ along))

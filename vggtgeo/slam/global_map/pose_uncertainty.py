@@ -74,7 +74,7 @@ def frame_uncertainty(slam: Slam, submap: int = 0) -> PoseUncertainty | None:
     own = set(submaps_by_size(slam)[submap])
     records = [record for record in slam.frames if record.tracked and record.reference in own]
     sigma = slam.map.pose_sigma[[record.reference for record in records]].reshape(-1, 2)
-    tracked = [(r.evidence.sigma_translation, r.evidence.sigma_rotation) for r in records]
+    tracked = [(r.quality.sigma_translation, r.quality.sigma_rotation) for r in records]
     # The pose of a keyframe's own frame is the keyframe's: only other frames add the error of their tracking.
     apart = [not np.array_equal(record.relative, np.eye(4)) for record in records]
     added = np.where(np.array(apart, bool)[:, None], np.array(tracked).reshape(-1, 2), 0.0)

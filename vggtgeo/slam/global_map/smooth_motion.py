@@ -21,7 +21,7 @@ from scipy.sparse.linalg import spsolve
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import sigma_by_median
-from vggtgeo.slam.global_map.carried_poses import MAX_GAP
+from vggtgeo.slam.global_map.propagated_poses import MAX_GAP
 
 ROUNDS, WIDTH = 10, 3.0
 """Reweighted solutions, and the width of the kernel in standard deviations."""

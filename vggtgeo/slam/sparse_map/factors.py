@@ -49,16 +49,16 @@ class MeasuredBaseline:
 class MeasuredRelativePose:
     """Camera `first` -> camera `second`, float64 [4, 4], and its information float64 [6, 6], translation first.
 
-    by_rays: whether no known depth was used, so that the length, and the scale after it, is weakly constrained, see
+    by_two_view: whether no known depth was used, so that the length, and the scale after it, is weakly constrained, see
     `tracking/two_view_motion.py`. recorded: whether no image was used: a motion from recorded poses
-    (`tracking/recorded_motion.py`).
+    (`slam/pose_prior_check.py`).
     """
 
     first: int
     second: int
     pose: np.ndarray
     information: np.ndarray
-    by_rays: bool = False
+    by_two_view: bool = False
     recorded: bool = False
 
     @property
@@ -84,7 +84,7 @@ FREE_LENGTH = 0.1
 """Relative standard deviation of the length of a tracked motion without measured depth: that of the scale drift from
 one keyframe to the next, 0.01 to 0.09 on real clips. A smaller one would count the current scale as measured repeatedly
 and preserve its drift; a much larger one leaves the scale unconstrained in pure rotation."""
-TIE_WIDTH = 12.6**0.5
+FACTOR_WIDTH = 12.6**0.5
 """Mahalanobis distance at which a relative-pose factor has half its weight, so that a false loop is rejected: the 95 %
 level of 6 degrees of freedom."""
 
@@ -167,7 +167,7 @@ def _baselines(own: Sequence[MeasuredBaseline], places: Mapping[int, int], room:
 
 def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, int], room: int) -> RelativePose:
     placed = [replace(factor, first=places[factor.first], second=places[factor.second]) for factor in own]
-    return RelativePose(**relative_pose_rows(placed, room), kernel=Cauchy(jnp.asarray(TIE_WIDTH)))
+    return RelativePose(**relative_pose_rows(placed, room), kernel=Cauchy(jnp.asarray(FACTOR_WIDTH)))
 
 
 def relative_pose_rows(own: Sequence[MeasuredRelativePose], room: int | None = None) -> dict[str, Any]:

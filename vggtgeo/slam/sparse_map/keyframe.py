@@ -18,7 +18,7 @@ import numpy as np
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.geometry import pinhole
-from vggtgeo.models.classical import place_vector, sample_segments, segment_depths
+from vggtgeo.models.classical import global_descriptor, sample_segments, segment_depths
 from vggtgeo.models.roles import DepthEstimate, Features, LineFeatures, Segments
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answer, check_size
@@ -136,8 +136,8 @@ class Keyframe:
 
     Fields: number, counted from 0 in the run; frame; timestamp, s; pose float64 [4, 4], world -> camera; its images;
     the results of the perception roles; the slots of its points and line samples (`sample_segment` int [m]: segment of
-    each sample); place, its global descriptor, float32 [n] of unit length, None = unknown; recorded: of a keyframe of a
-    known map its time stamp in the run that made it, s, by the clock of that run.
+    each sample); global_descriptor: float32 [n] of unit length, None = unknown; recorded: of a keyframe of a known map
+    its time stamp in the run that made it, s, by the clock of that run.
 
     All keyframes stay in memory during the run, so images are compressed: see `KeyframeImages`.
 
@@ -154,7 +154,7 @@ class Keyframe:
     points: Slots
     samples: Slots
     sample_segment: np.ndarray
-    place: np.ndarray | None = None
+    global_descriptor: np.ndarray | None = None
     recorded: float | None = None
 
     @property
@@ -236,7 +236,7 @@ def make_keyframe(
         points=_slots_at(features.pixels, depth, confidence),
         samples=_with_line_depth(samples, along_segments(1.0 / line_depths, segment, fraction)),
         sample_segment=segment,
-        place=place_vector(features),
+        global_descriptor=global_descriptor(features),
     )
 
 

@@ -96,7 +96,7 @@ def loop_edges(known: Map, apart: int) -> tuple[tuple[int, int], ...]:
 
     They have matches or a measured relative pose, and are at least `apart` keyframes (those of a window) apart.
     """
-    ends = [tie.keyframes for tie in known.odometry_factors]
+    ends = [factor.keyframes for factor in known.odometry_factors]
     ends += [pair.key for pair in known.pairs if len(pair.points) + len(pair.lines)]
     return tuple(sorted({(first, second) for first, second in ends if abs(second - first) >= apart}))
 

@@ -3,7 +3,7 @@
 A frame that is tracked against one keyframe has the error of one alignment, and the path has a step where the reference
 changes. So the last frames before that are also aligned to the next keyframe while their images are in memory. Both
 relative motions are kept as measured. The pose of the frame is their mean by information, each with its systematic
-error, which grows with the distance from its keyframe (`fusion.with_systematic`). So the path changes smoothly from one
+error, which grows with the distance from its keyframe (`pose_fusion.with_systematic`). So the path changes smoothly from one
 keyframe to the next, wherever adjustments move them. Keyframes are not changed.
 """
 
@@ -23,10 +23,10 @@ from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.evidence import MIN_CORRELATION, MIN_OVERLAP, MIN_SURFACE, Evidence
-from vggtgeo.slam.tracking.map_points import in_view
+from vggtgeo.slam.tracking.frame_tracking import view_of
+from vggtgeo.slam.tracking.local_map_tracking import in_view
+from vggtgeo.slam.tracking.pose_acceptance import MIN_CORRELATION, MIN_OVERLAP, MIN_SURFACE, TrackingQuality
 from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE, with_systematic
-from vggtgeo.slam.tracking.relocalisation import view_of
 from vggtgeo.slam.tracking.tracking_state import FramePose, SecondMotion, Tracker, frame_pose
 
 FINEST = (4, 0, 0)
@@ -103,7 +103,7 @@ def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.nd
     records = [frames[row] for row in rows]
     seconds = [record.second for record in records if record.second is not None]
     placed = np.array([second.relative @ known.keyframes[second.keyframe].pose for second in seconds])
-    own = np.array([tracked_information(record.evidence) for record in records])
+    own = np.array([tracked_information(record.quality) for record in records])
     other = np.array([second.information for second in seconds])
     apart = placed @ rigid.invert(poses[rows])
     off = np.concatenate([apart[:, :3, 3], Rotation.from_matrix(apart[:, :3, :3]).as_rotvec()], 1)
@@ -125,12 +125,12 @@ def squared_distance(off: np.ndarray, first: np.ndarray, second: np.ndarray) -> 
 
 
 def _shows(found: Aligned) -> bool:
-    """Return whether image and surface agree, as `Evidence.dense_fair`; comparisons with NaN are false."""
+    """Return whether image and surface agree, as `TrackingQuality.dense_fair`; comparisons with NaN are false."""
     surface = not found.surface < MIN_SURFACE
     return bool(found.correlation >= MIN_CORRELATION and found.overlap >= MIN_OVERLAP and surface)
 
 
-def tracked_information(evidence: Evidence) -> np.ndarray:
+def tracked_information(quality: TrackingQuality) -> np.ndarray:
     """Return the information [6, 6] of a tracked pose by its worst directions; zero if they are unknown."""
-    sigma = np.array([evidence.sigma_translation, evidence.sigma_rotation])
+    sigma = np.array([quality.sigma_translation, quality.sigma_rotation])
     return np.diag(1 / np.repeat(np.maximum(sigma, 1e-6), 3) ** 2) if np.isfinite(sigma).all() else np.zeros((6, 6))

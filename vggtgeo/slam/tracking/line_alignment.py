@@ -29,7 +29,7 @@ from vggtgeo.models.classical import line_coefficients
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
 from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.tracking.evidence import tangent, worst_sigma
+from vggtgeo.slam.tracking.pose_acceptance import tangent, worst_sigma
 
 END_SIGMA = 0.7
 """Standard deviation of a segment's end across it, pixels."""

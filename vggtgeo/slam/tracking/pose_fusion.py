@@ -16,8 +16,8 @@ from vggtgeo.models.roles import LineFeatures, LineMatcher
 from vggtgeo.slam.perception.rgbd_alignment import Aligned
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH
-from vggtgeo.slam.tracking.evidence import Evidence, tangent
 from vggtgeo.slam.tracking.line_alignment import align_lines
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality, tangent
 
 SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
 """Standard deviation of errors that samples share (calibration, rolling shutter, clocks): metres, radians, share of the
@@ -37,7 +37,7 @@ class Motion:
     information: np.ndarray
 
 
-def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) -> Motion | None:
+def agreed(by_points: Motion | None, dense: Aligned | None, quality: TrackingQuality) -> Motion | None:
     """Return the mean of both motions if they agree within their noise, else the one with the better evidence."""
     if dense is None:
         return by_points
@@ -52,8 +52,8 @@ def agreed(by_points: Motion | None, dense: Aligned | None, evidence: Evidence) 
         mean = np.linalg.solve(both + REGULARISER * np.eye(6), by_points.information @ off)
         return Motion(exponential(mean) @ dense.motion, both)
     # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
-    near = np.linalg.norm(off[:3]) < MAX_DISAGREEMENT or not evidence.points_strong
-    return by_picture if evidence.dense_fair and near else by_points
+    near = np.linalg.norm(off[:3]) < MAX_DISAGREEMENT or not quality.points_strong
+    return by_picture if quality.dense_fair and near else by_points
 
 
 def fused_with_prior(found: Motion, prior: Motion) -> Motion:
@@ -94,12 +94,12 @@ def metre_of(points: np.ndarray, pose: np.ndarray) -> float:
 def with_lines(
     found: Motion | None,
     prior: Motion | None,
-    evidence: Evidence,
+    quality: TrackingQuality,
     keyframe: Keyframe,
     seen: LineFeatures,
     intrinsics: np.ndarray,
     matcher: LineMatcher,
-) -> tuple[Motion | None, Evidence]:
+) -> tuple[Motion | None, TrackingQuality]:
     """Return the motion refined by line segments, with the evidence; without a measured motion, from the prior."""
     measured = np.zeros((6, 6)) if found is None else found.information
     start = prior if found is None else found
@@ -107,9 +107,9 @@ def with_lines(
     known = measured if prior is None else measured + prior.information
     lines = align_lines(keyframe, seen, matcher, start.motion, known, intrinsics)
     if lines is None:
-        return found, evidence
-    evidence = replace(evidence, lines=lines.agreed, visible_lines=lines.visible)
-    return Motion(lines.motion, measured + lines.information), evidence
+        return found, quality
+    quality = replace(quality, lines=lines.agreed, visible_lines=lines.visible)
+    return Motion(lines.motion, measured + lines.information), quality
 
 
 def with_systematic(information: np.ndarray, motion: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.sparse_map.map import Map, longer, scaled_information
-from vggtgeo.slam.tracking.evidence import Evidence
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality
 
 MAX_UNPLACED = 90
 """Frames without a pose that are kept, to be tracked once there is a map or at the end. Each takes half a megabyte at
@@ -43,7 +43,7 @@ class FramePose:
     """Pose of one frame relative to a keyframe, so that it follows when the keyframe is adjusted.
 
     relative: float64 [4, 4], reference camera -> this camera. tracked: False where tracking failed; `relative` is then
-    that of the last frame. evidence: quality and uncertainty of the pose.
+    that of the last frame. quality: of the tracking, with the uncertainty of the pose.
     """
 
     frame: int
@@ -52,7 +52,7 @@ class FramePose:
     relative: np.ndarray
     tracked: bool
     inliers: int
-    evidence: Evidence = field(default_factory=Evidence)
+    quality: TrackingQuality = field(default_factory=TrackingQuality)
     arrival: tuple[int, np.ndarray] | None = None
     """Of a frame that became a keyframe: the earlier keyframe it was tracked against, and its pose relative to that
     one as tracked, before any adjustment."""
@@ -83,7 +83,7 @@ class Tracker:
         lost: Frames since tracking was lost, 0 while it goes well.
         waiting: Frames without a pose so far.
         unplaced: Frames that stayed without a pose in a map of free scale, the last `MAX_UNPLACED` of them: the end
-            tries them again (`global_map/lost_frames.py`).
+            tries them again (`global_map/lost_frame_recovery.py`).
         between: Rows of the last frames, and their views, that wait for the next keyframe (`frame_refinement.py`).
 
     """
@@ -108,7 +108,7 @@ def frame_pose(known: Map, record: FramePose) -> np.ndarray:
 
 
 def scaled_record(record: FramePose, ratio: float) -> FramePose:
-    """Return the record of a frame whose keyframe was scaled, see `units.scaled_keyframe`."""
+    """Return the record of a frame whose keyframe was scaled, see `scaled_keyframe` in `sparse_map/map.py`."""
     arrival = None if record.arrival is None else (record.arrival[0], longer(record.arrival[1], ratio))
     second = None if record.second is None else scaled_second(record.second, ratio)
     return replace(record, relative=longer(record.relative, ratio), arrival=arrival, second=second)

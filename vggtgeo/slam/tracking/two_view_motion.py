@@ -7,7 +7,7 @@ known to measure it.
 The information of the motion is that of the matches with depths eliminated: with the rows `J` of a projection over the
 left tangent and its column `c` over the inverse depth of the point, `sum J^T (I - c c^T / c^T c) J / sigma^2`. It has
 no information about the length, so that of the prior is added. If all points are far away the translation is weakly
-constrained and follows the motion prior (`fusion.fused_with_prior`).
+constrained and follows the motion prior (`pose_fusion.fused_with_prior`).
 
 Depths may also be known and wrong: after a fast turn with little parallax, points with wrong depths agree on a wrong
 motion, in the worst case the opposite one. The epipolar lines of all matches, with known depth or without, then
@@ -24,7 +24,7 @@ from scipy.stats import chi2
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.tracking.evidence import STEP_GROWTH
+from vggtgeo.slam.tracking.pose_acceptance import STEP_GROWTH
 
 EXPLAINED_GATE = 2.0
 """Largest distance of a match from its epipolar line, pixels: four standard deviations of a key point."""

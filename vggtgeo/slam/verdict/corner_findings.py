@@ -18,8 +18,8 @@ from vggtgeo.geometry import rigid
 from vggtgeo.slam.verdict.alternatives import Explanation, preferred
 from vggtgeo.slam.verdict.claim import Claim, extent, max_place_error
 from vggtgeo.slam.verdict.corner_adjustment import Fit, solve, start_of
+from vggtgeo.slam.verdict.findings import Finding
 from vggtgeo.slam.verdict.thresholds import MAX_DEPTH_NOISE, MAX_REASONS, MAX_TURN_ERROR, SIGMAS
-from vggtgeo.slam.verdict.verdict import Finding
 
 CALIBRATE = "Calibrate the camera, or let the run estimate it (leave out `--intrinsics`)"
 FILM_AGAIN = "Film this part again, slower, or do not use it"

@@ -18,7 +18,7 @@ from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.argument_checks import check_kind
 from vggtgeo.slam.callback import Callback
-from vggtgeo.slam.perception.followed_corners import WIDTH, FollowedCorners, small_grey, small_mask
+from vggtgeo.slam.perception.klt_corners import WIDTH, FollowedCorners, small_grey, small_mask
 from vggtgeo.slam.state import Slam
 
 SOME = slice(4, None, 8)
@@ -28,7 +28,7 @@ MAX_QUEUED_FRAMES = 4
 
 
 @dataclass(frozen=True, eq=False)
-class FrameEvidence:
+class FrameCorners:
     """The corners of one frame. ids: int32 [m], a track's number, the same in each frame that saw it. pixels: float32
     [m, 2], of the ideal pinhole image. depth: float32 [m], measured, metres; NaN where there is none, or the image
     repeats that of another picture.
@@ -40,23 +40,23 @@ class FrameEvidence:
     pixels: np.ndarray
     depth: np.ndarray
 
-    def common(self, other: FrameEvidence) -> tuple[np.ndarray, np.ndarray]:
+    def common(self, other: FrameCorners) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows of the tracks that both frames saw, here and there, int [n] each."""
         _, rows, others = np.intersect1d(self.ids, other.ids, assume_unique=True, return_indices=True)
         return rows, others
 
 
-CornerTracks = Sequence[FrameEvidence]
+CornerTracks = Sequence[FrameCorners]
 """The corners of each frame of a run; equal ids are one track."""
 
 
-class EvidenceRecorder(Callback):
-    """Record a `FrameEvidence` of each frame, for `vggtgeo.Result.of`.
+class CornerRecorder(Callback):
+    """Record a `FrameCorners` of each frame, for `vggtgeo.Result.of`.
 
     Example:
         >>> import vggtgeo as vg
         >>> sequence = vg.simulate("room", 3, size=(160, 120))
-        >>> recorder = vg.callbacks.EvidenceRecorder(sequence.camera)
+        >>> recorder = vg.callbacks.CornerRecorder(sequence.camera)
         >>> for frame in sequence.frames():
         ...     recorder.add(frame)
         >>> len(recorder.frames)
@@ -68,7 +68,7 @@ class EvidenceRecorder(Callback):
         check_kind("camera", camera, Camera, "a `vggtgeo.Camera`, as `sequence.camera`")
         self._camera = camera
         self._mask: np.ndarray | None = None
-        self._frames: list[FrameEvidence] = []
+        self._frames: list[FrameCorners] = []
         self._waiting: deque[Future[None]] = deque()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="evidence")
         self._corners = FollowedCorners()
@@ -80,7 +80,7 @@ class EvidenceRecorder(Callback):
         self._mask = small_mask(still)
 
     @property
-    def frames(self) -> list[FrameEvidence]:
+    def frames(self) -> list[FrameCorners]:
         """The corners of each frame so far."""
         while self._waiting:
             self._waiting.popleft().result()
@@ -114,7 +114,7 @@ class EvidenceRecorder(Callback):
         pixels = (self._corners.pixels + 0.5) * (max(frame.image.shape[:2]) / WIDTH) - 0.5
         depth = self._depth_at(pixels, frame.depth, same_picture)
         ideal = self._camera.undistorted(pixels).astype(np.float32)
-        self._frames.append(FrameEvidence(frame.index, frame.timestamp, self._corners.ids, ideal, depth))
+        self._frames.append(FrameCorners(frame.index, frame.timestamp, self._corners.ids, ideal, depth))
 
     def _depth_at(self, pixels: np.ndarray, depth: np.ndarray | None, same_picture: bool) -> np.ndarray:
         """Return depths at pixels; NaN if the image repeats that of another picture: the run does not use it either."""

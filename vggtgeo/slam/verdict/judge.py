@@ -19,12 +19,12 @@ from vggtgeo.slam.verdict import thresholds
 from vggtgeo.slam.verdict.alternatives import explain
 from vggtgeo.slam.verdict.claim import Claim, Tracks, extent, max_place_error, tracks_of_windows
 from vggtgeo.slam.verdict.corner_findings import findings
-from vggtgeo.slam.verdict.corner_recorder import CornerTracks, FrameEvidence
-from vggtgeo.slam.verdict.verdict import Finding, Level, Verdict, conclude
+from vggtgeo.slam.verdict.corner_recorder import CornerTracks, FrameCorners
+from vggtgeo.slam.verdict.findings import Finding, Level, Verdict, conclude
 
 
 def judge(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
-    """Judge the state after the last adjustment. evidence: of all frames, from an `EvidenceRecorder`; without it only
+    """Judge the state after the last adjustment. evidence: of all frames, from an `CornerRecorder`; without it only
     the run's own record counts. input_findings: what is known of the input already.
     """
     claim = Claim.of(slam)
@@ -202,7 +202,7 @@ def check_frozen(claim: Claim, corners: CornerTracks) -> list[Finding]:
     return [Finding("frozen", "degraded", text, start, end)]
 
 
-def _same_picture(before: FrameEvidence, after: FrameEvidence) -> bool:
+def _same_picture(before: FrameCorners, after: FrameCorners) -> bool:
     first, second = before.common(after)
     moved = np.abs(before.pixels[first] - after.pixels[second]).max(1, initial=0.0)
     return len(first) >= thresholds.MIN_COMMON and bool(np.median(moved) < thresholds.MAX_UNMOVED)

@@ -29,7 +29,7 @@ LINE_GATE = 12.0
 outliers within it."""
 STEP_PIXELS = 2.0
 """Largest standard deviation of a point's projection after a motion of the same length as its baseline, pixels, for use
-in tracking: that of a match (`PIXEL_SIGMA` in `tracking/track.py`). It excludes points in the direction of motion."""
+in tracking: that of a match (`PIXEL_SIGMA` in `frame_tracking.py`). It excludes points in the direction of motion."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.bundle.terms.edge import EdgeTerm
+from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import PairTerm
-from vggtgeo.bundle.terms.points_and_lines import PointTerm
+from vggtgeo.bundle.terms.reprojection import PointTerm
 from vggtgeo.geometry import lie, rigid
 from vggtgeo.slam.sparse_map.map import by_first_member
 

@@ -18,20 +18,20 @@ from vggtgeo.simulation import simulate
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
-from vggtgeo.slam.tracking.evidence import tangent
-from vggtgeo.slam.tracking.map_points import Refined, refine_by_map
-from vggtgeo.slam.tracking.pose_fusion import with_systematic
-from vggtgeo.slam.tracking.track import (
+from vggtgeo.slam.tracking.frame_tracking import (
     PIXEL_SIGMA,
     SEARCH_RADIUS,
     FrameData,
     MotionPrior,
     TrackingInput,
+    factor_to,
     refined_by_map,
-    tie_to,
     track,
     track_by_map,
 )
+from vggtgeo.slam.tracking.local_map_tracking import Refined, refine_by_map
+from vggtgeo.slam.tracking.pose_acceptance import tangent
+from vggtgeo.slam.tracking.pose_fusion import with_systematic
 
 SIZE = (320, 240)
 ROLES = Roles(points=SiftMatcher(count=500))
@@ -105,9 +105,9 @@ def test_a_tie_counts_what_other_keyframes_know_only_once(view: View) -> None:
     given = TrackingInput(data, intrinsics, ROLES, expected)
     own = track(given, keyframes[2], None)
     refined = refined_by_map(own, given, keyframes)
-    assert refined.evidence.map_points > 0
+    assert refined.quality.map_points > 0
     assert np.linalg.eigvalsh(refined.measured - own.measured)[0] > 0
-    tie = tie_to(refined, 9)
+    tie = factor_to(refined, 9)
     assert tie.keyframes == (2, 9)
     np.testing.assert_allclose(tie.information, own.information)
     np.testing.assert_allclose(tie.pose, own.relative)
@@ -126,7 +126,7 @@ def test_keyframes_with_too_few_points_each_place_a_frame_together(view: View) -
         assert not track(given, keyframe, None).accepted
     found = track_by_map(given, poor, poor[-1], None)
     off = np.linalg.norm(rigid.centre(found.pose) - rigid.centre(true))
-    assert found.accepted, found.evidence
+    assert found.accepted, found.quality
     assert off < 0.01, f"{100 * off:.1f} cm"
 
 

@@ -13,11 +13,11 @@ from vggtgeo.datasets.frame import Frame
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.slam.global_map.lost_frames import place_lost_without_depth
+from vggtgeo.slam.global_map.lost_frame_recovery import place_lost_without_depth
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.lost_tracking import place_waiting
 from vggtgeo.slam.tracking.tracking_state import MAX_UNPLACED, FramePose, UnplacedFrame
+from vggtgeo.slam.tracking.waiting_frames import place_waiting
 
 SIZE = (320, 240)
 FREE_ROLES = replace(ROLES, depth=NoDepth())

@@ -13,9 +13,8 @@ from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.groups import KeyframeSettings
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.map import Map
-from vggtgeo.slam.tracking.evidence import Evidence
-from vggtgeo.slam.tracking.relocalisation import frame_data, record_of, view_of
-from vggtgeo.slam.tracking.track import MotionPrior, TrackingInput, track
+from vggtgeo.slam.tracking.frame_tracking import MotionPrior, TrackingInput, frame_data, record_of, track, view_of
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality
 from vggtgeo.slam.tracking.tracking_state import (
     MAX_UNPLACED,
     FramePose,
@@ -29,12 +28,12 @@ LOST_PATIENCE = 10
 """Number of lost frames with texture after which a new submap begins. Black frames do not count."""
 
 
-def wait(tracker: Tracker, frame: Frame, features: Features, evidence: Evidence) -> Tracker:
+def wait(tracker: Tracker, frame: Frame, features: Features, quality: TrackingQuality) -> Tracker:
     """Let a lost frame wait, recorded without a pose, where the frame before it is; the oldest waiting are dropped."""
     waiting = UnplacedFrame(frame.index, frame.timestamp, frame.image, features, frame.depth)
     last = tracker.frames[-1] if tracker.frames else None
     reference, relative = (0, np.eye(4)) if last is None else (last.reference, last.relative)
-    record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, evidence)
+    record = FramePose(frame.index, frame.timestamp, reference, relative, False, 0, quality)
     return replace(
         tracker,
         frames=(*tracker.frames, record),

@@ -10,7 +10,7 @@ from posed_keyframes import SIZE, small_keyframe
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
-from vggtgeo.slam.global_map.carried_poses import carried_poses
+from vggtgeo.slam.global_map.propagated_poses import propagated_poses
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
@@ -57,7 +57,7 @@ def _walked(begins: tuple[int, ...]) -> Slam:
 
 def test_frames_between_keyframes_share_what_the_adjustment_changed() -> None:
     """Keyframes that are pulled apart evenly take the frames between along; oracle: the straight path through them."""
-    _, poses = carried_poses(_walked(begins=(0,)))
+    _, poses = propagated_poses(_walked(begins=(0,)))
     assert np.allclose(poses, _straight(1.5), atol=1e-12)
 
 
@@ -65,17 +65,17 @@ def test_a_keyframe_that_begins_a_submap_keeps_its_pose_and_begins_its_own_share
     """The frame that a submap begins with stands where its keyframe does, and the frames behind it share what changed
     from there on; those before it, which nothing ties to it, stay as they were tracked. Oracle: the straight paths.
     """
-    _, poses = carried_poses(_walked(begins=(0, 1)))
+    _, poses = propagated_poses(_walked(begins=(0, 1)))
     assert np.allclose(poses[4:], _straight(1.5)[4:], atol=1e-12)
     assert np.allclose(poses[:4], _straight(1.0)[:4], atol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("sigma", "metric", "by_rays", "length"),
+    ("sigma", "metric", "by_two_view", "length"),
     [(0.5, True, False, 1.5), (0.05, True, False, 1.0), (0.05, False, False, 1.5), (0.5, False, True, 1.0)],
 )
 def test_a_keyframe_that_was_tracked_wrongly_leaves_the_frames_before_it_where_they_are(
-    sigma: float, metric: bool, by_rays: bool, length: float
+    sigma: float, metric: bool, by_two_view: bool, length: float
 ) -> None:
     """2.3 m between a keyframe as tracked and as adjusted are drift where its tracking left them open, and an error of
     that frame alone where it did not; without depth they are another unit, or a length that was a guess. Oracle: the
@@ -84,10 +84,10 @@ def test_a_keyframe_that_was_tracked_wrongly_leaves_the_frames_before_it_where_t
     slam = _walked(begins=(0,)).with_map(metric=metric)
     known = np.diag(np.repeat([sigma, 0.1], 3) ** -2.0)
     arrivals = [record for record in slam.frames if record.arrival is not None]
-    ties = tuple(
-        MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known, by_rays) for r in arrivals if r.arrival
+    factors = tuple(
+        MeasuredRelativePose(r.arrival[0], r.reference, r.arrival[1], known, by_two_view) for r in arrivals if r.arrival
     )
-    _, poses = carried_poses(slam.with_map(factors=ties))
+    _, poses = propagated_poses(slam.with_map(factors=factors))
     for first in (0, 4):
         step = _straight(length) @ rigid.invert(_straight(length)[0])
         assert np.allclose(poses[first : first + 4] @ rigid.invert(poses[first]), step[:4], atol=1e-12)

@@ -28,8 +28,8 @@ from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map, longer, submap_of
-from vggtgeo.slam.tracking.evidence import Evidence, worst_sigma
-from vggtgeo.slam.tracking.track import Track
+from vggtgeo.slam.tracking.frame_tracking import TrackedFrame
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality, worst_sigma
 from vggtgeo.slam.tracking.tracking_state import FramePose
 
 SIGNIFICANT = float(np.log(1e4))
@@ -79,7 +79,7 @@ def recorded_units(recorded: RecordedPoses, known: Map) -> np.ndarray:
     return np.full(len(known.keyframes), np.nan) if record is None else record.units()
 
 
-def recorded_tie(
+def recorded_factor(
     recorded: RecordedPoses, first: Keyframe, second: Keyframe, unit: float
 ) -> MeasuredRelativePose | None:
     """Return the recorded motion between two keyframes in the unit of the map, from the smaller number.
@@ -96,7 +96,7 @@ def recorded_tie(
     return MeasuredRelativePose(first.number, second.number, scaled, np.linalg.inv(noise), recorded=True)
 
 
-def recorded_ties(recorded: RecordedPoses, known: Map, units: np.ndarray) -> list[MeasuredRelativePose]:
+def recorded_factors_of(recorded: RecordedPoses, known: Map, units: np.ndarray) -> list[MeasuredRelativePose]:
     """Return the recorded motions between consecutive keyframes of one submap.
 
     units: of the recording at each keyframe, float64 [n], NaN = unknown.
@@ -104,15 +104,15 @@ def recorded_ties(recorded: RecordedPoses, known: Map, units: np.ndarray) -> lis
     label = submap_of(known)
     placed = [keyframe for keyframe in known.keyframes if np.isfinite(units[keyframe.number])]
     placed.sort(key=lambda keyframe: keyframe.timestamp)
-    ties = [
-        recorded_tie(recorded, first, second, float(units[second.number]))
+    factors = [
+        recorded_factor(recorded, first, second, float(units[second.number]))
         for first, second in pairwise(placed)
         if label[first.number] == label[second.number]
     ]
-    return [tie for tie in ties if tie is not None]
+    return [factor for factor in factors if factor is not None]
 
 
-def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, unit: float) -> Track | None:
+def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, unit: float) -> TrackedFrame | None:
     """Place a frame that images do not place, by the recorded motion from the last one with a pose.
 
     None if that motion is unknown.
@@ -125,8 +125,8 @@ def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, u
     noise = recorded.covariance(relative, time - keyframe.timestamp)
     information = np.linalg.inv(noise)
     sigma_translation, sigma_rotation = worst_sigma(information)
-    evidence = Evidence(sigma_translation=sigma_translation, sigma_rotation=sigma_rotation, recorded=True)
-    return Track(keyframe, relative @ keyframe.pose, information, evidence, GeometryResult.SUCCESS)
+    quality = TrackingQuality(sigma_translation=sigma_translation, sigma_rotation=sigma_rotation, recorded=True)
+    return TrackedFrame(keyframe, relative @ keyframe.pose, information, quality, GeometryResult.SUCCESS)
 
 
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
@@ -169,7 +169,7 @@ class _Record:
 
         It is the median over the motions of its submap, weighted by the recorded length, which no wrong match changes.
         """
-        measured = np.array([0.0 if own.by_rays else np.linalg.norm(own.pose[:3, 3]) for own in self.measured])
+        measured = np.array([0.0 if own.by_two_view else np.linalg.norm(own.pose[:3, 3]) for own in self.measured])
         lengths = np.linalg.norm(self.motions[:, :3, 3], axis=1)
         known, found = (measured > 0) & (lengths > 0), np.full(len(self.label), np.nan)
         for submap in np.unique(self.label[self.second[known]]):

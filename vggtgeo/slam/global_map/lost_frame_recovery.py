@@ -12,17 +12,26 @@ import numpy as np
 
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.slam.keyframe_decision import needs_keyframe
+from vggtgeo.slam.local_mapping import adjust_window, insert_keyframe
 from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import make_keyframe
 from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.map_points import in_view
-from vggtgeo.slam.tracking.relocalisation import record_of, relocalise
-from vggtgeo.slam.tracking.track import FrameData, MotionPrior, Track, TrackingInput, tie_to, track, track_by_map
+from vggtgeo.slam.tracking.frame_tracking import (
+    FrameData,
+    MotionPrior,
+    TrackedFrame,
+    TrackingInput,
+    factor_to,
+    record_of,
+    track,
+    track_by_map,
+)
+from vggtgeo.slam.tracking.local_map_tracking import in_view
+from vggtgeo.slam.tracking.relocalisation import relocalise
 from vggtgeo.slam.tracking.tracking_state import FramePose, UnplacedFrame
 from vggtgeo.slam.window.sliding_window import Window
-from vggtgeo.slam.window_steps import adjust_window, insert_keyframe
 
 
 def place_lost_without_depth(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:
@@ -52,7 +61,7 @@ def _data(lost: UnplacedFrame) -> FrameData:
     return FrameData(Frame(lost.frame, lost.timestamp, lost.image, None, ""), Description.of(lost.features), None)
 
 
-def _found(slam: Slam, lost: UnplacedFrame, roles: Roles) -> Track | None:
+def _found(slam: Slam, lost: UnplacedFrame, roles: Roles) -> TrackedFrame | None:
     """Track a frame by a keyframe that looks like it, or near the frame that is next to it in time."""
     given = TrackingInput(_data(lost), slam.intrinsics, roles)
     certain = relocalise(given, slam.keyframes, slam.tracker)
@@ -70,13 +79,13 @@ def _found(slam: Slam, lost: UnplacedFrame, roles: Roles) -> Track | None:
     tried = [track(given, keyframe, None) for keyframe in near]
     tried += [track_by_map(given, own, keyframe, None) for keyframe in near[:1]]
     accepted = [found for found in tried if found.accepted]
-    return max(accepted, key=lambda found: found.evidence.inliers, default=None)
+    return max(accepted, key=lambda found: found.quality.inliers, default=None)
 
 
-def _with_frame(slam: Slam, lost: UnplacedFrame, found: Track, roles: Roles, settings: SlamSettings) -> Slam:
+def _with_frame(slam: Slam, lost: UnplacedFrame, found: TrackedFrame, roles: Roles, settings: SlamSettings) -> Slam:
     """Add the frame's pose, and the frame as a keyframe if it sees what others do not."""
     record = record_of(_data(lost).frame, found)
-    if needs_keyframe(slam, found.pose, found.keyframe, found.evidence.inliers, settings.keyframes):
+    if needs_keyframe(slam, found.pose, found.keyframe, found.quality.inliers, settings.keyframes):
         slam, record = _with_keyframe(slam, lost, found, record, roles, settings)
     frames = tuple(record if other.frame == lost.frame else other for other in slam.frames)
     left = tuple(other for other in slam.tracker.unplaced if other.frame != lost.frame)
@@ -84,7 +93,7 @@ def _with_frame(slam: Slam, lost: UnplacedFrame, found: Track, roles: Roles, set
 
 
 def _with_keyframe(
-    slam: Slam, lost: UnplacedFrame, found: Track, record: FramePose, roles: Roles, settings: SlamSettings
+    slam: Slam, lost: UnplacedFrame, found: TrackedFrame, record: FramePose, roles: Roles, settings: SlamSettings
 ) -> tuple[Slam, FramePose]:
     """Add a keyframe, adjusted in a window of those nearest in time, which are fixed."""
     number, data, label = len(slam.keyframes), _data(lost), submap_of(slam.map)
@@ -93,7 +102,7 @@ def _with_keyframe(
     others.sort(key=lambda other: (other is not found.keyframe, abs(other.timestamp - lost.timestamp)))
     members = tuple(sorted(other.number for other in others[: settings.window.size - 1]))
     inserted = replace(slam, window=Window(members=members, held=members))
-    inserted = insert_keyframe(inserted, keyframe, roles, settings).with_factors(tie_to(found, number))
+    inserted = insert_keyframe(inserted, keyframe, roles, settings).with_factors(factor_to(found, number))
     adjusted = replace(adjust_window(inserted, settings), window=slam.window)
     arrival = found.keyframe.number, found.relative
     return adjusted, replace(record, reference=number, relative=np.eye(4), arrival=arrival, seen=None)

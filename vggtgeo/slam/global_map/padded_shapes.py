@@ -25,7 +25,7 @@ SMALL = (16, 64)
 """Keyframes of the smallest shapes; larger ones: 96, 128, 192, 256, ..."""
 MAX_PADDING = 2.0
 """Stored edges for each real one; a larger map with few edges keeps its own shape."""
-TIES, PAIRS = 2, 12
+FACTORS, PAIRS = 2, 12
 """Room for tracked motions and pairs for each keyframe; an office sequence of 64 keyframes has 533 pairs."""
 MAX_NEIGHBOURS = 16
 """Largest number of edges of one keyframe: it determines the padded size, and so time and memory of the adjustment."""
@@ -39,7 +39,7 @@ MAX_ITERATIONS = 40
 """Iterations of an adjustment of the whole map, which mostly converges after fewer."""
 
 
-class GlobalShape(NamedTuple):
+class PaddedShape(NamedTuple):
     """Padded size of landmarks and edges, room for factors by their kind, and room for pairs of surfaces."""
 
     size: PaddedSize
@@ -47,7 +47,7 @@ class GlobalShape(NamedTuple):
     pairs: int
 
 
-def shape_for(keyframes: int, edges: int, settings: SlamSettings, metric: bool = True) -> GlobalShape:
+def shape_for(keyframes: int, edges: int, settings: SlamSettings, metric: bool = True) -> PaddedShape:
     """Return the shape of a map of so many keyframes and edges, with odometry factors.
 
     Without metric depth the first factor is the baseline that fixes the scale.
@@ -56,12 +56,12 @@ def shape_for(keyframes: int, edges: int, settings: SlamSettings, metric: bool =
     stored = padded_edges(edges, padded)
     size = replace(window_size(settings), keyframes=padded, degree=MAX_NEIGHBOURS, edges=stored)
     baseline = () if metric else ((MeasuredBaseline, padded_count(1)),)
-    return GlobalShape(size, (*baseline, (MeasuredRelativePose, TIES * padded)), PAIRS * padded)
+    return PaddedShape(size, (*baseline, (MeasuredRelativePose, FACTORS * padded)), PAIRS * padded)
 
 
 def shape_of(
     keyframes: int, edges_of_host: Sequence[int], factors: Sequence[Factor], pairs: int, settings: SlamSettings
-) -> GlobalShape:
+) -> PaddedShape:
     """Return the shape of a map: that of `shape_for` if it fits.
 
     edges_of_host: number of edges of each keyframe, at most `MAX_NEIGHBOURS`.
@@ -73,7 +73,7 @@ def shape_of(
         size = replace(size, keyframes=keyframes, degree=max(edges_of_host), edges=edges)
     usual_room = dict(usual.room)
     room = tuple((kind, max(padded_count(count), usual_room.get(kind, 0))) for kind, count in counts.items())
-    return GlobalShape(size, room, max(padded_count(pairs), usual.pairs))
+    return PaddedShape(size, room, max(padded_count(pairs), usual.pairs))
 
 
 def padded_count(count: int) -> int:

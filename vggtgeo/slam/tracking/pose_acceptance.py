@@ -50,7 +50,7 @@ added to each. 99 % of the steps of a fast head-mounted camera are within three 
 
 
 @dataclass(frozen=True)
-class Evidence:
+class TrackingQuality:
     """Measures of the quality of one frame's pose. NaN = not measured.
 
     matches, inliers: of key points with known depth. error: median reprojection error of the inliers, pixels.
@@ -61,7 +61,7 @@ class Evidence:
     degrees of freedom. agreement: distance between the poses by points and by surface, metres. lines, visible_lines:
     segments of the keyframe that are matched in agreement with the pose, and those expected in the image. map_points:
     number of matched key points of other keyframes. metre: length that stands for a metre in a map of free scale, in
-    its unit, see `fusion.metre_of`. by_rays: whether the pose is from key points without known depth, so that its
+    its unit, see `pose_fusion.metre_of`. by_two_view: whether the pose is from key points without known depth, so that its
     baseline is weakly constrained, see `two_view_motion.py`. recorded: whether it is a recorded pose that no image has
     measured.
     """
@@ -81,7 +81,7 @@ class Evidence:
     visible_lines: int = 0
     map_points: int = 0
     metre: float = 1.0
-    by_rays: bool = False
+    by_two_view: bool = False
     recorded: bool = False
 
     @property
@@ -103,7 +103,7 @@ class Evidence:
     def points_strong(self) -> bool:
         return self.inliers >= STRONG_INLIERS and self.share >= STRONG_SHARE
 
-    def shows_as_well(self, other: Evidence) -> bool:
+    def shows_as_well(self, other: TrackingQuality) -> bool:
         """Return whether the correlation with this keyframe is about as good as the other's; true without one."""
         return not self.correlation < MIN_CORRELATION_RATIO * other.correlation
 
@@ -142,7 +142,7 @@ class Evidence:
     @property
     def accepted(self) -> bool:
         """Whether the pose is accepted."""
-        if self.by_rays or self.recorded:
+        if self.by_two_view or self.recorded:
             # Without depth there is neither a surface nor a picture to compare: only the points can confirm the pose.
             return self.recorded or self.points_strong
         if self.sigma_translation > MAX_SIGMA * self.metre or self.correlation < CONTRADICTION:

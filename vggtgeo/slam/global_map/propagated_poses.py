@@ -19,7 +19,7 @@ MAX_GAP = 3.0
 """Largest time to a neighbouring frame for a velocity, in usual intervals."""
 
 
-def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
+def propagated_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     """Return times [n], s, and poses [n, 4, 4], world -> camera, of all frames; for a lost frame the last known pose.
 
     A frame is stored relative to its reference keyframe. The correction of the next keyframe relative to that reference
@@ -30,7 +30,7 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     """
     poses = np.array([slam.pose(record) for record in slam.frames]).reshape(-1, 4, 4)
     times = np.array([record.timestamp for record in slam.frames])
-    ties = {(tie.first, tie.second): tie for tie in slam.map.odometry_factors}
+    factors = {(factor.first, factor.second): factor for factor in slam.map.odometry_factors}
     last = 0
     for row, record in enumerate(slam.frames):
         if not _made_its_keyframe(record):
@@ -39,10 +39,10 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
             reference, tracked = record.arrival
             arrived = tracked @ slam.keyframes[reference].pose
             change = poses[row] @ rigid.invert(arrived)
-            tie = ties.get((reference, record.reference))
+            factor = factors.get((reference, record.reference))
             # By rays the length of its motion was a guess, which frames tracked by points do not share.
-            apart = tie is not None and (
-                tie.by_rays or _is_gross(arrived, poses[row], tie if slam.metric else tie.of_free_length())
+            apart = factor is not None and (
+                factor.by_two_view or _is_gross(arrived, poses[row], factor if slam.metric else factor.of_free_length())
             )
             between = [] if apart else [k for k in range(last + 1, row) if slam.frames[k].reference == reference]
             for k in between:
@@ -53,10 +53,10 @@ def carried_poses(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
     return times, by_both(slam.map, slam.frames, poses)
 
 
-def _is_gross(arrived: np.ndarray, adjusted: np.ndarray, tie: MeasuredRelativePose) -> bool:
+def _is_gross(arrived: np.ndarray, adjusted: np.ndarray, factor: MeasuredRelativePose) -> bool:
     """Return whether an adjustment moved a keyframe [4, 4] beyond the uncertainty of its tracking."""
     off = lie.steps(arrived[None], adjusted[None])[0]
-    return bool(off @ tie.information @ off > GROSS)
+    return bool(off @ factor.information @ off > GROSS)
 
 
 def _made_its_keyframe(record: FramePose) -> bool:
@@ -85,7 +85,7 @@ def frame_motions(slam: Slam) -> np.ndarray:
 
     Units of the map, then radians. From the frames before and after; zero without them.
     """
-    times, poses = carried_poses(slam)
+    times, poses = propagated_poses(slam)
     if len(times) < 2:
         return np.zeros((len(times), lie.TANGENT))
     rows = np.arange(len(times))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
 from vggtgeo.bundle.pinhole_derivatives import Gradient
-from vggtgeo.bundle.terms.edge import CENTRE, EdgeTerm, EdgeView, LocalModel, PixelModel, View
+from vggtgeo.bundle.terms.landmark_edge import CENTRE, EdgeTerm, EdgeView, LocalModel, PixelModel, View
 from vggtgeo.bundle.terms.term import reweighting, robust_energy, squared_norm
 from vggtgeo.geometry.camera_models import Pinhole
 

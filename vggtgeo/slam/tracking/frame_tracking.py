@@ -26,9 +26,9 @@ from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.tracking.evidence import Evidence, step_chi2, step_information, worst_sigma
-from vggtgeo.slam.tracking.following import Located, located_by_flow
-from vggtgeo.slam.tracking.map_points import joint_matches, refine_by_map
+from vggtgeo.slam.tracking.flow_tracking import Located, located_by_flow
+from vggtgeo.slam.tracking.local_map_tracking import joint_matches, refine_by_map
+from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality, step_chi2, step_information, worst_sigma
 from vggtgeo.slam.tracking.pose_fusion import (
     Motion,
     agreed,
@@ -38,7 +38,7 @@ from vggtgeo.slam.tracking.pose_fusion import (
     with_lines,
     with_systematic,
 )
-from vggtgeo.slam.tracking.tracking_state import SeenPoints
+from vggtgeo.slam.tracking.tracking_state import FramePose, SeenPoints, Tracker
 from vggtgeo.slam.tracking.two_view_motion import explains_more, may_explain_more, two_view_motion
 
 PIXEL_SIGMA = 2.0
@@ -113,7 +113,7 @@ class TrackingInput:
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class TrackedFrame:
     """A frame's pose relative to one keyframe.
 
     pose: float64 [4, 4], world -> camera. measured: float64 [6, 6], information of the motion keyframe -> frame over
@@ -126,15 +126,15 @@ class Track:
     keyframe: Keyframe
     pose: np.ndarray
     measured: np.ndarray
-    evidence: Evidence
+    quality: TrackingQuality
     result: GeometryResult
-    alone: Track | None = None
+    alone: TrackedFrame | None = None
     seen: SeenPoints | None = None
     matches: PointMatches | None = None
 
     @property
     def accepted(self) -> bool:
-        return self.result is GeometryResult.SUCCESS and self.evidence.accepted
+        return self.result is GeometryResult.SUCCESS and self.quality.accepted
 
     @property
     def relative(self) -> np.ndarray:
@@ -147,7 +147,7 @@ class Track:
         return with_systematic(self.measured, self.relative)
 
 
-def track(given: TrackingInput, keyframe: Keyframe, source: RgbdView | None) -> Track:
+def track(given: TrackingInput, keyframe: Keyframe, source: RgbdView | None) -> TrackedFrame:
     """Track a frame against one keyframe: by its points, then by dense alignment from there.
 
     source: the keyframe's view, or None.
@@ -166,7 +166,7 @@ def track(given: TrackingInput, keyframe: Keyframe, source: RgbdView | None) -> 
 
 def track_by_map(
     given: TrackingInput, keyframes: Iterable[Keyframe], reference: Keyframe, source: RgbdView | None
-) -> Track:
+) -> TrackedFrame:
     """Track a frame by the points of all keyframes in view, if no keyframe alone has enough.
 
     Points are searched around the prediction. Dense alignment and lines use `reference`.
@@ -181,49 +181,51 @@ def track_by_map(
     return _placed(given, reference, given.views(source), located)
 
 
-def track_by_rays(given: TrackingInput, keyframe: Keyframe, length: float) -> Track | None:
+def track_by_two_view(given: TrackingInput, keyframe: Keyframe, length: float) -> TrackedFrame | None:
     """Track a frame by matches with a keyframe of unknown depths; None if they do not determine the motion.
 
     length: of the motion between both, from the motion so far.
     """
     matches = given.roles.points.match(keyframe.features, given.data.features)
-    return _placed_by_rays(given, keyframe, length, matches)
+    return _placed_by_two_view(given, keyframe, length, matches)
 
 
-def unless_contradicted(found: Track, given: TrackingInput, keyframe: Keyframe, length: float) -> Track:
+def unless_contradicted(found: TrackedFrame, given: TrackingInput, keyframe: Keyframe, length: float) -> TrackedFrame:
     """Return the track, or that by rays if its motion explains more matches beyond chance.
 
-    keyframe, length: as for `track_by_rays`. A track by another keyframe is returned as it is: the poses of both
+    keyframe, length: as for `track_by_two_view`. A track by another keyframe is returned as it is: the poses of both
     keyframes may differ by drift.
     """
     matches = found.matches
-    if found.keyframe.number != keyframe.number or matches is None or found.evidence.by_rays:
+    if found.keyframe.number != keyframe.number or matches is None or found.quality.by_two_view:
         return found
     if not may_explain_more(found.relative, matches, given.intrinsics):
         return found
-    other = _placed_by_rays(given, keyframe, length, matches)
+    other = _placed_by_two_view(given, keyframe, length, matches)
     if other is None or not other.accepted:
         return found
     better = explains_more(other.relative, found.relative, matches, given.intrinsics)
     return other if better else found
 
 
-def _placed_by_rays(given: TrackingInput, keyframe: Keyframe, length: float, matches: PointMatches) -> Track | None:
+def _placed_by_two_view(
+    given: TrackingInput, keyframe: Keyframe, length: float, matches: PointMatches
+) -> TrackedFrame | None:
     found = two_view_motion(matches, length, given.intrinsics, given.roles.geometry, PIXEL_SIGMA)
     if found is None:
         return None
     agree = int(np.count_nonzero(found.inliers))
     metre = metre_of(found.points[found.inliers], np.eye(4))
-    evidence = Evidence(matches=len(matches), inliers=agree, metre=metre, by_rays=True)
+    quality = TrackingQuality(matches=len(matches), inliers=agree, metre=metre, by_two_view=True)
     motion = Motion(found.motion, found.information)
     # Rays say little of the length of the motion, which the prior continues.
     motion = motion if given.prior is None else fused_with_prior(motion, given.prior.motion_from(keyframe))
-    return _judged(rigid.orthonormal(motion.motion @ keyframe.pose), motion.information, evidence, keyframe, None)
+    return _judged(rigid.orthonormal(motion.motion @ keyframe.pose), motion.information, quality, keyframe, None)
 
 
 def _placed(
     given: TrackingInput, keyframe: Keyframe, views: tuple[RgbdView, RgbdView] | None, located: Located
-) -> Track:
+) -> TrackedFrame:
     """Return the track from key points, refined by image, surface and lines; without points, from the motion prior."""
     guess, lines = located.guess, given.roles.line_matches
     known = guess.result is GeometryResult.SUCCESS
@@ -235,28 +237,28 @@ def _placed(
     if known:
         information = pose_information(guess.pose, located.points[guess.inliers], given.intrinsics, located.sigma)
         by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
-    evidence = _seen(guess, located.matches, by_points, dense)
+    quality = _seen(guess, located.matches, by_points, dense)
     if known and not given.roles.metric:
-        evidence = replace(evidence, metre=metre_of(located.points[guess.inliers], guess.pose))
+        quality = replace(quality, metre=metre_of(located.points[guess.inliers], guess.pose))
     prior = None if given.prior is None else given.prior.motion_from(keyframe)
     # The prior enters after the measurements were compared: it must not make wrong ones agree.
-    found = agreed(by_points, dense, evidence)
+    found = agreed(by_points, dense, quality)
     if found is not None and prior is not None:
         found = fused_with_prior(found, prior)
     # Finding lines costs as much as the alignment, so it is done only where it can help.
     needed = prior is not None if found is None else weakly_constrained(found)
     if needed and given.data.lines is not None:
-        found, evidence = with_lines(found, prior, evidence, keyframe, given.data.lines, given.intrinsics, lines)
+        found, quality = with_lines(found, prior, quality, keyframe, given.data.lines, given.intrinsics, lines)
     if found is None:
         nothing = np.zeros((6, 6))
-        return Track(keyframe, guess.pose, nothing, evidence, guess.result, matches=located.with_unknown_depth)
+        return TrackedFrame(keyframe, guess.pose, nothing, quality, guess.result, matches=located.with_unknown_depth)
     pose = rigid.orthonormal(found.motion @ keyframe.pose)
-    track = _judged(pose, found.information, evidence, keyframe, given.prior)
+    track = _judged(pose, found.information, quality, keyframe, given.prior)
     track = replace(track, matches=located.with_unknown_depth)
     return replace(track, seen=located.seen) if known and dense is None else track
 
 
-def refined_by_map(found: Track, given: TrackingInput, keyframes: Iterable[Keyframe]) -> Track:
+def refined_by_map(found: TrackedFrame, given: TrackingInput, keyframes: Iterable[Keyframe]) -> TrackedFrame:
     """Return the track refined by the points of all other keyframes in view if it is weakly constrained."""
     if not weakly_constrained(Motion(found.relative, found.measured)):
         return found
@@ -275,18 +277,18 @@ def refined_by_map(found: Track, given: TrackingInput, keyframes: Iterable[Keyfr
         return found
     # What no sample removes is common to all keyframes, and counted once.
     measured = found.measured + refined.information
-    evidence = replace(found.evidence, map_points=refined.points)
-    better = _judged(rigid.orthonormal(refined.pose), measured, evidence, found.keyframe, given.prior)
+    quality = replace(found.quality, map_points=refined.points)
+    better = _judged(rigid.orthonormal(refined.pose), measured, quality, found.keyframe, given.prior)
     return replace(better, alone=found, seen=found.seen, matches=found.matches)
 
 
-def moved_with(found: Track, keyframe: Keyframe) -> Track:
+def moved_with(found: TrackedFrame, keyframe: Keyframe) -> TrackedFrame:
     """Return the track after its keyframe was adjusted: the measurement is the relative motion."""
     alone = None if found.alone is None else moved_with(found.alone, keyframe)
     return replace(found, keyframe=keyframe, pose=rigid.orthonormal(found.relative @ keyframe.pose), alone=alone)
 
 
-def tie_to(found: Track, number: int) -> MeasuredRelativePose:
+def factor_to(found: TrackedFrame, number: int) -> MeasuredRelativePose:
     """Return the odometry factor of a frame that became keyframe `number`.
 
     Information from other keyframes is left out: it enters by their own edges and would count twice.
@@ -294,12 +296,12 @@ def tie_to(found: Track, number: int) -> MeasuredRelativePose:
     own = found.alone or found
     return MeasuredRelativePose(
         *(own.keyframe.number, number, own.relative, own.information),
-        by_rays=own.evidence.by_rays,
-        recorded=own.evidence.recorded,
+        by_two_view=own.quality.by_two_view,
+        recorded=own.quality.recorded,
     )
 
 
-def tie_between(first: Track, second: Track) -> MeasuredRelativePose:
+def factor_between(first: TrackedFrame, second: TrackedFrame) -> MeasuredRelativePose:
     """Return the relative-pose factor between the keyframes of two tracks of one frame."""
     first, second = first.alone or first, second.alone or second
     motion = rigid.invert(second.relative) @ first.relative
@@ -334,32 +336,65 @@ def _by_descriptors(given: TrackingInput, keyframe: Keyframe, matcher: PointMatc
 
 
 def _judged(
-    pose: np.ndarray, measured: np.ndarray, evidence: Evidence, keyframe: Keyframe, prior: MotionPrior | None
-) -> Track:
+    pose: np.ndarray, measured: np.ndarray, quality: TrackingQuality, keyframe: Keyframe, prior: MotionPrior | None
+) -> TrackedFrame:
     """Return a track with its standard deviations in the worst directions and its distance from the prior."""
-    track = Track(keyframe, pose, measured, evidence, GeometryResult.SUCCESS)
+    track = TrackedFrame(keyframe, pose, measured, quality, GeometryResult.SUCCESS)
     sigma_translation, sigma_rotation = worst_sigma(track.information)
-    evidence = replace(
-        evidence,
+    quality = replace(
+        quality,
         sigma_translation=sigma_translation,
         sigma_rotation=sigma_rotation,
         chi2=float("nan") if prior is None else step_chi2(pose, prior.pose, prior.step, prior.waited),
     )
-    return replace(track, evidence=evidence)
+    return replace(track, quality=quality)
 
 
-def _seen(guess: PoseGuess, matches: int, by_points: Motion | None, dense: Aligned | None) -> Evidence:
-    evidence = Evidence(matches=matches, inliers=guess.inlier_count, error=guess.error)
+def _seen(guess: PoseGuess, matches: int, by_points: Motion | None, dense: Aligned | None) -> TrackingQuality:
+    quality = TrackingQuality(matches=matches, inliers=guess.inlier_count, error=guess.error)
     if dense is None:
-        return evidence
+        return quality
     apart = float("nan")
     if by_points is not None:
         apart = float(np.linalg.norm(by_points.motion[:3, 3] - dense.motion[:3, 3]))
     return replace(
-        evidence,
+        quality,
         correlation=dense.correlation,
         edges=dense.edges,
         surface=dense.surface,
         overlap=dense.overlap,
         agreement=apart,
+    )
+
+
+def view_of(keyframe: Keyframe, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> RgbdView | None:
+    """Return a keyframe's view for the alignment: stored for the reference, else computed."""
+    if roles.alignment is None:
+        return None
+    if tracker.reference is not None and tracker.reference[0] == keyframe.number:
+        return tracker.reference[1]
+    depth = keyframe.depth.astype(np.float32), keyframe.depth_sigma.astype(np.float32)
+    return RgbdView.of(keyframe.image, depth, intrinsics)
+
+
+def frame_data(frame: Frame, description: Description, intrinsics: np.ndarray, roles: Roles, metric: bool) -> FrameData:
+    """Return the frame's data for tracking. metric: whether lengths of the map are metres."""
+    view = None
+    if roles.alignment is not None and metric:
+        view = description.view_by(intrinsics)
+        view = view or RgbdView.of(frame.image, roles.tracking_depth(frame.depth), intrinsics)
+    return FrameData(frame, description, view)
+
+
+def record_of(frame: Frame, found: TrackedFrame) -> FramePose:
+    """Return the record of a tracked frame relative to its keyframe."""
+    return FramePose(
+        frame.index,
+        frame.timestamp,
+        found.keyframe.number,
+        found.relative,
+        True,
+        found.quality.inliers,
+        found.quality,
+        seen=found.seen,
     )

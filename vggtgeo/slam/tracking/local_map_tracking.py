@@ -20,8 +20,8 @@ from vggtgeo.geometry.robust import POSE_GATE, TUKEY, inverse_information
 from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
-from vggtgeo.slam.tracking.evidence import tangent
-from vggtgeo.slam.tracking.following import MAX_POINTS
+from vggtgeo.slam.tracking.flow_tracking import MAX_POINTS
+from vggtgeo.slam.tracking.pose_acceptance import tangent
 
 MAX_KEYFRAMES = 4
 """Further keyframes that are searched: each costs a search in the frame's key points."""

@@ -19,13 +19,13 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.simulation import simulate
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
-from vggtgeo.slam.recorded_prior import prior_summary, with_recorded_ties
+from vggtgeo.slam.pose_prior import prior_summary, with_recorded_factors
+from vggtgeo.slam.pose_prior_check import SIGNIFICANT, compare
 from vggtgeo.slam.run import frame_trajectory
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map, longer, scaled_factor, scaled_keyframe, submap_of
 from vggtgeo.slam.state import Slam
-from vggtgeo.slam.tracking.recorded_motion import SIGNIFICANT, compare
 from vggtgeo.slam.tracking.tracking_state import FramePose, Tracker
 
 SIZE = (320, 240)
@@ -79,14 +79,14 @@ def _ties(truth: Trajectory, noise: float, rng: np.random.Generator) -> Map:
         for number, (pose, time) in enumerate(zip(poses, truth.timestamps, strict=True))
     )
     sigma = np.repeat([noise, noise / 3], 3)
-    ties = tuple(
+    factors = tuple(
         MeasuredRelativePose(
             *(row, row + 1, rigid.exponential(rng.normal(size=6) * sigma) @ poses[row + 1] @ rigid.invert(poses[row])),
             information=np.diag(1 / sigma**2),
         )
         for row in range(len(poses) - 1)
     )
-    return Map(metric=True, keyframes=keyframes, factors=ties, roots=(0,))
+    return Map(metric=True, keyframes=keyframes, factors=factors, roots=(0,))
 
 
 def test_a_pose_between_two_recorded_ones_is_on_the_way() -> None:
@@ -118,8 +118,8 @@ def test_wrongly_tracked_motions_do_not_decide(walk: Walk) -> None:
     known = _ties(truth, 0.003, rng)
     wrong = {*range(15, 35)} - {*range(15, 35, 3)}
     factors = [
-        replace(tie, pose=rigid.exponential(rng.normal(size=6) * 0.3) @ tie.pose) if row in wrong else tie
-        for row, tie in enumerate(known.odometry_factors)
+        replace(factor, pose=rigid.exponential(rng.normal(size=6) * 0.3) @ factor.pose) if row in wrong else factor
+        for row, factor in enumerate(known.odometry_factors)
     ]
     assert compare(RecordedPoses(_disturbed(truth)), replace(known, factors=tuple(factors))).accepted
 
@@ -130,7 +130,7 @@ def test_motions_of_any_other_time_are_no_evidence(walk: Walk) -> None:
     """
     truth, rng = walk[2], np.random.default_rng(2)
     known = _ties(truth, 0.003, rng)
-    motions = [tie.pose for tie in known.odometry_factors]
+    motions = [factor.pose for factor in known.odometry_factors]
     found = []
     for _ in range(100):
         poses = [np.eye(4)]
@@ -172,7 +172,7 @@ def test_submaps_are_joined_in_the_unit_of_the_recording(walk: Walk) -> None:
         for keyframe in known.keyframes
     )
     factors = tuple(
-        scaled_factor(tie, float(scale[tie.first])) for tie in known.odometry_factors if tie.second != first
+        scaled_factor(factor, float(scale[factor.first])) for factor in known.odometry_factors if factor.second != first
     )
     records = [FramePose(row, float(time), row, np.eye(4), True, 50) for row, time in enumerate(truth.timestamps)]
     lost = FramePose(99, float(truth.timestamps[-1]) + 0.05, 35, np.eye(4), False, 0)
@@ -185,7 +185,7 @@ def test_submaps_are_joined_in_the_unit_of_the_recording(walk: Walk) -> None:
         np.append(truth.timestamps, truth.timestamps[-1] + 0.1), np.concatenate([truth.poses, truth.poses[-1:]])
     )
     recorded = RecordedPoses(_disturbed(beyond, drift=0.0))
-    joined = with_recorded_ties(slam, replace(ROLES, depth=NoDepth(), recorded=recorded))
+    joined = with_recorded_factors(slam, replace(ROLES, depth=NoDepth(), recorded=recorded))
     assert submap_of(joined.map).max() == 0
     assert joined.map.roots == (0,)
     error = evaluate_trajectory(frame_trajectory(joined), recorded.trajectory)
@@ -223,6 +223,6 @@ def test_another_recording_changes_nothing(walk: Walk) -> None:
     roles = replace(ROLES, recorded=RecordedPoses(_other(truth)))
     slam, plain = _run(bright, roles), _run(bright, ROLES)
     np.testing.assert_array_equal(frame_trajectory(slam).poses, frame_trajectory(plain).poses)
-    ended = with_recorded_ties(slam, roles)
+    ended = with_recorded_factors(slam, roles)
     assert len(ended.map.factors) == len(plain.map.factors)
     assert "not used" in ended.notes[-1]

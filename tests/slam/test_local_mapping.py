@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
+from vggtgeo.slam.local_mapping import LAG, begin_window, is_due, merge_pending_window
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.tracking_state import FramePose
 from vggtgeo.slam.window.sliding_window import Window
-from vggtgeo.slam.window_steps import LAG, begin_window, is_due, merge_pending_window
 
 CAMERA = np.array([100.0, 100.0, 50.0, 50.0])
 STATE = Slam(

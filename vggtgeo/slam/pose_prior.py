@@ -2,7 +2,7 @@
 
 They tell where the next frame is, place frames that no image places, and give factors between keyframes; at the end
 also the unit of a map without depth, and the places of submaps that never met. All this only while the images agree
-with them (`tracking/recorded_motion.py`): until then, and where they are of another recording, a run with them is to
+with them (`slam/pose_prior_check.py`): until then, and where they are of another recording, a run with them is to
 the last bit the run without.
 """
 
@@ -19,21 +19,21 @@ from vggtgeo.slam.global_map.drift_correction import at_poses
 from vggtgeo.slam.global_map.joining import moved_submap
 from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, squared_distance
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
+from vggtgeo.slam.pose_prior_check import (
+    Comparison,
+    carried,
+    compare,
+    recorded_factor,
+    recorded_factors_of,
+    recorded_units,
+    weighted_median,
+)
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import longer, submap_of
 from vggtgeo.slam.state import Slam, submaps_by_size
-from vggtgeo.slam.tracking.recorded_motion import (
-    Comparison,
-    carried,
-    compare,
-    recorded_tie,
-    recorded_ties,
-    recorded_units,
-    weighted_median,
-)
-from vggtgeo.slam.tracking.track import Track
+from vggtgeo.slam.tracking.frame_tracking import TrackedFrame
 from vggtgeo.slam.tracking.tracking_state import FramePose
 
 AROUND = 5
@@ -53,7 +53,7 @@ class RecordedPrior:
         motion = None if last is None else self.recorded.motion(last.timestamp, time)
         return None if motion is None else longer(motion, self.unit)
 
-    def carried(self, slam: Slam, time: float) -> Track | None:
+    def carried(self, slam: Slam, time: float) -> TrackedFrame | None:
         """Place a frame that images do not place, by the recorded motion from the last one with a pose."""
         last = last_placed(slam)
         return None if last is None else carried(self.recorded, slam.map, last, time, self.unit)
@@ -63,14 +63,14 @@ class RecordedPrior:
         motion = self.recorded.motion(keyframe.timestamp, time)
         return None if motion is None else self.unit * float(np.linalg.norm(motion[:3, 3]))
 
-    def with_tie(self, slam: Slam) -> Slam:
+    def with_factor(self, slam: Slam) -> Slam:
         """Add the recorded motion to the newest keyframe from the one before, if both are in one submap."""
         label, (before, newest) = submap_of(slam.map), slam.keyframes[-2:]
-        known = any(tie.keyframes == (before.number, newest.number) for tie in slam.map.recorded_factors)
-        tie = recorded_tie(self.recorded, before, newest, self.unit)
-        if tie is None or known or label[before.number] != label[newest.number]:
+        known = any(factor.keyframes == (before.number, newest.number) for factor in slam.map.recorded_factors)
+        factor = recorded_factor(self.recorded, before, newest, self.unit)
+        if factor is None or known or label[before.number] != label[newest.number]:
             return slam
-        return slam.with_factors(tie)
+        return slam.with_factors(factor)
 
 
 def recorded_prior(slam: Slam, roles: Roles) -> RecordedPrior | None:
@@ -96,7 +96,7 @@ def prior_summary(slam: Slam, roles: Roles) -> dict[str, Any]:
     return {"pose_prior": {"used": found.accepted, **asdict(found)}}
 
 
-def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
+def with_recorded_factors(slam: Slam, roles: Roles) -> Slam:
     """Add all recorded motions between keyframes before the last adjustment, if the images agree with them.
 
     Without agreement none is added. A map of free scale gets the unit of the recording. Submaps, and frames that no
@@ -108,19 +108,19 @@ def with_recorded_ties(slam: Slam, roles: Roles) -> Slam:
     slam = slam.with_notes(_note(found))
     if not found.accepted:
         # A keyframe that no image ties to the others stays tied by what was recorded.
-        return _with_ties(slam, [tie for tie in slam.map.recorded_factors if _alone(slam, tie)])
+        return _with_factors(slam, [factor for factor in slam.map.recorded_factors if _alone(slam, factor)])
     units = recorded_units(roles.recorded, slam.map)
     if not slam.metric:
         slam = _in_recorded_unit(slam, roles.recorded, units)
         units = np.where(np.isfinite(units), 1.0, np.nan)
     slam = _with_carried_frames(_joined(slam, roles.recorded, units), roles.recorded, units)
-    return _with_ties(slam, recorded_ties(roles.recorded, slam.map, units))
+    return _with_factors(slam, recorded_factors_of(roles.recorded, slam.map, units))
 
 
-def _with_ties(slam: Slam, ties: list[MeasuredRelativePose]) -> Slam:
+def _with_factors(slam: Slam, recorded: list[MeasuredRelativePose]) -> Slam:
     """Replace the recorded motions of the state."""
-    factors = [factor for factor in slam.map.factors if not getattr(factor, "recorded", False)]
-    return slam.with_map(factors=(*factors, *ties))
+    others = [factor for factor in slam.map.factors if not getattr(factor, "recorded", False)]
+    return slam.with_map(factors=(*others, *recorded))
 
 
 def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
@@ -134,25 +134,25 @@ def _in_recorded_unit(slam: Slam, recorded: RecordedPoses, units: np.ndarray) ->
         if not np.isfinite(units[submap[0]]):
             continue
         numbers = tuple(sorted(submap, key=lambda number: slam.keyframes[number].timestamp))
-        ties = [
-            recorded_tie(recorded, slam.keyframes[first], slam.keyframes[second], 1.0)
+        steps = [
+            recorded_factor(recorded, slam.keyframes[first], slam.keyframes[second], 1.0)
             for first, second in pairwise(numbers)
         ]
-        local = _local_units(slam, ties, numbers, float(units[numbers[0]]))
+        local = _local_units(slam, steps, numbers, float(units[numbers[0]]))
         scales[list(numbers)] = 1.0 / local
         poses[numbers[0], :3, 3] /= local[0]
-        for row, (tie, (first, second)) in enumerate(zip(ties, pairwise(numbers), strict=True)):
+        for row, (factor, (first, second)) in enumerate(zip(steps, pairwise(numbers), strict=True)):
             before, after = (slam.keyframes[number].pose for number in (first, second))
             poses[second] = longer(after @ rigid.invert(before), 1.0 / local[row]) @ poses[first]
-            if tie is not None and squared_distance(tie, poses) > LOOP_GATE:
-                recorded_motion = tie.pose if tie.second == second else rigid.invert(tie.pose)
+            if factor is not None and squared_distance(factor, poses) > LOOP_GATE:
+                recorded_motion = factor.pose if factor.second == second else rigid.invert(factor.pose)
                 poses[second] = recorded_motion @ poses[first]
     factors = tuple(factor for factor in slam.map.factors if not isinstance(factor, MeasuredBaseline))
     return at_poses(slam.with_map(factors=factors), poses, scales)
 
 
 def _local_units(
-    slam: Slam, ties: list[MeasuredRelativePose | None], numbers: tuple[int, ...], usual: float
+    slam: Slam, factors: list[MeasuredRelativePose | None], numbers: tuple[int, ...], usual: float
 ) -> np.ndarray:
     """Return the length of a unit of the recording at each keyframe of a submap.
 
@@ -161,7 +161,7 @@ def _local_units(
     """
     places = rigid.centres(np.array([slam.keyframes[number].pose for number in numbers]))
     lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    true = np.array([0.0 if tie is None else np.linalg.norm(tie.pose[:3, 3]) for tie in ties])
+    true = np.array([0.0 if factor is None else np.linalg.norm(factor.pose[:3, 3]) for factor in factors])
     found = np.full(len(numbers), usual)
     for row in range(len(numbers)):
         around = slice(max(row - AROUND, 0), row + AROUND)
@@ -180,12 +180,12 @@ def _joined(slam: Slam, recorded: RecordedPoses, units: np.ndarray) -> Slam:
     for other in others:
         pairs = product((slam.keyframes[number] for number in main), (slam.keyframes[number] for number in other))
         near, own = min(pairs, key=lambda pair: abs(pair[0].timestamp - pair[1].timestamp))
-        tie = recorded_tie(recorded, near, own, float(units[own.number]))
-        if tie is None:
+        factor = recorded_factor(recorded, near, own, float(units[own.number]))
+        if factor is None:
             continue
-        motion = tie.pose if tie.second == own.number else rigid.invert(tie.pose)
+        motion = factor.pose if factor.second == own.number else rigid.invert(factor.pose)
         began = slam.keyframes[min(other)].frame
-        slam = moved_submap(slam, other, rigid.invert(own.pose) @ motion @ near.pose).with_factors(tie)
+        slam = moved_submap(slam, other, rigid.invert(own.pose) @ motion @ near.pose).with_factors(factor)
         slam = slam.with_notes(f"the submap that began at frame {began} is joined to the rest by recorded poses")
         slam = slam.with_window(prior=None, solved=None, held=())
         main |= other
@@ -205,16 +205,16 @@ def _with_carried_frames(slam: Slam, recorded: RecordedPoses, units: np.ndarray)
     return slam.with_tracker(frames=tuple(frames))
 
 
-def _placed_by(record: FramePose, found: Track) -> FramePose:
+def _placed_by(record: FramePose, found: TrackedFrame) -> FramePose:
     number = found.keyframe.number
-    return replace(record, reference=number, relative=found.relative, tracked=True, evidence=found.evidence)
+    return replace(record, reference=number, relative=found.relative, tracked=True, quality=found.quality)
 
 
-def _alone(slam: Slam, tie: MeasuredRelativePose) -> bool:
+def _alone(slam: Slam, factor: MeasuredRelativePose) -> bool:
     """Return whether no other factor connects the later keyframe of a recorded motion to an earlier one."""
-    earlier = [pair.first for pair in slam.map.pairs if pair.second == tie.second and len(pair.points)]
-    tracked = [other.first for other in slam.map.odometry_factors if other.second == tie.second]
-    return not any(number < tie.second for number in (*earlier, *tracked))
+    earlier = [pair.first for pair in slam.map.pairs if pair.second == factor.second and len(pair.points)]
+    tracked = [other.first for other in slam.map.odometry_factors if other.second == factor.second]
+    return not any(number < factor.second for number in (*earlier, *tracked))
 
 
 def _note(found: Comparison) -> str:

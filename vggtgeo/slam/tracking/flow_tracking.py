@@ -27,7 +27,7 @@ smallest weight, so that maps without measured depth can be tracked."""
 MIN_FOLLOWED = 0.4
 """Minimum share of the points in view that optical flow must follow; from a bad guess it still follows 0.4 or more."""
 MIN_INLIER_SHARE = 0.7
-"""Minimum inlier share of the followed points; wrong poses have at most 0.5, see `evidence.py`."""
+"""Minimum inlier share of the followed points; wrong poses have at most 0.5, see `pose_acceptance.py`."""
 MIN_INLIERS = 60
 """Above it a frame does not become a keyframe for want of matches (`KeyframeSettings.min_inliers`)."""
 MAX_KEPT = 128
