@@ -8,7 +8,7 @@ earlier marginalisations. At fixed linearisation points they form the quadratic
 from which the landmarks and then the leaving pose are eliminated by Schur complements. The square root of the result is
 the new prior `1/2 |R x + r0|^2`. States that are already under a prior keep their linearisation point (first-estimates
 Jacobians): two linearisations of one state would add spurious information along the gauge. Cost: one linearisation, one
-symmetric eigenvalue problem of size `6 n + 4`.
+symmetric eigenvalue problem of size `6 n + q`, for `q` camera parameters.
 
 `slide` is one step of a sliding window, with static shapes: a solved window of `n` keyframes loses one, which is
 marginalised, the others move up, and a new one takes the last position. The observations of the new window are packed
@@ -36,7 +36,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.landmark import HostPixel, SlotTerm
 from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
-from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, PairTerm, PoseTerm
+from vggtgeo.bundle.terms.node import DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie
@@ -46,7 +46,7 @@ from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 _MAX_KEYFRAMES = 1000
 """Largest number of keyframes of a prior, whose matrix is dense: 0.3 GB."""
-_Quadratic = tuple[Float[Array, "c c"], Float[Array, " c"]]
+_MatrixAndVector = tuple[Float[Array, "c c"], Float[Array, " c"]]
 
 
 def empty_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters: int = 4) -> MarginalPrior:
@@ -97,10 +97,7 @@ def marginalise(problem: Problem, state: State, leaving: Int[Array, ""] | int) -
     point = _linearisation_point(prior, state)
     quadratic, gradient, finite = _quadratic(problem, point, leaving)
     check_linearisation(problem, point, finite)
-    leaving_rows = jnp.arange(len(gradient)) // lie.TANGENT == leaving
-    leaving_rows = leaving_rows.at[-problem.num_parameters :].set(False)
-    # Known exactly, hence conditioned on; eliminating them would treat them as unknown.
-    quadratic, gradient = _eliminate(quadratic, gradient, leaving_rows, free_coordinates(problem))
+    quadratic, gradient = _eliminate(quadratic, gradient, leaving, free_coordinates(problem))
     root, offset = nan_unless_finite(finite, square_root(quadratic, gradient))
     return MarginalPrior(
         root=root, offset=offset, poses=point.poses, intrinsics=point.parameters, weight=jnp.ones_like(offset, shape=())
@@ -181,29 +178,32 @@ def _leaving(term: AbstractTerm, problem: Problem, leaving: Int[Array, ""] | int
         goes = (term.first == leaving) | (term.second == leaving)
     else:
         # The earlier prior becomes part of the new one. Terms on the camera stay in the problem and would count twice.
-        goes = jnp.asarray(isinstance(term, DenseTerm) and not isinstance(term, CameraTerm))
+        goes = jnp.asarray(isinstance(term, DenseTerm))
     return term.reweighted(jnp.where(goes, term.weight, jnp.zeros_like(term.weight)))
 
 
 def _eliminate(
-    quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], rows: Bool[Array, " c"], free: Bool[Array, " c"]
-) -> _Quadratic:
-    """Condition on fixed coordinates, then eliminate the leaving rows by a Schur complement (pseudo-inverse)."""
+    quadratic: Float[Array, "c c"], gradient: Float[Array, " c"], leaving: Int[Array, ""] | int, free: Bool[Array, " c"]
+) -> _MatrixAndVector:
+    """Condition on fixed coordinates, then eliminate the leaving pose by a Schur complement; its rows become zero."""
+    # Fixed coordinates are known exactly; eliminating them would treat them as unknown.
     quadratic = jnp.where(free[:, None] & free[None, :], quadratic, 0.0)
     gradient = jnp.where(free, gradient, 0.0)
-    inner = jnp.where(rows[:, None] & rows[None, :], quadratic, 0.0)
+    size, first = len(gradient), lie.TANGENT * leaving
+    rows = jnp.arange(size) // lie.TANGENT == leaving
+    inner = jax.lax.dynamic_slice(quadratic, (first, first), (lie.TANGENT, lie.TANGENT))
+    unit = _balance(inner)
     # A pseudo-inverse: the leaving pose may be undetermined by the terms that leave with it.
-    inverse = jnp.linalg.pinv(inner, hermitian=True)
-    coupling = jnp.where(~rows[:, None] & rows[None, :], quadratic, 0.0)
-    remaining = jnp.where(~rows[:, None] & ~rows[None, :], quadratic, 0.0)
-    remaining = remaining - coupling @ inverse @ coupling.T
-    gradient = jnp.where(rows, 0.0, gradient - coupling @ inverse @ gradient)
+    inverse = jnp.linalg.pinv(inner / unit[:, None] / unit, hermitian=True) / unit[:, None] / unit
+    coupling = jnp.where(rows[:, None], 0.0, jax.lax.dynamic_slice(quadratic, (0, first), (size, lie.TANGENT)))
+    remaining = jnp.where(rows[:, None] | rows, 0.0, quadratic) - coupling @ inverse @ coupling.T
+    by_leaving = coupling @ inverse @ jax.lax.dynamic_slice(gradient, (first,), (lie.TANGENT,))
     # Products of a Schur complement are symmetric up to rounding only, and `eigh` below reads one triangle.
-    return (remaining + remaining.T) / 2, gradient
+    return (remaining + remaining.T) / 2, jnp.where(rows, 0.0, gradient - by_leaving)
 
 
 @jax.custom_jvp
-def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) -> _Quadratic:
+def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) -> _MatrixAndVector:
     """Return `R, r0` with `R' R = H` and `R' r0 = g` on the subspace where `H` is positive.
 
     The result is unique up to a rotation from the left, which does not change the prior. The derivative is one of those
@@ -224,7 +224,9 @@ def square_root(quadratic: Float[Array, "c c"], gradient: Float[Array, " c"]) ->
 
 
 @square_root.defjvp
-def _square_root_derivative(primals: _Quadratic, tangents: _Quadratic) -> tuple[_Quadratic, _Quadratic]:
+def _square_root_derivative(
+    primals: _MatrixAndVector, tangents: _MatrixAndVector
+) -> tuple[_MatrixAndVector, _MatrixAndVector]:
     """Differentiate with a right inverse `Q` of the kept rows, `R Q = I`:
 
         dR = Q' dH (I - Q R / 2),     dr0 = Q' (dg - dR' r0).

@@ -46,7 +46,7 @@ def insert_keyframe(
 ) -> Slam:
     """Insert a keyframe, which was tracked against `tied_to`, into the window and match it to the others.
 
-    length_known: whether the distance to `tied_to` is measured. Images of keyframes outside the window are compressed.
+    Images of keyframes outside the window are compressed. length_known: whether the distance to `tied_to` is measured.
     """
     window = marginalise_oldest(slam.window, settings, tied_to)
     match = lambda number: match_keyframes(
@@ -102,6 +102,7 @@ def begin_window(slam: Slam, adjusted: Callable[[], Slam]) -> Slam:
     pool = ThreadPoolExecutor(1, thread_name_prefix="window")
     result = pool.submit(in_double_precision(adjusted))
     pool.shutdown(wait=False)
+    # The caller adds the new keyframe's own frame after this, hence 1.
     return replace(slam, pending=PendingWindow(len(slam.frames) + 1 + LAG, slam, result))
 
 
@@ -113,8 +114,8 @@ def is_due(slam: Slam) -> bool:
 def merge_pending_window(slam: Slam) -> Slam:
     """Wait for the pending window and merge it.
 
-    Keyframes, matches and window are from its thread; frames, factors and notes added since it began from tracking. For
-    frames before it began, the thread's records are used.
+    Keyframes, matches, camera, window, and the records of frames before it began are from its thread. Velocity, lost
+    count, and the frames, factors and notes added since then are from tracking.
     """
     if slam.pending is None:
         return slam

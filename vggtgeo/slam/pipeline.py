@@ -182,7 +182,7 @@ def _moved(slam: Slam, frame: Frame, found: TrackedFrame) -> Slam:
         velocity = np.eye(4)
     else:
         velocity = found.pose @ rigid.invert(slam.last_pose)
-    return replace(slam, tracker=replace(slam.tracker, velocity=velocity, lost=0))
+    return slam.with_tracker(velocity=velocity, lost=0)
 
 
 def _decide(
@@ -262,15 +262,14 @@ def _insert_and_adjust(
         keyframe = make_keyframe(
             number, frame, found.pose, data.description, roles, settings, slam.intrinsics, data.found_lines
         )
-    tracked = found.keyframe.number, found.relative
-    record = FramePose(
-        *(frame.index, frame.timestamp, number, np.eye(4), True, found.quality.inliers, found.quality), tracked
-    )
+    arrival, inliers = (found.keyframe.number, found.relative), found.quality.inliers
+    record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, inliers, found.quality, arrival)
     odometry = factor_to(found, number)
     if odometry.first not in slam.window.members:
         slam = _window_around(slam, odometry.first, settings)
-    slam = replace(slam, tracker=replace(slam.tracker, reference=(number, data.view)))
+    slam = slam.with_tracker(reference=(number, data.view))
 
+    # From `slam`, in which the new keyframe is not yet inserted: its thread inserts it with its matches.
     def adjusted(own: str) -> Slam:
         with clock.measure("match keyframes" + own):
             measured = not found.quality.by_two_view
@@ -297,7 +296,7 @@ def _insert_and_adjust(
 
 
 def _with_record(slam: Slam, record: FramePose) -> Slam:
-    return replace(slam, tracker=replace(slam.tracker, frames=(*slam.frames, record)))
+    return slam.with_tracker(frames=(*slam.frames, record))
 
 
 def _with_odometry(slam: Slam, odometry: MeasuredRelativePose) -> Slam:
@@ -333,10 +332,11 @@ def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     """
     label = submap_of(slam.map)
     around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
-    window = tuple(other for other in around if label[other] == label[number])[-(settings.window.size - 1) :]
+    own = sorted((other for other in around if label[other] == label[number]), key=lambda other: abs(other - number))
+    window = tuple(sorted(own[: settings.window.size - 1]))
     # Without metric depth one held pose leaves the unit free: two hold it.
     held = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
-    return replace(slam, window=replace(slam.window, members=window, prior=None, solved=None, held=held))
+    return slam.with_window(members=window, prior=None, solved=None, held=held)
 
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:

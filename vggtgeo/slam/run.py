@@ -119,7 +119,7 @@ def run_frames(
 ) -> Iterator[Slam]:
     """As `run`, for an iterable of frames; continue from the state `known`, or begin a new map if it is None.
 
-    before: the last frames of that state, of which the run that goes on asks whether the next depth image is new.
+    before: the last frames of that state; the first depth image is dropped if it repeats theirs (`with_own_depth`).
     waiting: entered while a frame is waited for.
     """
     slam = begin(camera, roles) if known is None else known
@@ -164,13 +164,14 @@ def finish(
     check_whole("rounds", rounds, 1)
     slam, roles, settings = merge_pending_window(slam), roles or default_roles(slam.metric), settings or SlamSettings()
     fixed = settings.keyframes.localise_only or not settings.refinement.global_adjustment
-    if fixed or len(slam.keyframes) < 3:
+    if fixed or len(slam.keyframes) < 3:  # the window has adjusted two as well as it can be done
         return slam
     clock = clock or Clock()
     with clock.measure("place frames"):
         slam = replace(slam, tracker=against_nearest(slam.map, slam.tracker, slam.intrinsics, roles))
     with clock.measure("loops"):
         slam = place_lost_without_depth(join_at_end(slam, roles), roles, settings)
+        # Lost frames that were placed may link submaps that nothing linked before.
         slam = with_recorded_factors(join_at_end(slam, roles), roles)
         slam = close_loops(slam, roles, settings)
     with clock.measure("global adjustment"):

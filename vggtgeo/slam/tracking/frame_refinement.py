@@ -3,7 +3,7 @@
 A frame that is tracked against one keyframe has the error of one alignment, and the path has a step where the reference
 changes. So the last frames before that are also aligned to the next keyframe while their images are in memory. Both
 relative motions are kept as measured. The pose of the frame is their mean by information, each with its systematic
-error, which grows with the distance from its keyframe (`pose_fusion.with_systematic`). So the path changes smoothly from one
+error, which grows with the distance from its keyframe (`with_systematic`). So the path changes smoothly from one
 keyframe to the next, wherever adjustments move them. Keyframes are not changed.
 """
 

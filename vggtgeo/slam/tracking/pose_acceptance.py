@@ -61,7 +61,7 @@ class TrackingQuality:
     degrees of freedom. agreement: distance between the poses by points and by surface, metres. lines, visible_lines:
     segments of the keyframe that are matched in agreement with the pose, and those expected in the image. map_points:
     number of matched key points of other keyframes. metre: length that stands for a metre in a map of free scale, in
-    its unit, see `pose_fusion.metre_of`. by_two_view: whether the pose is from key points without known depth, so that its
+    its unit, see `metre_of`. by_two_view: whether the pose is from key points without known depth, so that its
     baseline is weakly constrained, see `two_view_motion.py`. recorded: whether it is a recorded pose that no image has
     measured.
     """

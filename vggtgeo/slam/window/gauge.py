@@ -1,8 +1,8 @@
-"""Gauge fixing: exactly one fixed pose in each connected component of a problem.
+"""Gauge fixing: each connected component of a problem is held at one place, and without metric depth at one scale.
 
-Poses are known up to one rigid motion of each connected component. A component without a fixed pose drifts along that
-motion, and the intrinsics with it. A component with two fixed poses keeps the error between them. So each component
-gets exactly one fixed pose, and the user is warned.
+Poses are known up to one rigid motion (one similarity without metric depth) of each connected component. A component
+that nothing holds drifts along it, and the intrinsics with it. A component with two fixed poses keeps the error between
+them. So a component that no prior places gets one fixed pose; a second one only holds a scale that nothing else does.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Gauge:
 
 
 def with_one_gauge(problem: Problem, state: State, keyframes: int, metric: bool) -> tuple[Problem, Gauge]:
-    """Return the problem with exactly one fixed pose in each connected component of its first `keyframes` poses.
+    """Return the problem with one known gauge in each connected component of its first `keyframes` poses.
 
     With metric depth, the first fixed pose of a component stays fixed. Without, several fixed poses of a component
     define its scale, and stay fixed. A marginal prior on absolute poses fixes its component, too.
