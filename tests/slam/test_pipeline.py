@@ -28,7 +28,7 @@ from vggtgeo.slam.global_map.compile_ahead import expected_keyframes
 from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.global_adjustment import adjust_all
 from vggtgeo.slam.global_map.loops import close_loops
-from vggtgeo.slam.local_mapping import adjust_window, camera_prior
+from vggtgeo.slam.local_mapping import adjust_window, camera_prior, window_around
 from vggtgeo.slam.run import finish, frame_trajectory
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.settings.table import updated
@@ -136,6 +136,11 @@ def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
     assert expected_keyframes(6, 30, 100) == 20
     assert expected_keyframes(6, 31, 100) is None
     assert [expected_keyframes(count, 31, None) for count in (7, 8, 70)] == [None, 8, 70]
+
+
+def test_a_window_of_three_around_an_old_keyframe_keeps_it(tracked: Slam) -> None:
+    around = window_around(tracked, 1, updated(SETTINGS, {"window": {"size": 3}})).window
+    assert (around.members, around.held) == ((0, 1), (1,))
 
 
 @pytest.mark.long

@@ -17,6 +17,7 @@ from vggtgeo.models.classical import can_search
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import match_keyframes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import PendingWindow, Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.window.adjustment import CameraPrior, write_back
@@ -33,6 +34,8 @@ from vggtgeo.slam.window.sliding_window import (
 LAG = 6
 """Largest number of frames tracked meanwhile: matching and adjustment take as long as about five frames on two cores
 (`benchmarks/stage_times.py`)."""
+NEIGHBOURS = 3
+"""Keyframes before and after an old one that make up the window when the camera comes back to it."""
 
 
 def insert_keyframe(
@@ -91,6 +94,20 @@ def adjust_window(slam: Slam, settings: SlamSettings) -> Slam:
 def camera_prior(slam: Slam) -> CameraPrior:
     """Return the prior of the intrinsics in the window."""
     return CameraPrior(slam.camera.given, slam.camera.window_sigma(len(slam.keyframes)))
+
+
+def window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
+    """Return a window of the keyframes around an old one, which is fixed: the camera has come back to it.
+
+    Only of its own submap: the pose of another one is a guess, so matches predicted from it would be wrong.
+    """
+    label = submap_of(slam.map)
+    around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
+    own = sorted((other for other in around if label[other] == label[number]), key=lambda other: abs(other - number))
+    window = tuple(sorted(own[: settings.window.size - 1]))
+    # Without metric depth one held pose leaves the unit free: two hold it.
+    held = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
+    return slam.with_window(members=window, prior=None, solved=None, held=held)
 
 
 def begin_window(slam: Slam, adjusted: Callable[[], Slam]) -> Slam:

@@ -15,7 +15,14 @@ from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.joining import join_submaps
 from vggtgeo.slam.keyframe_decision import becomes_keyframe, track_by_old_keyframe, view_change
-from vggtgeo.slam.local_mapping import adjust_window, begin_window, insert_keyframe, is_due, merge_pending_window
+from vggtgeo.slam.local_mapping import (
+    adjust_window,
+    begin_window,
+    insert_keyframe,
+    is_due,
+    merge_pending_window,
+    window_around,
+)
 from vggtgeo.slam.manhattan import constrain_rotation
 from vggtgeo.slam.map_initialisation import (
     begin_again_with_depth,
@@ -29,7 +36,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import without_matches
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, find_lines, make_keyframe
-from vggtgeo.slam.sparse_map.map import Map, submap_of
+from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import against_reference, with_view
 from vggtgeo.slam.tracking.frame_tracking import (
@@ -53,9 +60,6 @@ from vggtgeo.slam.tracking.relocalisation import relocalise
 from vggtgeo.slam.tracking.tracking_state import FramePose
 from vggtgeo.slam.tracking.two_view_motion import usual_step
 from vggtgeo.slam.tracking.waiting_frames import begins_submap, place_waiting, wait
-
-NEIGHBOURS = 3
-"""Keyframes before and after an old one that make up the window when the camera comes back to it."""
 
 
 def begin(camera: Camera, roles: Roles) -> Slam:
@@ -266,7 +270,7 @@ def _insert_and_adjust(
     record = FramePose(frame.index, frame.timestamp, number, np.eye(4), True, inliers, found.quality, arrival)
     odometry = factor_to(found, number)
     if odometry.first not in slam.window.members:
-        slam = _window_around(slam, odometry.first, settings)
+        slam = window_around(slam, odometry.first, settings)
     slam = slam.with_tracker(reference=(number, data.view))
 
     # From `slam`, in which the new keyframe is not yet inserted: its thread inserts it with its matches.
@@ -323,20 +327,6 @@ def _with_view(slam: Slam, view: RgbdView | None, roles: Roles) -> Slam:
 
 def _place_waiting(slam: Slam, roles: Roles) -> Slam:
     return replace(slam, tracker=place_waiting(slam.map, slam.tracker, slam.intrinsics, roles))
-
-
-def _window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
-    """Return a window of the keyframes around an old one, which is fixed: the camera has come back to it.
-
-    Only of its own submap: the pose of another one is a guess, so matches predicted from it would be wrong.
-    """
-    label = submap_of(slam.map)
-    around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
-    own = sorted((other for other in around if label[other] == label[number]), key=lambda other: abs(other - number))
-    window = tuple(sorted(own[: settings.window.size - 1]))
-    # Without metric depth one held pose leaves the unit free: two hold it.
-    held = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
-    return slam.with_window(members=window, prior=None, solved=None, held=held)
 
 
 def _noted_found(slam: Slam, frame: Frame) -> Slam:
