@@ -135,7 +135,7 @@ class ArrowSystem(eqx.Module):
     """Known directions along which the energy may be flat (a free scale): unit columns, or zero."""
     factors: NodeFactors | None = None
     """Terms on nodes and pairs of nodes: blocks of the matrix."""
-    held: Bool[Array, "h s"] | None = None
+    at_bound: Bool[Array, "h s"] | None = None
     """Landmarks fixed at an active bound; None: no landmark."""
     segments: SegmentLandmarks | None = None
     """If given, the last `2 g` landmarks are coordinates of segments of `q` samples."""
@@ -209,8 +209,8 @@ def join_landmarks(system: ArrowSystem, fraction: Float[Array, "n m q"] | None) 
         system = eqx.tree_at(lambda s: (s.triples, s.blocks), system, (factors, None), is_leaf=is_none)
     if fraction is None:
         return system
-    changed = join_segments(system.cross, system.held, fraction)
-    return eqx.tree_at(lambda s: (s.cross, s.segments, s.held), system, changed, is_leaf=is_none)
+    changed = join_segments(system.cross, system.at_bound, fraction)
+    return eqx.tree_at(lambda s: (s.cross, s.segments, s.at_bound), system, changed, is_leaf=is_none)
 
 
 def restricted(known: TripleLandmarks | None, values: Float[Array, "h *rows s"]) -> Float[Array, "h *rows s"]:
@@ -221,7 +221,7 @@ def restricted(known: TripleLandmarks | None, values: Float[Array, "h *rows s"])
 def moving_landmarks(system: ArrowSystem) -> Bool[Array, "h s"]:
     """Return the landmarks that are determined and not at an active bound."""
     determined = system.landmark_hessian != 0
-    return determined if system.held is None else determined & ~system.held
+    return determined if system.at_bound is None else determined & ~system.at_bound
 
 
 def inverse_landmark_hessian(system: ArrowSystem) -> Float[Array, "h s"]:

@@ -45,7 +45,7 @@ class BandElimination(AbstractFactor):
         return solve_pinned(self.updates, self.weights, self.pinned_inverse, free), jnp.asarray(True)
 
     def pinned_inverse(self, columns: Float[Array, "c m"]) -> Float[Array, "c m"]:
-        """Return the inverse with flat directions pinned instead of held."""
+        """Return the inverse with flat directions pinned instead of fixed."""
         laid = self.layout.columns(columns, len(self.elimination.corner))
         return self.layout.flat(solve_eliminated(self.elimination, laid))
 

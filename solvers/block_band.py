@@ -171,7 +171,7 @@ def add_to_diagonal(matrix: BandMatrix, added: BandVector) -> BandMatrix:
 
 def factorise(matrix: BandMatrix, moves: BandVector) -> BandFactor:
     """Return the Cholesky factor over the free coordinates (others get a unit diagonal); NaN if not definite."""
-    matrix = held(matrix, moves)
+    matrix = with_fixed(matrix, moves)
     nodes, shared = matrix.diagonal()
     # Scaled to a unit diagonal: metres, radians and pixels differ by orders of magnitude, which would cost as many
     # digits.
@@ -252,7 +252,7 @@ def _kept(system: ArrowSystem, near: Bool[Array, " e"]) -> Bool[Array, "h t t"]:
     return classes[:, :, None] == classes[:, None, :]
 
 
-def held(matrix: BandMatrix, moves: BandVector) -> BandMatrix:
+def with_fixed(matrix: BandMatrix, moves: BandVector) -> BandMatrix:
     """Return the matrix with unit rows and columns for fixed coordinates."""
     nodes, shared = moves.nodes[..., 0], moves.shared[..., 0]
     after = jnp.concatenate([nodes[1:], jnp.zeros_like(nodes[:1])])

@@ -24,7 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
-from vggtgeo.solvers.block_band import BandMatrix, BandVector, balanced, held
+from vggtgeo.solvers.block_band import BandMatrix, BandVector, balanced, with_fixed
 
 REFINEMENTS = 4
 """Number of steps of iterative refinement in a solve; each costs one solve, a few percent of the elimination."""
@@ -71,7 +71,7 @@ def eliminate(matrix: BandMatrix, moves: BandVector, scale: BandVector, toleranc
     """
     unit = lambda size, moving: jnp.where(moving, size, 1.0)
     scale = BandVector(unit(scale.nodes, moves.nodes), unit(scale.shared, moves.shared))
-    matrix = balanced(held(matrix, moves), scale)
+    matrix = balanced(with_fixed(matrix, moves), scale)
     width = matrix.groups.shape[-1]
 
     def body(carry: Any, group: Any) -> tuple[Any, Any]:

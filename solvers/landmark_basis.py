@@ -163,11 +163,11 @@ class SegmentLandmarks(eqx.Module):
 
 
 def join_segments(
-    cross: Float[Array, "n r z"], held: Bool[Array, "n z"] | None, fraction: Float[Array, "n m q"]
+    cross: Float[Array, "n r z"], at_bound: Bool[Array, "n z"] | None, fraction: Float[Array, "n m q"]
 ) -> tuple[Float[Array, "n r s"], SegmentLandmarks, Bool[Array, "n s"] | None]:
     """Restrict the last `m q` landmarks of a host to `m` affine functions of `fraction`.
 
-    cross, held: of an `ArrowSystem`, returned for the new landmarks.
+    cross, at_bound: of an `ArrowSystem`, returned for the new landmarks.
     """
     _, count, samples = fraction.shape
     alone = cross.shape[-1] - count * samples
@@ -186,7 +186,7 @@ def join_segments(
     joined = jnp.einsum("nrms,nmsk->nrkm", rows, joint.basis)
     joined = joined.at[:, -1].set(jnp.stack([own, jnp.where(determined, rest, 0.0)], 1))
     cross = jnp.concatenate([cross[..., :alone], joined.reshape(*joined.shape[:2], 2 * count)], -1)
-    return cross, joint, None if held is None else jnp.pad(held[:, :alone], ((0, 0), (0, 2 * count)))
+    return cross, joint, None if at_bound is None else jnp.pad(at_bound[:, :alone], ((0, 0), (0, 2 * count)))
 
 
 def expand_segments(segments: SegmentLandmarks, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:

@@ -396,7 +396,7 @@ def _gradient_norm(system: ArrowSystem) -> Float[Array, ""]:
     scaled = lambda gradient, curvature: gradient * jax.lax.rsqrt(jnp.where(curvature > 0, curvature, jnp.inf))
     landmarks = scaled(system.landmark_gradient, system.landmark_hessian)
     # A landmark at an active bound is stationary (Karush-Kuhn-Tucker condition).
-    landmarks = landmarks if system.held is None else jnp.where(system.held, 0.0, landmarks)
+    landmarks = landmarks if system.at_bound is None else jnp.where(system.at_bound, 0.0, landmarks)
     dense = jnp.where(system.free, scaled(*dense_gradient(system)), 0.0)
     return jnp.maximum(jnp.max(jnp.abs(landmarks), initial=0.0), jnp.max(jnp.abs(dense), initial=0.0))
 

@@ -59,11 +59,11 @@ def test_observability_as_numbers_words_and_picture(solved: dict[str, Any]) -> N
     """The numbers are those of the report's table, the picture has a bar for each kind and free direction."""
     report = solved["report"]
     numbers = json.loads(json.dumps(report.to_dict(), allow_nan=False))
-    assert (numbers["free"], numbers["held"]) == (12, 10)
+    assert (numbers["free"], numbers["fixed"]) == (12, 10)
     assert numbers["weak"] == []
     assert any("scale" in name for name in numbers["weak_without"]["depth"])
     scale = numbers["lost_without"]["scale"]
     assert f"{scale['points']:7.0%}" in next(line for line in str(report).splitlines() if line.startswith("scale"))
-    assert repr(report) == "Observability(12 coordinates free, 10 held, weak: none)"
+    assert repr(report) == "Observability(12 coordinates free, 10 fixed, weak: none)"
     heights = [bar.get_height() for bar in vg.plot(report).axes[1].patches]
     assert heights[0] == pytest.approx(100 * scale["points"])

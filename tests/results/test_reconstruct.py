@@ -264,7 +264,7 @@ def test_a_run_says_what_became_of_the_prior() -> None:
     summary = vg.reconstruct(
         sequence, settings=SETTINGS, pose_prior="recorded", options=vg.RunOptions(dense="none")
     ).summary
-    assert summary["pose_prior"] == {"used": False, "unit": None, "compared": 0, "evidence": 0.0}
+    assert summary["pose_prior"] == {"used": False, "scale": None, "compared": 0, "evidence": 0.0}
     assert "truth" not in summary
     other = vg.Trajectory(np.array([100.0, 101.0]), np.tile(np.eye(4), (2, 1, 1)))
     summary = vg.reconstruct(sequence, settings=SETTINGS, pose_prior=other, options=vg.RunOptions(dense="none")).summary

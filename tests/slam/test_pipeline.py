@@ -140,7 +140,7 @@ def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
 
 def test_a_window_of_three_around_an_old_keyframe_keeps_it(tracked: Slam) -> None:
     around = window_around(tracked, 1, updated(SETTINGS, {"window": {"size": 3}})).window
-    assert (around.members, around.held) == ((0, 1), (1,))
+    assert (around.members, around.fixed) == ((0, 1), (1,))
 
 
 @pytest.mark.long

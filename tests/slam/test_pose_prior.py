@@ -108,8 +108,8 @@ def test_the_unit_of_a_recording_is_found(walk: Walk) -> None:
     truth = walk[2]
     found = compare(RecordedPoses(_disturbed(truth)), _ties(truth, 0.003, np.random.default_rng(0)))
     assert found.accepted
-    assert found.unit is not None
-    assert abs(found.unit * 1.05 - 1) < 0.02
+    assert found.scale is not None
+    assert abs(found.scale * 1.05 - 1) < 0.02
 
 
 def test_wrongly_tracked_motions_do_not_decide(walk: Walk) -> None:

@@ -68,7 +68,7 @@ def full(slam: Slam) -> Slam:
             pose_sigma=np.ones((2, 2)),
         ),
         window=replace(
-            slam.window, prior=WindowPrior(adjustment.keyframes, empty_prior(4)), iterations=tries, held=(0,)
+            slam.window, prior=WindowPrior(adjustment.keyframes, empty_prior(4)), iterations=tries, fixed=(0,)
         ),
         camera=replace(
             slam.camera,

@@ -73,7 +73,7 @@ def linearise(
     if not joined:
         return system
     # Before the change of basis: the bound is on the inverse depths themselves.
-    system = replace(system, held=_landmarks_at_bound(problem, state, system.cross[:, -2, num_offsets(state) :]))
+    system = replace(system, at_bound=_landmarks_at_bound(problem, state, system.cross[:, -2, num_offsets(state) :]))
     return join_landmarks(system, None if problem.fraction is None else jax.lax.stop_gradient(problem.fraction))
 
 
@@ -197,8 +197,8 @@ def scale_direction(problem: Problem, state: State) -> Float[Array, "c 1"]:
     """Return the unit motion of the poses under a change of scale about the first fixed camera, or camera 0."""
     rotations, translations = lie.rotation_matrix(state.poses), state.poses.translation()
     # 0 if no pose is fixed, which is as good a centre as any.
-    held = jnp.argmax(problem.fixed_pose)
-    anchor = -rotations[held].T @ translations[held]
+    first = jnp.argmax(problem.fixed_pose)
+    anchor = -rotations[first].T @ translations[first]
     outward = translations + rotations @ anchor
     direction = jnp.concatenate([outward, jnp.zeros_like(outward)], 1).reshape(-1)
     direction = jnp.concatenate([direction, jnp.zeros(problem.num_parameters, direction.dtype)])
@@ -336,8 +336,8 @@ def _landmarks_at_bound(problem: Problem, state: State, gradient: Float[Array, "
     alone = jnp.arange(gradient.shape[1]) < problem.first_segment
     # Karush-Kuhn-Tucker: active only if the energy falls towards the bound, so that a landmark can leave it again.
     far, near = state.inverse_depth <= MIN_INVERSE_DEPTH, state.inverse_depth >= MAX_INVERSE_DEPTH
-    held = ((far & (gradient > 0)) | (near & (gradient < 0))) & alone
-    return jnp.pad(held, ((0, 0), (num_offsets(state), 0)))
+    at_bound = ((far & (gradient > 0)) | (near & (gradient < 0))) & alone
+    return jnp.pad(at_bound, ((0, 0), (num_offsets(state), 0)))
 
 
 def _node_factors(

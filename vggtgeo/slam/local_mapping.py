@@ -105,9 +105,9 @@ def window_around(slam: Slam, number: int, settings: SlamSettings) -> Slam:
     around = range(max(number - NEIGHBOURS, 0), min(number + NEIGHBOURS + 1, len(slam.keyframes)))
     own = sorted((other for other in around if label[other] == label[number]), key=lambda other: abs(other - number))
     window = tuple(sorted(own[: settings.window.size - 1]))
-    # Without metric depth one held pose leaves the unit free: two hold it.
-    held = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
-    return slam.with_window(members=window, prior=None, solved=None, held=held)
+    # Without metric depth one fixed pose leaves the scale free: two fix it.
+    fixed = (number,) if slam.metric else tuple(member for member in window if abs(member - number) <= 1)
+    return slam.with_window(members=window, prior=None, solved=None, fixed=fixed)
 
 
 def begin_window(slam: Slam, adjusted: Callable[[], Slam]) -> Slam:

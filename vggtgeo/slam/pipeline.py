@@ -132,7 +132,7 @@ def _first(slam: Slam, frame: Frame, features: Features, roles: Roles, settings:
     return replace(
         slam,
         map=replace(slam.map, keyframes=(*slam.keyframes, keyframe), roots=(*slam.map.roots, number), axes=()),
-        window=replace(slam.window, members=(number,), prior=None, solved=None, held=()),
+        window=replace(slam.window, members=(number,), prior=None, solved=None, fixed=()),
         tracker=replace(slam.tracker, frames=(*slam.frames, record), velocity=np.eye(4), reference=None, lost=0),
     )
 

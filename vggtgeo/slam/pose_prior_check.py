@@ -1,7 +1,7 @@
-"""Recorded poses against the images: whether they are of this recording, and how long their unit is in the map.
+"""Recorded poses against the images: whether they are of this recording, and the scale of the map relative to theirs.
 
 Two hypotheses about the tracked motions `m_k` between keyframes are compared. Of this recording: `m_k` is the recorded
-motion `r_k` of the same time, up to one unit, to within the noise of both. Of another one, or of another clock: `m_k`
+motion `r_k` of the same time, up to one scale, to within the noise of both. Of another one, or of another clock: `m_k`
 may as well belong to the recorded motion `r_j` of any other time. With the likelihood `p(m_k | r)`, in the noise of the
 motion and of the recording, the ratio of the likelihoods is
 
@@ -42,12 +42,12 @@ MAX_OTHERS = 32
 
 @dataclass(frozen=True)
 class Comparison:
-    """Recorded poses and a map. unit: what a unit of theirs is in that of the map's newest submap, None where no motion
-    tells. compared: motions between keyframes that images measured. evidence: logarithm of the ratio of likelihoods,
-    that the recording is of these images over that it is not.
+    """Recorded poses and a map. scale: of the map's newest submap relative to theirs, None where no motion determines
+    it. compared: number of motions between keyframes that images measured. evidence: logarithm of the ratio of
+    likelihoods, that the recording is of these images over that it is not.
     """
 
-    unit: float | None
+    scale: float | None
     compared: int
     evidence: float
 
@@ -65,24 +65,24 @@ def compare(recorded: RecordedPoses, known: Map) -> Comparison:
     record = _Record.of(recorded, known)
     if record is None:
         return Comparison(None, 0, 0.0)
-    units = record.units()
-    newest = float(units[-1])
-    return Comparison(newest if np.isfinite(newest) else None, len(record.motions), record.evidence(recorded, units))
+    scales = record.scales()
+    newest = float(scales[-1])
+    return Comparison(newest if np.isfinite(newest) else None, len(record.motions), record.evidence(recorded, scales))
 
 
-def recorded_units(recorded: RecordedPoses, known: Map) -> np.ndarray:
-    """Return the length of a unit of the recording at each keyframe, float64 [n], in the map's unit or metres.
+def recorded_scales(recorded: RecordedPoses, known: Map) -> np.ndarray:
+    """Return the scale of the map (or metres) relative to the recording, at each keyframe, float64 [n].
 
     NaN if no measured motion determines it.
     """
     record = _Record.of(recorded, known)
-    return np.full(len(known.keyframes), np.nan) if record is None else record.units()
+    return np.full(len(known.keyframes), np.nan) if record is None else record.scales()
 
 
 def recorded_factor(
-    recorded: RecordedPoses, first: Keyframe, second: Keyframe, unit: float
+    recorded: RecordedPoses, first: Keyframe, second: Keyframe, scale: float
 ) -> MeasuredRelativePose | None:
-    """Return the recorded motion between two keyframes in the unit of the map, from the smaller number.
+    """Return the recorded motion between two keyframes in the scale of the map, from the smaller number.
 
     None if it is unknown.
     """
@@ -91,28 +91,28 @@ def recorded_factor(
     motion = recorded.motion(first.timestamp, second.timestamp)
     if motion is None:
         return None
-    scaled = longer(motion, unit)
+    scaled = longer(motion, scale)
     noise = recorded.covariance(scaled, second.timestamp - first.timestamp)
     return MeasuredRelativePose(first.number, second.number, scaled, np.linalg.inv(noise), recorded=True)
 
 
-def recorded_factors_of(recorded: RecordedPoses, known: Map, units: np.ndarray) -> list[MeasuredRelativePose]:
+def recorded_factors_of(recorded: RecordedPoses, known: Map, scales: np.ndarray) -> list[MeasuredRelativePose]:
     """Return the recorded motions between consecutive keyframes of one submap.
 
-    units: of the recording at each keyframe, float64 [n], NaN = unknown.
+    scales: of the map relative to the recording at each keyframe, float64 [n], NaN = unknown.
     """
     label = submap_of(known)
-    placed = [keyframe for keyframe in known.keyframes if np.isfinite(units[keyframe.number])]
+    placed = [keyframe for keyframe in known.keyframes if np.isfinite(scales[keyframe.number])]
     placed.sort(key=lambda keyframe: keyframe.timestamp)
     factors = [
-        recorded_factor(recorded, first, second, float(units[second.number]))
+        recorded_factor(recorded, first, second, float(scales[second.number]))
         for first, second in pairwise(placed)
         if label[first.number] == label[second.number]
     ]
     return [factor for factor in factors if factor is not None]
 
 
-def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, unit: float) -> TrackedFrame | None:
+def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, scale: float) -> TrackedFrame | None:
     """Place a frame that images do not place, by the recorded motion from the last one with a pose.
 
     None if that motion is unknown.
@@ -121,7 +121,7 @@ def carried(recorded: RecordedPoses, known: Map, last: FramePose, time: float, u
     if motion is None:
         return None
     keyframe = known.keyframes[last.reference]
-    relative = rigid.orthonormal(longer(motion, unit) @ last.relative)
+    relative = rigid.orthonormal(longer(motion, scale) @ last.relative)
     noise = recorded.covariance(relative, time - keyframe.timestamp)
     information = np.linalg.inv(noise)
     sigma_translation, sigma_rotation = worst_sigma(information)
@@ -138,8 +138,8 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """Motions that images measured, each with the recorded one. motions: float64 [m, 4, 4], in the unit of the
-    recording. second: keyframe that each ends at, int [m]. label: of the part with one unit that each keyframe belongs
+    """Motions that images measured, each with the recorded one. motions: float64 [m, 4, 4], in the scale of the
+    recording. second: keyframe that each ends at, int [m]. label: of the part with one scale that each keyframe belongs
     to, int [n].
     """
 
@@ -164,7 +164,7 @@ class _Record:
         measured, motions, seconds, ends = zip(*rows, strict=True)
         return cls(measured, np.array(motions), np.array(seconds), np.array(ends), label)
 
-    def units(self) -> np.ndarray:
+    def scales(self) -> np.ndarray:
         """Return the ratio of measured to recorded lengths at each keyframe, float64 [n].
 
         It is the median over the motions of its submap, weighted by the recorded length, which no wrong match changes.
@@ -177,12 +177,12 @@ class _Record:
             found[self.label == submap] = weighted_median(measured[own] / lengths[own], lengths[own])
         return found
 
-    def evidence(self, recorded: RecordedPoses, units: np.ndarray) -> float:
-        """Return the logarithm of the ratio of likelihoods; motions in an unknown unit are left out."""
-        rows = np.flatnonzero(np.isfinite(units[self.second]))
+    def evidence(self, recorded: RecordedPoses, scales: np.ndarray) -> float:
+        """Return the logarithm of the ratio of likelihoods; motions in an unknown scale are left out."""
+        rows = np.flatnonzero(np.isfinite(scales[self.second]))
         if len(rows) < 2:
             return 0.0
-        scale = units[self.second[rows]]
+        scale = scales[self.second[rows]]
         own = _longer(self.motions[rows], scale)
         noise = [
             np.linalg.inv(self.measured[row].information) + recorded.covariance(motion, float(self.seconds[row]))

@@ -34,7 +34,7 @@ tracking is lost between them, all are tracked."""
 MIN_KEYFRAMES = 10
 """Keyframes that self-calibration without depth needs; as many as a window has: a smaller map is adjusted as a whole
 while tracking, and its few keyframes have little parallax. With depth, as many as the last adjustment needs."""
-MAX_PASSES, SETTLED = 3, 0.03
+MAX_PASSES, CONVERGED = 3, 0.03
 """Passes over the calibration frames, and the relative change of the focal length that ends them. A lens with strong
 distortion needs more than one pass: the first finds a focal length without the lens."""
 MIN_TRACKED = 0.5
@@ -89,7 +89,7 @@ def _calibrated_by(
         before = before.with_camera(intrinsics=own, given=own, self_calibrated=True, lens=lens)
         before = before.with_notes(_note(found, passes, camera))
         moved = np.abs(own[:2] / last.intrinsics[:2] - 1).max()
-        if moved < SETTLED and (lens is None) == (last.camera.lens is None):
+        if moved < CONVERGED and (lens is None) == (last.camera.lens is None):
             break
         keyframes = frozenset(keyframe.frame for keyframe in last.keyframes)
     return before

@@ -65,8 +65,8 @@ def _drifting(seed: int, false: float, bias: float, alike: bool) -> tuple[np.nda
                 measured = _motion(rng, 0.5, np.deg2rad(10.0))
         loops.append(MeasuredRelativePose(other, number, measured, known))
         right.append(not wrong)
-    held = np.arange(len(true)) == 0
-    return true, PoseGraph(np.array(poses), tuple(motions), tuple(loops), held), np.array(right)
+    fixed = np.arange(len(true)) == 0
+    return true, PoseGraph(np.array(poses), tuple(motions), tuple(loops), fixed), np.array(right)
 
 
 def _errors(poses: np.ndarray, true: np.ndarray) -> tuple[float, float]:

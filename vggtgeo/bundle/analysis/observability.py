@@ -249,7 +249,7 @@ def _combine(
         if own is not None
     ]
     system = eqx.tree_at(
-        lambda s: (s.gram, s.cross, s.blocks, s.prior_hessian, s.factors, s.held),
+        lambda s: (s.gram, s.cross, s.blocks, s.prior_hessian, s.factors, s.at_bound),
         systems[0],
         (
             *(total([system.gram for system in systems]), total([system.cross for system in systems])),
@@ -295,10 +295,10 @@ def _spectrum(reduced: Reduced, coordinates: _Coordinates) -> Spectra:
     # No eigenvalue of a free direction reaches the trace: so the fixed ones come last.
     beyond = 2 * len(scale)
     values, vectors = symmetric_eigen(balanced + jnp.diag(jnp.where(free, 0.0, beyond).astype(scale.dtype)))
-    held = jnp.arange(len(scale)) >= jnp.sum(free)
+    fixed = jnp.arange(len(scale)) >= jnp.sum(free)
     along = jnp.einsum("gc,cd,gd->g", coordinates.common, information, coordinates.common)
     return Spectra(
-        values=jnp.where(held, jnp.inf, values),
+        values=jnp.where(fixed, jnp.inf, values),
         vectors=vectors,
         along=_along_all(along, jnp.diagonal(information), coordinates),
     )

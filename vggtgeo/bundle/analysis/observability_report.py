@@ -53,7 +53,7 @@ class Observability(Readable):
         >>> found.without.values.shape  # a row a term: points, lines, depth, host_pixels, intrinsics_prior
         (5, 28)
         >>> vg.observability(problem, solution.state)
-        Observability(18 coordinates free, 10 held, weak: none)
+        Observability(18 coordinates free, 10 fixed, weak: none)
 
     """
 
@@ -97,7 +97,7 @@ class Observability(Readable):
         lost, used = undetermined_landmarks(self)
         whole, pairs = weak_directions(self), [f"{i} and {j}" for i, j in rotation_pairs(self)]
         lines = [
-            f"Observability of {self.keyframes} keyframes: {free} coordinates free, {size - free} held",
+            f"Observability of {self.keyframes} keyframes: {free} coordinates free, {size - free} fixed",
             f"weakest eigenvalues: {'  '.join(f'{max(value, 0):.1e}' for value in values[:6])}",
             f"weak directions: {_spell(whole, self)}",
             *(line for known in least_known(self) for line in (f"least known: {known}", f"  sigma: {known.sigma()}")),
@@ -123,7 +123,7 @@ class Observability(Readable):
         return {
             "keyframes": self.keyframes,
             "free": free,
-            "held": size - free,
+            "fixed": size - free,
             "eigenvalues": [float(value) for value in np.asarray(self.whole.values[0])[:free]],
             "weak": [str(direction) for direction in weak_directions(self)],
             "weak_without": {
@@ -146,7 +146,7 @@ class Observability(Readable):
         lost, used = known["inverse_depths_undetermined"], known["inverse_depths"]
         depths = f", {lost} of {used} inverse depths undetermined" if lost else ""
         weak = f"{weak}{more}{depths}" if finite else "unknown, since the linearisation is not finite"
-        return f"Observability({known['free']} coordinates free, {known['held']} held, weak: {weak})"
+        return f"Observability({known['free']} coordinates free, {known['fixed']} fixed, weak: {weak})"
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ PARAMETERS = 4
 """Logarithm of the focal length, principal point, k1."""
 MIN_BLOCKS = PARAMETERS + 2
 """Minimum number of blocks: the covariance between them needs degrees of freedom beyond the parameters."""
-ITERATIONS, SETTLED = 20, 0.002
+ITERATIONS, CONVERGED = 20, 0.002
 """Iteration limit, and the step, as a share of the longest one, that ends the iteration. Half the focal length is seven
 of the longest steps away."""
 POSE_ITERATIONS = 4
@@ -126,7 +126,7 @@ def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, np.nda
         step = np.clip(-np.linalg.solve(normal, reduced.gradient.sum(0)), -LONGEST_STEP, LONGEST_STEP)
         value = value + step
         poses = rigid.moved(poses, reduced.pose_steps(step))
-        if np.all(np.abs(step) < SETTLED * LONGEST_STEP):
+        if np.all(np.abs(step) < CONVERGED * LONGEST_STEP):
             break
         reduced = _reduce(points, poses, value, intrinsics)
     return value, poses, reduced

@@ -36,7 +36,7 @@ from vggtgeo.slam.camera.camera_comparison import (
 from vggtgeo.slam.camera.camera_estimate import Readout
 from vggtgeo.slam.threads import map_in_threads
 
-FIRST_SHIFT, SETTLED = 1.0, 0.05
+FIRST_SHIFT, CONVERGED = 1.0, 0.05
 """Median displacement of matches, pixels: the first step of the search, and the step that ends it."""
 FASTEST = 1e6
 """Pixels a second: larger velocities come from landmarks at the camera's centre."""
@@ -210,7 +210,7 @@ def find_readout(
     for columns in (False, True):
         shifts = row_shifts(problem, state, motions, size, columns)
         search = _Search(problem, shifts, max(size) / 2)
-        if search.usual * longest < SETTLED:
+        if search.usual * longest < CONVERGED:
             continue
         slopes = search.slopes(0.0, state)
         slopes = slopes[slopes != 0]
@@ -247,7 +247,7 @@ def _descend(search: _Search, state: State, slope: float, longest: float, solve:
             following = np.clip(min(sought, farthest, key=abs) if ahead else farthest, -longest, longest)
         else:
             following = _zero(lower, upper)
-        if abs(following - seconds) * search.usual < SETTLED:
+        if abs(following - seconds) * search.usual < CONVERGED:
             break
         seconds = float(following)
     else:

@@ -70,18 +70,18 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     if not drifted and not broken:
         return slam, list(loops)
     measured = (*closing, *(loop.motion for loop in loops))
-    graph = _graph(slam, motions, measured, _units(slam, motions, loops))
+    graph = _graph(slam, motions, measured, _scales(slam, motions, loops))
     tracked = graph.motions if slam.metric else [motion.of_free_length() for motion in graph.motions]
     # Before the solve: with several wrong loops even a robust kernel may settle on their consensus.
     sure = consistent_loops(graph.loops, tracked, LOOP_GATE, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
         return _with_refused(_without(slam, closing), len(loops) - len(agreeing), len(loops)), agreeing
-    units = _units(slam, motions, tuple(compress(loops, sure[len(closing) :])))
-    poses, fits = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), units))
+    scales = _scales(slam, motions, tuple(compress(loops, sure[len(closing) :])))
+    poses, fits = solve_pose_graph(_graph(slam, motions, tuple(compress(measured, sure)), scales))
     true = np.zeros(len(measured), bool)
     true[sure] = fits
-    moved = at_poses(_without(slam, list(compress(closing, ~true[: len(closing)]))), poses, units)
+    moved = at_poses(_without(slam, list(compress(closing, ~true[: len(closing)]))), poses, scales)
     # A loop that took no part (refused, or alone) is used where the corrected map agrees with it.
     own = zip(loops, true[len(closing) :], sure[len(closing) :], strict=True)
     accepted = [loop for loop, fits, took_part in own if (fits if took_part else loop.agrees(moved))]
@@ -127,21 +127,21 @@ def _pixels(factor: MeasuredRelativePose, slam: Slam) -> float:
 
 
 def _graph(
-    slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[MeasuredRelativePose], units: np.ndarray
+    slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[MeasuredRelativePose], scales: np.ndarray
 ) -> PoseGraph:
     """Return the graph in the scale of the first keyframe, with one fixed keyframe in each connected component."""
-    inside = lambda measured: scaled_motion(measured, float(units[measured.first]))
+    inside = lambda measured: scaled_motion(measured, float(scales[measured.first]))
     scaled_motions, scaled_loops = tuple(map(inside, motions)), tuple(map(inside, loops))
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
-    start = np.array([longer(pose, unit) for pose, unit in zip(poses, units, strict=True)])
+    start = np.array([longer(pose, scale) for pose, scale in zip(poses, scales, strict=True)])
     label = submap_of(slam.with_factors(*loops).map)
-    held = np.zeros(len(poses), bool)
-    held[np.unique(label, return_index=True)[1]] = True
-    return PoseGraph(start, scaled_motions, scaled_loops, held)
+    fixed = np.zeros(len(poses), bool)
+    fixed[np.unique(label, return_index=True)[1]] = True
+    return PoseGraph(start, scaled_motions, scaled_loops, fixed)
 
 
-def _units(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
-    """Return the factor on the lengths of each keyframe, float64 [n]; 1 in metres or in the unit of the recording."""
+def _scales(slam: Slam, motions: Sequence[MeasuredRelativePose], loops: Sequence[Loop]) -> np.ndarray:
+    """Return the factor on the lengths of each keyframe, float64 [n]; 1 in metres or in the scale of the recording."""
     if slam.metric or slam.map.recorded_factors:
         return np.ones(len(slam.keyframes))
     ratios = [loop.scale for loop in loops if loop.scale is not None]
@@ -154,16 +154,16 @@ def _without(slam: Slam, unwanted: Sequence[MeasuredRelativePose]) -> Slam:
     return slam.with_map(factors=tuple(factor for factor in slam.map.factors if id(factor) not in gone))
 
 
-def at_poses(slam: Slam, poses: np.ndarray, units: np.ndarray) -> Slam:
+def at_poses(slam: Slam, poses: np.ndarray, scales: np.ndarray) -> Slam:
     """Return the map at other poses, lengths scaled keyframe by keyframe."""
-    unit = lambda number: float(units[number])
+    scale = lambda number: float(scales[number])
     moved = slam.with_map(
         keyframes=tuple(
-            replace(scaled_keyframe(keyframe, unit(keyframe.number)), pose=rigid.orthonormal(pose))
+            replace(scaled_keyframe(keyframe, scale(keyframe.number)), pose=rigid.orthonormal(pose))
             for keyframe, pose in zip(slam.keyframes, poses, strict=True)
         ),
-        factors=tuple(scaled_factor(factor, unit(factor.keyframes[0])) for factor in slam.map.factors),
-    ).with_tracker(frames=tuple(scaled_record(record, unit(record.reference)) for record in slam.frames))
+        factors=tuple(scaled_factor(factor, scale(factor.keyframes[0])) for factor in slam.map.factors),
+    ).with_tracker(frames=tuple(scaled_record(record, scale(record.reference)) for record in slam.frames))
     return moved.with_window(prior=None, solved=None)
 
 

@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.gauss_newton import damped_step
 from vggtgeo.geometry.robust import sigma_by_median
 from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
@@ -143,7 +144,7 @@ def _resected(
         information = weighted @ rows.T
         hessian = information + known
         gradient = weighted @ off.T.ravel() + known @ tangent(current @ rigid.invert(pose))
-        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
+        step = damped_step(hessian, gradient)
         current = rigid.moved(current[None], step[None])[0]
         if width == WIDTH and np.abs(step).max() < CONVERGED:
             break

@@ -66,7 +66,7 @@ def join_submaps(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettin
         slam, fixed = scale_submap(slam, ratio, numbers), slam.window.members[:2]
     motion = rigid.invert(slam.keyframes[-1].pose) @ place.pose
     prior = None if slam.window.prior is None else _moved_prior(slam.window.prior, motion)
-    joined = moved_submap(slam, numbers, motion).with_window(held=fixed, prior=prior, solved=None)
+    joined = moved_submap(slam, numbers, motion).with_window(fixed=fixed, prior=prior, solved=None)
     factor = MeasuredRelativePose(old.number, new.number, place.relative, place.information)
     began = slam.keyframes[min(numbers)].frame
     note = f"the submap that began at frame {began} is joined to the one before at frame {new.frame}"
@@ -172,4 +172,4 @@ def _placed_by(slam: Slam, loop: Loop, other: set[int]) -> Slam:
     else:
         number, place = second, loop.motion.pose @ slam.keyframes[first].pose
     scaled = scale_submap(slam, ratio, other)
-    return moved_submap(scaled, other, rigid.invert(scaled.keyframes[number].pose) @ place).with_window(held=())
+    return moved_submap(scaled, other, rigid.invert(scaled.keyframes[number].pose) @ place).with_window(fixed=())

@@ -101,7 +101,7 @@ def _with_keyframe(
     others = [other for other in slam.keyframes if label[other.number] == label[found.keyframe.number]]
     others.sort(key=lambda other: (other is not found.keyframe, abs(other.timestamp - lost.timestamp)))
     members = tuple(sorted(other.number for other in others[: settings.window.size - 1]))
-    inserted = replace(slam, window=Window(members=members, held=members))
+    inserted = replace(slam, window=Window(members=members, fixed=members))
     inserted = insert_keyframe(inserted, keyframe, roles, settings).with_factors(factor_to(found, number))
     adjusted = replace(adjust_window(inserted, settings), window=slam.window)
     arrival = found.keyframe.number, found.relative

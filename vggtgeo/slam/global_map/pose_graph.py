@@ -80,13 +80,13 @@ class LoopClosure(RelativePose):
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
     """Poses float64 [n, 4, 4], world -> camera, by keyframe; motions: a tree, the later keyframe second; loops: all
-    other relative poses; held: bool [n], one of each component.
+    other relative poses; fixed: bool [n], one of each component.
     """
 
     poses: np.ndarray
     motions: tuple[MeasuredRelativePose, ...]
     loops: tuple[MeasuredRelativePose, ...]
-    held: np.ndarray
+    fixed: np.ndarray
 
 
 def solve_pose_graph(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +108,7 @@ def solve_pose_graph(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
         Intrinsics(np.array([1.0, 1.0, 0.0, 0.0]), fixed=True),
         np.zeros(0),
         # Padding poses are fixed: without factors they would make the system singular.
-        fixed_pose=np.concatenate([graph.held, np.ones(padding, bool)]),
+        fixed_pose=np.concatenate([graph.fixed, np.ones(padding, bool)]),
         terms=(motions, loops),
     )
     small = count <= DENSE_POSES

@@ -177,7 +177,7 @@ def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.
     worst = np.zeros((len(asked), 2))
     for row, keyframe in enumerate(asked):
         at = np.flatnonzero(free // lie.TANGENT == keyframe)
-        if len(at) < lie.TANGENT:  # held, or a part of it: it is where it is said to be
+        if len(at) < lie.TANGENT:  # fixed, at least in part: its place is exact
             continue
         columns = np.zeros((len(free), lie.TANGENT))
         columns[at, np.arange(lie.TANGENT)] = unit[at]

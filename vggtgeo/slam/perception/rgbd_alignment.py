@@ -224,8 +224,8 @@ def _aligned(
         damped = hessian + jnp.diag(1e-3 * diagonal + 1e-9 * diagonal.sum() + 1e-9)
         change = -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(damped), True), gradient)
         count = carry.number + 1
-        settled = jnp.abs(change).max() < jnp.where(level == 0, CONVERGED, 10 * CONVERGED)
-        ends = settled | (count >= iterations[level]) | (carry.stage == JUDGED)
+        converged = jnp.abs(change).max() < jnp.where(level == 0, CONVERGED, 10 * CONVERGED)
+        ends = converged | (count >= iterations[level]) | (carry.stage == JUDGED)
         # At this pose the views do not overlap: further steps would follow noise.
         lost = ~(terms.edges.enough | terms.surface.enough)
         return _Carry(

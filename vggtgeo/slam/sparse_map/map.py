@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import sigma_by_median
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose, MeasuredRotation
@@ -121,9 +122,8 @@ def measured_ratio(
     # Ratios are symmetric in the logarithm: exchanging the keyframes changes the sign only.
     logs = np.log(depth[ahead] * after[ahead])
     middle = float(np.median(logs))
-    # Standard error of a median: 1.25 sigma / sqrt(n), sigma from the median absolute deviation.
-    error = 1.25 * 1.48 * float(np.median(np.abs(logs - middle))) / float(np.sqrt(len(logs)))
-    return float(np.exp(middle)), error
+    # Standard error of the median of n normal variables.
+    return float(np.exp(middle)), sigma_by_median(logs - middle) * float(np.sqrt(0.5 * np.pi / len(logs)))
 
 
 def longer(motion: np.ndarray, ratio: float) -> np.ndarray:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.gauss_newton import damped_step
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.robust import TUKEY, sigma_by_median
 from vggtgeo.models.classical import line_coefficients
@@ -223,8 +224,8 @@ def _step(rows: _Rows, motion: np.ndarray, start: np.ndarray, known: np.ndarray)
     safe = np.where(np.isfinite(rows.residual), rows.residual, 0.0)
     hessian = _normal(rows.jacobian, weight) + known
     gradient = np.einsum("mec,me->c", rows.jacobian, weight * safe) + known @ tangent(motion @ rigid.invert(start))
-    # Lines may leave a direction free: the regulariser gives it no step.
-    return -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
+    # Lines may leave a direction free: it gets no step.
+    return damped_step(hessian, gradient)
 
 
 def _normal(jacobian: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.gauss_newton import damped_step
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.robust import POSE_GATE, TUKEY, inverse_information
 from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
@@ -83,7 +84,7 @@ def refine_by_map(
         # Each keyframe pulls towards the pose that its points prefer, but only with the information that its own place
         # leaves.
         gradient -= np.sum([known @ own.step() for known, own in zip(limited, equations, strict=True)], axis=0)
-        step = -_solve(information + known, gradient)
+        step = damped_step(information + known, gradient)
         current = exponential(step) @ current
         if np.abs(step).max() < 1e-4:
             break
@@ -130,7 +131,7 @@ class _Equations:
 
     def step(self) -> np.ndarray:
         """Return the step that these points alone would take."""
-        return -_solve(self.hessian, self.gradient)
+        return damped_step(self.hessian, self.gradient)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +191,3 @@ def _agrees(own: _Equations, known: np.ndarray, bound: Bound) -> bool:
     noise = inverse_information(bound(own.hessian, own.motion)) + inverse_information(known)
     step = own.step()
     return float(step @ np.linalg.solve(noise, step)) < POSE_GATE
-
-
-def _solve(hessian: np.ndarray, right: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6) + 1e-12 * np.eye(6), right)

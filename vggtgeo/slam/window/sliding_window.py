@@ -61,7 +61,7 @@ class Window:
     Fields:
         members: Their numbers, oldest first.
         prior: The prior from marginalised keyframes.
-        held: Numbers of keyframes whose poses are fixed, besides roots of submaps.
+        fixed: Numbers of keyframes whose poses are fixed, in place of the roots of submaps.
         solved: The last problem of the window and its solution.
         energies: `1/2 sum rho` of that problem at the start and after each iteration.
         iterations: Record of the solver's iterations.
@@ -70,7 +70,7 @@ class Window:
 
     members: tuple[int, ...] = ()
     prior: WindowPrior | None = None
-    held: tuple[int, ...] = ()
+    fixed: tuple[int, ...] = ()
     solved: tuple[Adjustment, State] | None = None
     energies: np.ndarray | None = None
     iterations: IterationRecord | None = None
@@ -174,7 +174,7 @@ def _fixed(window: Window, roots: tuple[int, ...]) -> np.ndarray:
     """Return the members with fixed poses: those of an old part of the map that the camera returned to, if any, else
     the roots of submaps.
     """
-    fixed = np.isin(window.members, window.held)
+    fixed = np.isin(window.members, window.fixed)
     # When the camera has returned to old keyframes, the old part must not move: the roots would be a second gauge.
     return fixed if fixed.any() else np.isin(window.members, roots)
 
