@@ -131,10 +131,10 @@ class ExactModel(eqx.Module):
         """Return the solution of `solve`, and whether an iterative solver has converged."""
         inverse = inverse_landmark_hessian(self.system)
         rest = vector.dense - carry_to_nodes(self.system, inverse * vector.landmarks)
-        dense, found = self.factor.solve(self.system, rest)
+        dense, converged = self.factor.solve(self.system, rest)
         # A singular matrix gives no step, so the chord iteration ends and the derivative is zero, not NaN.
         dense = jnp.where(jnp.all(jnp.isfinite(dense)), dense, 0.0)
-        return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0))), found
+        return ArrowVector(dense, inverse * (vector.landmarks - couple(self.system, dense, 0.0))), converged
 
     def largest(self, gradient: ArrowVector) -> Float[Array, ""]:
         """Return the largest entry of a gradient, each scaled by the root of its curvature."""
@@ -213,9 +213,8 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
     # NaN if the derivative is undefined, or the point not stationary with the option `nan`.
     doubtful = ((left > STATIONARY) & (options.not_stationary == "nan")) | ~jnp.isfinite(left)
     trusted = jnp.where(doubtful, jnp.nan, 1.0)
-    flat, unflatten = ravel_pytree(
-        _times(right_hand_side, trusted)
-    )  # one leaf, since JAX requires that all leaves depend on the differentiated input
+    # One leaf, since JAX requires that all leaves depend on the differentiated input.
+    flat, unflatten = ravel_pytree(_times(right_hand_side, trusted))
 
     def operator(vector: Array) -> Array:
         along = _expanded(system, _free(unflatten(vector), system))
@@ -225,21 +224,20 @@ def _implicit_derivative(primals: Any, tangents: Any) -> Any:
         return ravel_pytree(pushed)[0]
 
     def solve(_: Any, vector: Array) -> Array:
-        step, ended = model.checked(unflatten(vector))
-        step = _times(step, jnp.where(~ended & (options.not_stationary == "nan"), jnp.nan, 1.0))
-        found: Array = ravel_pytree(step)[0]
-        return eqx.error_if(found, ~ended, _NOT_SOLVED) if options.not_stationary == "error" else found
+        step, converged = model.checked(unflatten(vector))
+        step = _times(step, jnp.where(~converged & (options.not_stationary == "nan"), jnp.nan, 1.0))
+        flat_step: Array = ravel_pytree(step)[0]
+        return eqx.error_if(flat_step, ~converged, _NOT_SOLVED) if options.not_stationary == "error" else flat_step
 
-    # `operator` defines the derivative of this solve (for second derivatives); the factor in `solve` computes its
-    # value.
+    # `operator` defines the derivative of this solve, for second derivatives; `solve` computes its value.
     solved = unflatten(jax.lax.custom_linear_solve(operator, -flat, solve, symmetric=True))
 
-    def found(moving: Any, step: ArrowVector) -> Any:
+    def moved_optimum(moving: Any, step: ArrowVector) -> Any:
         shifted = eqx.combine(moving, fixed)
         return shifted.retract(shifted.restore_fixed(at), _expanded(system, step))
 
     zero = jax.tree.map(jnp.zeros_like, solved)
-    value, tangent = jax.jvp(found, (moving, zero), (moved, solved))
+    value, tangent = jax.jvp(moved_optimum, (moving, zero), (moved, solved))
     if options.not_stationary == "error":
         value = eqx.error_if(value, ~(left <= STATIONARY), _NOT_STATIONARY)
     return (value, reported), (
@@ -261,7 +259,7 @@ _NOT_SOLVED = (
 
 
 def _times(tree: Any, factor: Float[Array, ""]) -> Any:
-    """Scale a tree before and after the linear solve, which drops NaN, so that NaN reaches the result in both modes."""
+    """Multiply every leaf by `factor`. The linear solve drops NaN, so callers multiply before and after it."""
     return jax.tree.map(lambda leaf: leaf * factor.astype(leaf.dtype), tree)
 
 
@@ -271,7 +269,7 @@ def _detached(tree: Any) -> Any:
 
 def _gradient(problem: AbstractArrowProblem, point: Any, system: ArrowSystem) -> ArrowVector:
     """Return the gradient by the free coordinates, in the coordinates of `system`."""
-    return _free(_restricted(_along(system, problem), problem.gradient(point)), system)
+    return _free(_restricted(_with_fractions(system, problem), problem.gradient(point)), system)
 
 
 def _polish(
@@ -326,7 +324,7 @@ def _chord_steps(
     return polished, last[1]
 
 
-def _along(system: ArrowSystem, problem: AbstractArrowProblem) -> ArrowSystem:
+def _with_fractions(system: ArrowSystem, problem: AbstractArrowProblem) -> ArrowSystem:
     """Return `system` with the fractions of `problem`: equal values, but with a derivative."""
     fractions = problem.fractions()
     if system.segments is None or fractions is None:

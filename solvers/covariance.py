@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, inverse_landmark_hessian, moving_landmarks, restricted
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
-from vggtgeo.solvers.schur_complement import LocalInverse, to_relative, visible
+from vggtgeo.solvers.schur_complement import LocalInverse, relative_covariance, visible
 
 
 class ArrowCovariance(eqx.Module):
@@ -72,7 +72,7 @@ def _landmarks(system: ArrowSystem, found: LocalInverse, rows: Int[Array, " h"])
     cross = restricted(basis.triples, system.cross[rows, :-2])
     # In this order, since the square of a large inverse may overflow, but its product with the coupling does not.
     pulled = basis.expand(hessian_inverse[:, None] * cross)
-    spread = lambda local, side: jnp.einsum("nrs,nrt,nts->ns", side, to_relative(system, rows, local), side)
+    spread = lambda local, side: jnp.einsum("nrs,nrt,nts->ns", side, relative_covariance(system, rows, local), side)
     variance = basis.expand_variance(hessian_inverse) + spread(found.covariance, pulled)
     lost = hessian_inverse * spread(found.null, cross) > visible(cross.dtype)
     unknown = (system.landmark_hessian[rows] == 0) | lost

@@ -110,7 +110,7 @@ class Reduced(eqx.Module):
 def dense_schur_complement(system: ArrowSystem) -> Reduced:
     """Assemble the dense Hessian and the undamped Schur complement in node coordinates.
 
-    Cost: one product of `[r, s]` with its transpose a row, the rest is small matrices.
+    Cost: for each row one product of `[r, s]` with its transpose; the rest are small matrices.
     """
     schur, schur_gradient = _dense(assemble_hosts(system, schur_products_of_hosts(system), DenseLayout()))
     hessian, gradient = _dense(assemble_edges(system, DenseLayout()))
@@ -163,12 +163,12 @@ def assemble(system: ArrowSystem, layout: AbstractLayout) -> tuple[Blocks, Block
 def sparse_layout(system: ArrowSystem) -> SparseLayout:
     """Return the layout of all coupled pairs of `system`; outside `jit`. Integers must be able to represent `n^2`."""
     nodes = system.num_nodes
-    around = np.concatenate([np.asarray(system.neighbours()), np.asarray(system.graph.host_of_row)[:, None]], 1)
+    around = np.asarray(system.around())
     pairs = [tuple(np.broadcast_arrays(around[:, :, None], around[:, None, :]))]
     if system.factors is not None:
         first, second = np.asarray(system.factors.first), np.asarray(system.factors.second)
         pairs += [(first, second), (second, first)]
-    row, column = (np.concatenate([own[side].reshape(-1) for own in pairs]).astype(np.int64) for side in (0, 1))
+    row, column = (np.concatenate([pair[side].reshape(-1) for pair in pairs]).astype(np.int64) for side in (0, 1))
     present = (row < nodes) & (column < nodes)
     return SparseLayout(jnp.asarray(np.unique(row[present] * nodes + column[present])), nodes)
 
@@ -184,10 +184,10 @@ def reduced_blocks(system: ArrowSystem, layout: SparseLayout) -> Blocks:
 
 def assemble_hosts(system: ArrowSystem, products: Float[Array, "h t t"], layout: AbstractLayout) -> Blocks:
     """Transform each row's matrix from relative to node and shared coordinates, and sum over rows."""
-    hosts, degree = system.graph.of_host.shape
+    rows, degree = system.graph.of_host.shape
     nodes, block = system.num_nodes, system.block
     wide = degree * block
-    transports = padded_transports(system).reshape(hosts, wide, block)
+    transports = padded_transports(system).reshape(rows, wide, block)
     # By the chain rule with `d eta / d x_i = -A` of each edge.
     own = -jnp.einsum("nrw,nwb->nrb", products[:, :, :wide], transports)
     corner = -jnp.einsum("nwa,nwb->nab", transports, own[:, :wide])
@@ -195,13 +195,13 @@ def assemble_hosts(system: ArrowSystem, products: Float[Array, "h t t"], layout:
     to_neighbour = jnp.swapaxes(own[:, :wide], 1, 2)
     top = jnp.concatenate([products[:, :wide, :wide], own[:, :wide]], 2)
     bottom = jnp.concatenate([to_neighbour, corner], 2)
-    local = jnp.concatenate([top, bottom], 1).reshape(hosts, degree + 1, block, degree + 1, block)
+    local = jnp.concatenate([top, bottom], 1).reshape(rows, degree + 1, block, degree + 1, block)
     index = system.around()
-    rows, columns = jnp.broadcast_arrays(index[:, :, None], index[:, None, :])
+    row, column = jnp.broadcast_arrays(index[:, :, None], index[:, None, :])
     blocks = layout.empty(nodes, block, products.dtype)
-    blocks = layout.add(blocks, rows, columns, local.transpose(0, 1, 3, 2, 4))
+    blocks = layout.add(blocks, row, column, local.transpose(0, 1, 3, 2, 4))
     border = jnp.concatenate([products[:, wide:, :wide], own[:, wide:]], 2)
-    border = border.reshape(hosts, -1, degree + 1, block).transpose(0, 2, 3, 1)
+    border = border.reshape(rows, -1, degree + 1, block).transpose(0, 2, 3, 1)
     seen = seen_by_hosts(system)
     borders = _add_border(jnp.zeros((nodes + 1, block, system.shared + 1), products.dtype), index, border, seen)[:-1]
     return Blocks(blocks, borders, sum_corners(system, products[:, wide:, wide:], seen))
@@ -224,19 +224,19 @@ def _add_border(
 
 def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     """Return Hessian and gradient of all edges in node and shared coordinates."""
-    hosts, block = system.num_nodes, system.block
+    count, block = system.num_nodes, system.block
     source, target = system.graph.source, system.graph.target
     eta, border = system.gram[:, :block, :block], system.gram[:, :block, block:]
     own = jnp.einsum("eba,ebc,ecd->ead", system.source_adjoint, eta, system.source_adjoint)
     # The curvature of `eta` is a product of `x_j` and `x_i`, so the blocks on the diagonal do not have it.
     mixed = -jnp.einsum("eab,ebc->eac", eta + system.lie_curvature, system.source_adjoint)
-    blocks = layout.empty(hosts, block, eta.dtype)
+    blocks = layout.empty(count, block, eta.dtype)
     # Both triangles; a layout that stores one of them drops the other.
     blocks = layout.add(layout.add(blocks, target, target, eta), source, source, own)
     blocks = layout.add(blocks, target, source, mixed)
     blocks = layout.add(blocks, source, target, jnp.swapaxes(mixed, 1, 2))
     seen = system.graph.seen(system.graph.ends(), system.seen)
-    borders = _add_border(jnp.zeros((hosts, block, system.shared + 1), eta.dtype), target, border, seen)
+    borders = _add_border(jnp.zeros((count, block, system.shared + 1), eta.dtype), target, border, seen)
     at_source = -jnp.einsum("eba,ebc->eac", system.source_adjoint, border)
     borders = _add_border(borders, source, at_source, seen)
     whole = Blocks(blocks, borders, sum_corners(system, system.gram[:, block:, block:], seen))
@@ -244,17 +244,14 @@ def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
 
 
 def _add_factors(system: ArrowSystem, whole: Blocks, factors: NodeFactors, layout: AbstractLayout) -> Blocks:
-    hosts, block = whole.border.shape[:2]
-    first, second = factors.first, factors.second
+    count, block = whole.border.shape[:2]
+    ends = first, second = factors.first, factors.second
     cut = lambda a, b: factors.hessian[:, a * block : (a + 1) * block, b * block : (b + 1) * block]
     nodes = whole.nodes
-    for row, column, value in (
-        *((first, first, cut(0, 0)), (second, second, cut(1, 1))),
-        *((first, second, cut(0, 1)), (second, first, cut(1, 0))),
-    ):
+    for a, b in ((0, 0), (1, 1), (0, 1), (1, 0)):
         # A block with a missing second node must not be added to the first node's row either.
-        absent = (row == hosts) | (column == hosts)
-        nodes = layout.add(nodes, jnp.where(absent, hosts, row), jnp.where(absent, hosts, column), value)
+        absent = (ends[a] == count) | (ends[b] == count)
+        nodes = layout.add(nodes, jnp.where(absent, count, ends[a]), jnp.where(absent, count, ends[b]), cut(a, b))
     tail = jnp.concatenate([factors.hessian[:, :, 2 * block :], factors.gradient[..., None]], 2)
     borders = jnp.concatenate([whole.border, jnp.zeros_like(whole.border[:1])])
     seen = seen_by_factors(system, factors)
@@ -268,14 +265,14 @@ def _add_factors(system: ArrowSystem, whole: Blocks, factors: NodeFactors, layou
 
 def add_prior_blocks(blocks: Blocks, system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     """Return the blocks plus the prior on the shared coordinates, and on the nodes if it couples them."""
-    hosts, block = blocks.border.shape[:2]
+    count, block = blocks.border.shape[:2]
     shared, prior = blocks.corner.shape[0] - 1, system.prior_hessian
     corner = blocks.corner.at[:shared, :shared].add(prior[-shared:, -shared:])
     nodes = blocks.nodes
     if len(prior) > shared:
         # Its diagonal blocks only: the whole prior would fill any sparse layout, and a preconditioner may approximate.
-        square = prior[: hosts * block, : hosts * block].reshape(hosts, block, hosts, block)
-        every = jnp.arange(hosts)
+        square = prior[: count * block, : count * block].reshape(count, block, count, block)
+        every = jnp.arange(count)
         nodes = layout.add(nodes, every, every, square[every, :, every])
     return Blocks(nodes, blocks.border, corner)
 
@@ -304,8 +301,7 @@ class LocalInverse(eqx.Module):
 
 def local_nodes(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array, "h m"]:
     """Return the neighbours of each row, then its host; an arbitrary node for missing neighbours."""
-    neighbours = jnp.minimum(system.neighbours()[rows], system.num_nodes - 1)
-    return jnp.concatenate([neighbours, system.graph.host_of_row[rows, None]], 1)
+    return jnp.minimum(system.around()[rows], system.num_nodes - 1)
 
 
 def local_coordinates(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array, "h l"]:
@@ -316,7 +312,9 @@ def local_coordinates(system: ArrowSystem, rows: Int[Array, " h"]) -> Int[Array,
     return jnp.concatenate([nodes.reshape(len(rows), -1), jnp.broadcast_to(shared, (len(rows), len(shared)))], 1)
 
 
-def to_relative(system: ArrowSystem, rows: Int[Array, " h"], local: Float[Array, "h l l"]) -> Float[Array, "h r r"]:
+def relative_covariance(
+    system: ArrowSystem, rows: Int[Array, " h"], local: Float[Array, "h l l"]
+) -> Float[Array, "h r r"]:
     """Return `J C J'`: a covariance of the local coordinates in those of the cross terms, `(eta, shared)`."""
     degree, block = system.graph.of_host.shape[1], system.block
     wide, shared = degree * block, system.shared

@@ -96,7 +96,7 @@ def _edge_terms(
 
     def body(carry: tuple[Array, Array | None], edge: Edge) -> tuple[tuple[Array, Array | None], Array]:
         (cross, blocks), row, index = carry, edge.row, edge.index_at_host
-        gram, coupled, own = _edge_model(seen_along(edge), correction, sizes, exact)
+        gram, coupled, pixel_blocks = _edge_model(seen_along(edge), correction, sizes, exact)
         zero = jnp.zeros_like(row)
         for first, part in coupled:
             column = zero + first
@@ -108,7 +108,7 @@ def _edge_terms(
             tail, start = part[None, lie.TANGENT + apart :], (row, zero + common, column)
             shared = jax.lax.dynamic_slice(cross, start, (1, *tail.shape[1:]))
             cross = jax.lax.dynamic_update_slice(cross, shared + tail, start)
-        return (cross, blocks if blocks is None or own is None else blocks.at[row].add(own)), gram
+        return (cross, blocks if blocks is None or pixel_blocks is None else blocks.at[row].add(pixel_blocks)), gram
 
     (points, slots), rows = sizes, len(state.inverse_depth)
     cross = jnp.zeros((rows, common + cameras.size + 2, 2 * points + slots), state.inverse_depth.dtype)
@@ -217,7 +217,7 @@ def lie_curvature(gradient: Float[Array, "e 6"]) -> Float[Array, "e 6 6"]:
     return -0.5 * jnp.concatenate([upper, jnp.concatenate([force, torque], 2)], 1)
 
 
-Seen = Sequence[tuple[EdgeTerm, EdgeView]]
+TermsOfEdge = Sequence[tuple[EdgeTerm, EdgeView]]
 Columns = list[tuple[int, Float[Array, "r _"]]]
 """Blocks of columns, each with its first column."""
 
@@ -243,7 +243,7 @@ def offsets_of(landmarks: Float[Array, "n t"]) -> Float[Array, "n p 2"]:
 
 
 def _edge_model(
-    seen: Seen, correction: Float[Array, ""] | None, sizes: tuple[int, int], exact: bool
+    seen: TermsOfEdge, correction: Float[Array, ""] | None, sizes: tuple[int, int], exact: bool
 ) -> tuple[Array, Columns, Array | None]:
     """Return Gram matrix, cross terms and blocks of landmarks with free pixels of one edge, all terms added up."""
     models = [_exact(*one) for one in seen] if exact else _reweighted(seen, correction)
@@ -259,7 +259,7 @@ def _edge_model(
     return gram, _merge_columns(columns, 2 * free + slots), joint
 
 
-def _reweighted(seen: Seen, correction: Float[Array, ""] | None) -> list[_TermModel]:
+def _reweighted(seen: TermsOfEdge, correction: Float[Array, ""] | None) -> list[_TermModel]:
     models = []
     # The barrier keeps XLA from forming the columns again in each product.
     parts = jax.lax.optimization_barrier([term.columns(view, correction) for term, view in seen])

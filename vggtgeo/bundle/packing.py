@@ -110,7 +110,7 @@ def pack(
     fixed = np.arange(len(poses)) == 0 if fixed_pose is None else check_fixed("fixed_pose", fixed_pose, (len(poses),))
     size, graph, host, index = _layout(observations, len(poses), size)
     padding, camera_of = size.keyframes - len(poses), cameras.camera_of
-    seen = _seen(observations, index, size, dtype)
+    seen = _terms_of_observations(observations, index, size, dtype)
     problem = Problem(
         pixels=_per_slot(index, observations.pixel, 0.0, dtype),
         edges=graph,
@@ -156,7 +156,7 @@ def _layout(
     rows = rows_of_keyframes(slots, size)
     order = np.argsort(observations.edges[:, 0], kind="stable")
     stored, position, step = pad_edges(observations.edges[order], size, rows)
-    # At least 1, since a kind without slots has no landmark to divide for.
+    # At least 1, so that the division below is valid if a row has no slot of a kind.
     length = np.where(slots.is_line, max(size.lines, 1), max(size.points, 1))
     part, within = (np.zeros_like(slots.within), slots.within) if size.rows is None else np.divmod(slots.within, length)
     slot = np.where(slots.is_line, size.points + within, within)
@@ -169,7 +169,9 @@ def _layout(
     return size, stored, host, SlotIndex(row, slot, position[place], shape, part, step[place])
 
 
-def _seen(observations: Observations, index: SlotIndex, size: PaddedSize, dtype: DTypeLike) -> tuple[AbstractTerm, ...]:
+def _terms_of_observations(
+    observations: Observations, index: SlotIndex, size: PaddedSize, dtype: DTypeLike
+) -> tuple[AbstractTerm, ...]:
     """Return the terms of `Observations`: points, lines, depths and host pixels."""
     seen, every = observations, np.arange(len(observations.host))
     kernel = seen.kernel
@@ -304,6 +306,5 @@ def _lengthened(term: AbstractTerm, count: int) -> AbstractTerm:
 
     # Indices of keyframes are lengthened too, but are not data of an observation.
     touched = {name: getattr(term, name) for name in term.structure - {"weight", "kernel"}}
-    changed = term.holding(jax.tree.map(longer, {**term.data(), **touched}))
     weight = jnp.concatenate([term.weight, jnp.zeros(more, term.weight.dtype)])
-    return eqx.tree_at(lambda longer: longer.weight, changed, weight)
+    return term.holding({**jax.tree.map(longer, {**term.data(), **touched}), "weight": weight})

@@ -37,8 +37,8 @@ from vggtgeo.solvers.levenberg_marquardt import (
 )
 from vggtgeo.solvers.problem import energy_of
 
-OF_THE_PROBLEM = {"check_function": False}
-"""Options of solves of `energy_of`: without the check that it is the problem's energy, which is not compiled, then."""
+UNCHECKED = {"check_function": False}
+"""Options of a solve: do not check that the function is the problem's energy, since compiling this check costs time."""
 
 
 class Graduation(eqx.Module):
@@ -67,6 +67,8 @@ class Graduation(eqx.Module):
     def start(self, problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> State:
         """Return the state after all factors, the widest first; fixed coordinates as in `initial`."""
         brief = eqx.tree_at(lambda s: s.max_iterations, solver, self.iterations)
+        # The path to the optimum has no part in its derivative; without this it would be differentiated all the same.
+        problem, state = jax.lax.stop_gradient((problem, initial))
 
         def stage(state: State, factor: Float[Array, ""]) -> tuple[State, None]:
             widened = [eqx.tree_at(lambda t: t.kernel, term, term.kernel.widened(factor)) for term in problem.terms]
@@ -76,7 +78,7 @@ class Graduation(eqx.Module):
                 brief,
                 state,
                 args=BundleAdjustment(wide),
-                options=OF_THE_PROBLEM,
+                options=UNCHECKED,
                 max_steps=self.iterations,
                 # A stage that ends early still leaves a better start.
                 throw=False,
@@ -84,18 +86,15 @@ class Graduation(eqx.Module):
             return found.value, None
 
         factors = jnp.asarray(self.factors, initial.intrinsics.dtype)
-        # The path to the optimum has no part in its derivative; without this it would be differentiated all the same.
-        detached = jax.lax.stop_gradient((problem, initial))
-        problem, state = detached
         state, _ = jax.lax.scan(stage, state, factors)
-        # Fixed coordinates again from `initial`, with their derivative, which the line above has cut off.
+        # Fixed coordinates again from `initial`, with their derivative, which `stop_gradient` has cut off.
         return BundleAdjustment(problem, initial).restore_fixed(jax.lax.stop_gradient(state))
 
 
 class Solution(Readable):
     """The result of `solve`; a pytree, so it passes through `jit` and `vmap`.
 
-    Example (of `solve`'s):
+    Example (`solution` of the example of `solve`):
         >>> solution.to_dict()["converged"]
         True
 
@@ -241,7 +240,7 @@ def _solve_jit(
         solver,
         initial,
         args=BundleAdjustment(problem, initial),
-        options=OF_THE_PROBLEM,
+        options=UNCHECKED,
         max_steps=solver.max_iterations,
         adjoint=adjoint,
         # Failure is a value, `termination`: an exception inside `jit` would lose the state.
@@ -250,16 +249,16 @@ def _solve_jit(
     last = jax.lax.stop_gradient(eqx.filter(found.state, eqx.is_array))
     last = eqx.combine(last, found.state)
     # The diagnosis reports; a derivative of it would only cost compilation.
-    fixed = jax.lax.stop_gradient((problem, initial, found.value))
+    constant, start, end = jax.lax.stop_gradient((problem, initial, found.value))
     # Precision is judged at the initial state: a solve that lacked digits may have ended anywhere.
-    faults = diagnose(prepared(fixed[0]), *fixed[1:], last.energy) if diagnosis else None
+    faults = diagnose(prepared(constant), start, end, last.energy) if diagnosis else None
     codes: Any = Termination
     termination = last.termination
     if faults is not None:
         beyond = jnp.any(faults.unresolved > MAJORITY)
         termination = codes.where(beyond, codes.beyond_precision, termination)
-    alone = fixed[2].inverse_depth[:, : problem.first_segment]
-    beyond = (alone <= MIN_INVERSE_DEPTH) | (alone >= MAX_INVERSE_DEPTH)
+    alone = end.inverse_depth[:, : problem.first_segment]
+    at_bound = (alone <= MIN_INVERSE_DEPTH) | (alone >= MAX_INVERSE_DEPTH)
     return Solution(
         state=found.value,
         energy=_energy_at(last.energy, BundleAdjustment(problem), found.value),
@@ -270,7 +269,7 @@ def _solve_jit(
         termination=termination,
         polished=last.polished,
         gradient_residual=last.gradient_residual,
-        at_bound=jnp.sum(beyond) if problem.positive_depth else jnp.asarray(0),
+        at_bound=jnp.sum(at_bound) if problem.positive_depth else jnp.asarray(0),
         diagnosis=faults,
         record=last.record,
     )

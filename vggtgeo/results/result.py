@@ -115,7 +115,7 @@ class Result:
     def of(cls, slam: Slam, evidence: CornerTracks = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
         """Return the result of a state of `vggtgeo.run` or `vggtgeo.finish`.
 
-        evidence: frame data of an `CornerRecorder`; without it the verdict uses the state alone. truth: ground truth,
+        evidence: frame data of a `CornerRecorder`; without it the verdict uses the state alone. truth: ground truth,
         camera -> world. dense: source of the dense depth, as in `vggtgeo.RunOptions`.
         """
         check_kind("slam", slam, Slam, "a state of `vggtgeo.run`")

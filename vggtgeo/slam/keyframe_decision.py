@@ -26,8 +26,8 @@ from vggtgeo.slam.tracking.frame_tracking import (
 from vggtgeo.slam.tracking.relocalisation import close_loop_while_tracking
 
 MIN_OVERLAP, MAX_PARALLAX = 0.8, math.radians(10.0)
-"""Least share of a keyframe's key points in the image, and largest angle between a point's rays, of a frame that needs
-no keyframe of its own, where lengths have no unit. In simulated walks limits from 0.9 and 5 degrees to 0.7 and 10 are
+"""Minimum share of a keyframe's key points in the image, and largest angle between a point's rays, of a frame that does
+not become a keyframe, where lengths have no unit. In simulated walks limits from 0.9 and 5 degrees to 0.7 and 10 are
 equally accurate (`benchmarks/keyframe_spacing.py`)."""
 MAX_SHIFT = 1.0
 """Pixels by which errors of the keyframe's depths may move its points in the image: the noise of a match. Beyond it
@@ -37,7 +37,7 @@ THIRD_VIEW = 0.25
 
 
 def becomes_keyframe(slam: Slam, found: TrackedFrame, settings: KeyframeSettings) -> bool:
-    """Return whether a tracked frame needs a keyframe of its own (`needs_keyframe`); one placed by rays always does."""
+    """Return whether a tracked frame becomes a keyframe (`needs_keyframe`); one placed by rays alone always does."""
     quality = found.quality
     return quality.by_two_view or needs_keyframe(slam, found.pose, found.keyframe, quality.inliers, settings)
 
@@ -67,9 +67,9 @@ def view_change(slam: Slam, pose: np.ndarray, keyframe: Keyframe, settings: Keyf
 def _unitless_change(pose: np.ndarray, keyframe: Keyframe, intrinsics: np.ndarray) -> float:
     """Return the largest of three shares of their limits: overlap that is lost, parallax, and shift by depth errors.
 
-    The parallax is the root mean square of the angles between the rays to a point from both places: near points tell a
-    position, and count in it as in the information on it. A point of unknown depth counts as the mean of the others,
-    and as infinitely far where no depth is known.
+    The parallax is the root mean square of the angles between the rays to a point from both places: near points
+    determine the position, and count most. A point of unknown depth counts as the mean of the others, and as infinitely
+    far where no depth is known.
     """
     some = np.s_[:: max(len(keyframe.points.pixels) // SAMPLES, 1)]
     inverse = keyframe.points.inverse_depth[some]

@@ -10,8 +10,6 @@ from jaxtyping import Array, Float
 
 from vggtgeo.bundle.terms.term import AbstractTerm, check_residual, reweighted_rows, reweighting, shared_field
 
-Derivatives = tuple[Float[Array, "h s"], Float[Array, "h s"]]
-
 
 class SlotTerm(AbstractTerm):
     """Observations of inverse depths: `weight` and data have the axes `[h, s]`, row of landmarks and slot.
@@ -40,7 +38,7 @@ class SlotTerm(AbstractTerm):
 
     def derivatives(
         self, inverse_depth: Float[Array, "h s"], correction: Float[Array, ""] | None, exact: bool
-    ) -> Derivatives:
+    ) -> tuple[Float[Array, "h s"], Float[Array, "h s"]]:
         """Return first and second derivatives of the energy; for a prepared term."""
         ones = jnp.ones_like(inverse_depth)
         if exact:

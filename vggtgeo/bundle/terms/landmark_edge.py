@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle import camera_derivatives, pinhole_derivatives
 from vggtgeo.bundle.pinhole_derivatives import Gradient, OneEdge, Projection
@@ -124,7 +124,7 @@ class EdgeView(eqx.Module):
             by_cameras = [j + i for j, i in both] if one_camera else [*found.target, *found.host]
             return [*found.motion, *by_cameras], found.depth, found.pixel if self.free_pixels else []
         *shared, depth = pinhole_derivatives.row(*self.projection, a, b)
-        # The centre moves the pixel in the target and, the other way, the ray in the host.
+        # By the pixel in the host: by the pixel in the target, minus by the principal point.
         pixel = [a - shared[CENTRE], b - shared[CENTRE + 1]] if self.free_pixels else []
         return self.tied(shared), depth, pixel
 
@@ -196,7 +196,7 @@ class EdgeTerm(AbstractTerm):
     def residual(self, view: View) -> Float[Array, "*m"]:
         """Return the residual of one landmark observed along one edge."""
 
-    def restricted(self, of_edge: Float[Array, " e"] | Array) -> Self:
+    def restricted(self, of_edge: Bool[Array, " e"]) -> Self:
         """Return the term without the observations of edges where `of_edge` is False."""
         return self.reweighted(jnp.where(of_edge[:, None], self.weight, 0.0))
 

@@ -18,14 +18,14 @@ from vggtgeo.io.errors import InputError
 class MarginalPrior(DenseTerm):
     """`r = root (x boxminus linearisation) + offset` over poses and camera parameters.
 
-    Coordinates: six a keyframe (left tangent `log(T T_lin^-1)`, translation first), then the camera's.
+    Coordinates: six for each keyframe (left tangent `log(T T_lin^-1)`, translation first), then the camera's.
 
     Fields:
         root: [c, c], square root of the information; zero rows have no information.
         offset: [c], the residual at the linearisation point.
         poses: Linearisation points, batch `[n]`; constant during the life of the prior (first estimates).
         intrinsics: [q], linearisation point of the cameras' parameters.
-        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
+        weight: a scalar, factor on the information of the whole residual; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
     Example:

@@ -34,8 +34,8 @@ def _check_data(term: NodeTerm, **shapes: tuple[int, ...]) -> None:
         size = np.linalg.norm(known[:, :4], axis=1) if shape else known
         wrong = ~(np.abs(size - 1) <= UNIT) if shape else ~(size > 0)
         if wrong.any():
-            what = "a quaternion of length 1, w first" if shape else "positive numbers"
-            raise InputError(f"`{term.name}.{name}` must be {what}, got {size[wrong][0]:.3g}")
+            what = "a quaternion of length 1, w first, got length" if shape else "positive numbers, got"
+            raise InputError(f"`{term.name}.{name}` must be {what} {size[wrong][0]:.3g}")
 
 
 class RelativePose(PairTerm):
@@ -149,7 +149,7 @@ class RotationPrior(PoseTerm):
 
 
 class BaselinePrior(PairTerm):
-    """`r = log(|t_ij| / length) / sigma`: the distance of two camera centres.
+    """`r = log(|t_ij| / length) / sigma`: the distance between two camera centres.
 
     Fields:
         length: Metres, or the unit of the map.
@@ -159,7 +159,7 @@ class BaselinePrior(PairTerm):
         first: int [m], keyframe i of each observation.
         second: int [m], keyframe j of each observation.
 
-    Example: the first two cameras are 20 cm apart, to a per mille.
+    Example: the first two cameras are 20 cm apart, with a standard deviation of 0.1 %.
         >>> one = jax.numpy.ones(1)
         >>> vg.terms.BaselinePrior(first=[0], second=[1], length=0.2 * one, sigma=1e-3 * one, weight=one).name
         'baselines'

@@ -33,7 +33,7 @@ def _indices(given: Any) -> Array:
     if not isinstance(given, jax.Array):
         found = np.asarray(given)
         if found.size and found.dtype.kind not in "iu":
-            raise InputError(f"keyframes of a term must be whole numbers, one an observation, got {given!r:.60}")
+            raise InputError(f"keyframes of a term must be whole numbers, one for each observation, got {given!r:.60}")
     return jnp.asarray(given, jnp.int32)
 
 
@@ -65,7 +65,7 @@ class NodeTerm(AbstractTerm):
     ) -> Array:
         """Return the residual of one observation, after a step of its local coordinates.
 
-        step: zero in value, to differentiate by; None: without derivatives.
+        step: zeros, for derivatives by the local coordinates; None: only the residual is needed.
         """
         known, end = [jaxlie.SE3(poses[index]) for index in touched], lie.TANGENT * len(touched)
         if step is not None:
@@ -227,7 +227,7 @@ class DenseTerm(AbstractTerm):
     """One observation of all poses and the camera, with a dense Hessian. `weight` is a scalar.
 
     Fields:
-        weight: 1 / variance of the residual of each observation; 0 = absent, without a derivative.
+        weight: a scalar, factor on the information of the whole residual; 0 = absent, without a derivative.
         kernel: robust kernel of each observation.
 
     Example: the prior of a marginalisation.

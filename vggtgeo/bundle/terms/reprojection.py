@@ -130,7 +130,7 @@ class ImageTerm(EdgeTerm):
         edge, at = view.projection
         (residual, normal, rows), (pull, bend) = derivatives, weights
         centre = slice(CENTRE, CENTRE + 2)
-        # The centre moves the pixel in the target and, the other way, the ray in the host.
+        # By the pixel in the host: by the pixel in the target, minus by the principal point.
         pixel, third_of = normal - jnp.swapaxes(rows[:, centre], 0, 1), -third[centre]
         along, of_pixel = jnp.sum(residual[:, None] * rows, 0), jnp.sum(pixel * residual, 1)
         force, gradient = pull * jnp.sum(normal * residual, 1), pull * of_pixel

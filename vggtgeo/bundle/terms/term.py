@@ -2,7 +2,8 @@
 
 The energy of a term is `1/2 sum rho(w |r|^2)` over its observations. A subclass defines `residual` for ONE observation,
 without mask, batch or weight: there `self` has the data of that observation only. Everything else (energy, gradient,
-normal equations, exact Hessian) is derived from it by automatic differentiation in local coordinates.
+normal equations, exact Hessian) is derived from it by automatic differentiation in local coordinates, except where a
+term has faster derivatives written by hand.
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ def check_residual(term: AbstractTerm, residual: Any) -> Array:
 
 
 def check_padded(term: AbstractTerm, rows: tuple[int, ...], slots: int) -> None:
-    """Raise InputError for a term on landmarks, such as flat lists, without the padded shape of a problem.
+    """Raise InputError if a term on landmarks does not have the padded shape of a problem; flat lists do not.
 
-    The shape is `rows` (its edges or keyframes), then at most `slots`.
+    The shape is `rows` (the number of edges, or of rows of landmarks), then at most `slots`.
     """
     shape = np.shape(term.weight)
     found = [("weight", shape, (*rows, slots))] if shape[:-1] != rows or shape[-1] > slots else []
@@ -63,7 +64,8 @@ def check_padded(term: AbstractTerm, rows: tuple[int, ...], slots: int) -> None:
     for name, own, expected in found:
         raise InputError(
             f"the shape of `{term.name}.{name}` must begin with {expected}, the padded size of the problem, got {own}: "
-            "pass flat lists, one row an observation, as a `vggtgeo.terms.FlatTerm` to `vggtgeo.pack(..., terms=[...])`"
+            "pass flat lists, one row for each observation, as a `vggtgeo.terms.FlatTerm` to "
+            "`vggtgeo.pack(..., terms=[...])`"
         )
 
 

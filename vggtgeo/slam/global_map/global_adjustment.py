@@ -47,7 +47,7 @@ MAX_NAMED = 4
 
 
 class _Solved(NamedTuple):
-    """A state, the problem that it is the solution of, and this solution."""
+    """A SLAM state after an adjustment, the adjustment, and its solution."""
 
     slam: Slam
     adjustment: Adjustment
@@ -68,9 +68,10 @@ class _Solved(NamedTuple):
 def adjust_all(slam: Slam, settings: SlamSettings, *, rounds: int = ROUNDS, uncertainty: bool = True) -> Slam:
     """Bundle-adjust every keyframe, with surfaces if there is metric depth, in a few rounds.
 
-    The first round also estimates the readout time of a rolling shutter, and corrections of the camera; later rounds
-    keep both. Without measured depth, each but the last is followed by a search for further matches.
-    uncertainty: whether to compute that of the poses.
+    The first round also estimates the readout time of a rolling shutter, and corrections of the camera. Later rounds
+    keep both, except a given camera that was refined without depth: they estimate it again. Without measured depth,
+    each round but the last is followed by a search for further matches. uncertainty: whether to compute that of the
+    poses.
     """
     if len(slam.keyframes) < MIN_KEYFRAMES_FOR_CAMERA or not slam.map.pairs:
         return slam
@@ -86,7 +87,7 @@ def adjust_all(slam: Slam, settings: SlamSettings, *, rounds: int = ROUNDS, unce
         slam = done.slam
         if is_first:
             done = _try_rolling_shutter(done, settings)
-            slam, shared = shared.try_camera(done, settings, last=rounds == 1)
+            slam, shared = shared.with_tried_camera(done, settings, last=rounds == 1)
             described = slam.map.pairs
         if not slam.metric and number < rounds - 1:
             slam = slam.with_map(pairs=guided_pairs(replace(slam.map, pairs=described), slam.intrinsics))
@@ -137,7 +138,8 @@ class _SharedByRounds:
     def adjustment(self, slam: Slam, settings: SlamSettings, finds_camera: bool) -> tuple[Adjustment, tuple[str, ...]]:
         """Return a round's adjustment and warnings about its gauge.
 
-        finds_camera: without measurements that depend on the current camera: tracked motions and surfaces.
+        finds_camera: whether the camera is unknown and is estimated now; measurements that depend on its current value
+        (tracked motions, surfaces) are then left out.
         """
         factors = _factors_without_intrinsics(slam) if finds_camera else slam.map.factors
         adjustment = build(
@@ -150,7 +152,7 @@ class _SharedByRounds:
             fixed_pose=np.isin(np.arange(len(slam.keyframes)), slam.map.roots),
             terms=_terms(slam, factors, self.surfaces, self.shape, settings),
         )
-        # Surfaces were unprojected with the current intrinsics and would hold them.
+        # Surfaces were unprojected with the current intrinsics and would keep them near their current values.
         problem = without_surfaces(adjustment.problem) if finds_camera else adjustment.problem
         problem, gauge = with_one_gauge(problem, adjustment.initial, len(slam.keyframes), slam.metric)
         notes = gauge_notes(gauge, adjustment.keyframes, "global adjustment")
@@ -159,7 +161,7 @@ class _SharedByRounds:
             problem = problem_to_global_shutter(problem, adjustment.initial, motions, size, slam.camera.readout)
         return replace(adjustment, problem=problem), notes
 
-    def try_camera(self, done: _Solved, settings: SlamSettings, *, last: bool) -> tuple[Slam, _SharedByRounds]:
+    def with_tried_camera(self, done: _Solved, settings: SlamSettings, *, last: bool) -> tuple[Slam, _SharedByRounds]:
         """Return the state after trying to refine its camera, and the data for the following rounds.
 
         A guessed camera is fixed after its estimation (see `_factors_without_intrinsics`). last: no round follows.
@@ -180,7 +182,7 @@ class _SharedByRounds:
         return slam, replace(self, edges=_edges(slam), surfaces=_surfaces(slam), camera=camera)
 
 
-def _solved(problem: Problem, state: State) -> State:
+def _solve_again(problem: Problem, state: State) -> State:
     """Adjust any problem of the shape of a global adjustment."""
     return solve_jit(problem, state, global_solver(problem)).state
 
@@ -192,7 +194,7 @@ def _try_rolling_shutter(done: _Solved, settings: SlamSettings) -> _Solved:
         return done
     problem = done.adjustment.problem
     motions = camera_motions(slam, problem.num_keyframes)
-    found = find_readout(problem, done.state, motions, slam.keyframes[0].size, frame_interval(slam), _solved)
+    found = find_readout(problem, done.state, motions, slam.keyframes[0].size, frame_interval(slam), _solve_again)
     if found is None or not found.is_significant:
         return done
     done = done.with_problem(found)
@@ -200,22 +202,22 @@ def _try_rolling_shutter(done: _Solved, settings: SlamSettings) -> _Solved:
 
 
 def _try_camera(done: _Solved, edges: list[Directed], settings: SlamSettings) -> Slam:
-    """Return the state after trying to refine a given camera, and to find a lens that no calibration tells."""
+    """Return the state after trying to refine a given camera, and to find a lens that no calibration gives."""
     camera, refined = done.slam.camera, None
     if camera.calibrated and done.slam.metric:
         motions = None if camera.readout is None else camera_motions(done.slam, len(done.slam.keyframes))
         pairs = keyframe_pairs(done.slam.map, camera, edges, motions)
-        found = refine_given_camera(pairs, done.adjustment.problem, done.state, _solved)
+        found = refine_given_camera(pairs, done.adjustment.problem, done.state, _solve_again)
         return _apply_refined_camera(done, found, settings)
     if camera.calibrated:
         # Focal length and lens are free together: either alone absorbs the other.
-        free, refined = estimate_with_map(done.adjustment.problem, done.state, _solved)
+        free, refined = estimate_with_map(done.adjustment.problem, done.state, _solve_again)
         done = done._replace(adjustment=replace(done.adjustment, problem=free), state=refined.state or done.state)
     elif done.adjustment.problem.shared_focal:
         done = _try_pixel_aspect(done)
     unknown = (camera.lens is None or camera.self_calibrated) and not camera.given_lens
     if unknown and can_undistort(done.slam.keyframes):
-        lens = find_lens(done.adjustment.problem, done.state, done.slam.keyframes[0].size, _solved)
+        lens = find_lens(done.adjustment.problem, done.state, done.slam.keyframes[0].size, _solve_again)
         undistorting = _apply_lens(done.slam, done.adjustment, lens)
         if undistorting is not done.slam:
             return undistorting
@@ -223,8 +225,8 @@ def _try_camera(done: _Solved, edges: list[Directed], settings: SlamSettings) ->
 
 
 def _try_pixel_aspect(done: _Solved) -> _Solved:
-    """Return the solution with non-square pixels of a guessed camera, if it has such."""
-    found = find_aspect(done.adjustment.problem, done.state, _solved)
+    """Return the solution with non-square pixels of a guessed camera, if they are significant."""
+    found = find_aspect(done.adjustment.problem, done.state, _solve_again)
     if found is None or not found.is_significant:
         return done
     done = done.with_problem(found)
@@ -257,10 +259,8 @@ def _surfaces(slam: Slam) -> list[Surface]:
 
 def _apply_refined_camera(done: _Solved, found: RefinedCamera | None, settings: SlamSettings) -> Slam:
     """Return the state with a refined camera if it improves the fit or is required, and notes for the user."""
-    if found is None:
-        return done.slam
     always = settings.camera.refine_intrinsics == "always"
-    if found.state is None or not (found.is_significant or always):
+    if found is None or found.state is None or not (found.is_significant or always):
         return done.slam
     slam = _Solved.of(done.slam, done.adjustment, found.state).slam
     if found.change <= REPORTED_CHANGE:
@@ -282,7 +282,7 @@ def _apply_lens(slam: Slam, adjustment: Adjustment, found: FoundLens | None) -> 
 
 
 def undistorted(slam: Slam, lens: Camera) -> Slam:
-    """Return the state for the ideal pinhole of `lens`, of the images as they are now; poses and depths stay."""
+    """Return the state after the distortion `lens` is removed from its current images; poses and depths stay."""
     frames = tuple(
         record
         if record.seen is None
@@ -299,7 +299,7 @@ def undistorted(slam: Slam, lens: Camera) -> Slam:
 def _terms(
     slam: Slam, factors: Sequence[Factor], surfaces: list[Surface], shape: PaddedShape, settings: SlamSettings
 ) -> tuple[AbstractTerm, ...]:
-    """Return the terms on poses besides matches: factors of the run, and aligned surfaces."""
+    """Return all terms besides matches: factors of the run, the prior of the pixels' aspect, and aligned surfaces."""
     places = {keyframe.number: row for row, keyframe in enumerate(slam.keyframes)}
     terms = factor_terms(factors, places, dict(shape.room), metric=slam.metric)
     if slam.camera.calibrated and not slam.metric:

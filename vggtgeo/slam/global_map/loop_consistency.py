@@ -5,12 +5,13 @@ enough. They must also be consistent with odometry. Three tests of the squared M
 significance level:
 
 1. Each loop against odometry on the way between its ends, whose covariance is a bound for any correlation of the errors
-(`slam/tracking/odometry.py`). It grows with the way, so that a true loop after a long drift passes. 2. Each loop
-against loops between keyframes near by, over the short ways between them (pairwise consistency: Mangelson et al., ICRA
-2018). Consistent loops form one cluster, a revisited place; a single loop is not used, since a large drift allows it by
-chance. 3. Each cluster against the loops selected before, the most plausible cluster first: in the median, its loops
-must be consistent with the nearest of those. The drift that those measured limits the drift elsewhere: its variance is
-at most the upper confidence limit by their distances, instead of the bound for any correlation.
+   (`slam/tracking/accumulated_odometry.py`). It grows with the way, so that a true loop after a long drift passes.
+2. Each loop against loops between keyframes near by, over the short ways between them (pairwise consistency: Mangelson
+   et al., ICRA 2018). Consistent loops form one cluster, a revisited place; a single loop is not used, since a large
+   drift allows it by chance.
+3. Each cluster against the loops selected before, the most plausible cluster first: in the median, its loops must be
+   consistent with the nearest of those. The drift that those measured limits the drift elsewhere: its variance is at
+   most the upper confidence limit by their distances, instead of the bound for any correlation.
 """
 
 from __future__ import annotations

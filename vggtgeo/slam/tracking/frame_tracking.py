@@ -191,7 +191,7 @@ def track_by_two_view(given: TrackingInput, keyframe: Keyframe, length: float) -
 
 
 def unless_contradicted(found: TrackedFrame, given: TrackingInput, keyframe: Keyframe, length: float) -> TrackedFrame:
-    """Return the track, or that by rays if its motion explains more matches beyond chance.
+    """Return the track, or the track by rays alone if it explains significantly more matches.
 
     keyframe, length: as for `track_by_two_view`. A track by another keyframe is returned as it is: the poses of both
     keyframes may differ by drift.
@@ -218,7 +218,7 @@ def _placed_by_two_view(
     metre = metre_of(found.points[found.inliers], np.eye(4))
     quality = TrackingQuality(matches=len(matches), inliers=agree, metre=metre, by_two_view=True)
     motion = Motion(found.motion, found.information)
-    # Rays say little of the length of the motion, which the prior continues.
+    # Rays alone hardly determine the length of the motion; the prior adds it.
     motion = motion if given.prior is None else fused_with_prior(motion, given.prior.motion_from(keyframe))
     return _judged(rigid.orthonormal(motion.motion @ keyframe.pose), motion.information, quality, keyframe, None)
 
@@ -227,7 +227,7 @@ def _placed(
     given: TrackingInput, keyframe: Keyframe, views: tuple[RgbdView, RgbdView] | None, located: Located
 ) -> TrackedFrame:
     """Return the track from key points, refined by image, surface and lines; without points, from the motion prior."""
-    guess, lines = located.guess, given.roles.line_matches
+    guess, line_matcher = located.guess, given.roles.line_matches
     known = guess.result is GeometryResult.SUCCESS
     aligner, dense = given.roles.alignment, None
     # Dense alignment converges from near poses only: with neither a pose nor a prediction there is no start.
@@ -237,7 +237,7 @@ def _placed(
     if known:
         information = pose_information(guess.pose, located.points[guess.inliers], given.intrinsics, located.sigma)
         by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
-    quality = _seen(guess, located.matches, by_points, dense)
+    quality = _quality_of(guess, located.matches, by_points, dense)
     if known and not given.roles.metric:
         quality = replace(quality, metre=metre_of(located.points[guess.inliers], guess.pose))
     prior = None if given.prior is None else given.prior.motion_from(keyframe)
@@ -248,7 +248,7 @@ def _placed(
     # Finding lines costs as much as the alignment, so it is done only where it can help.
     needed = prior is not None if found is None else weakly_constrained(found)
     if needed and given.data.lines is not None:
-        found, quality = with_lines(found, prior, quality, keyframe, given.data.lines, given.intrinsics, lines)
+        found, quality = with_lines(found, prior, quality, keyframe, given.data.lines, given.intrinsics, line_matcher)
     if found is None:
         nothing = np.zeros((6, 6))
         return TrackedFrame(keyframe, guess.pose, nothing, quality, guess.result, matches=located.with_unknown_depth)
@@ -275,7 +275,7 @@ def refined_by_map(found: TrackedFrame, given: TrackingInput, keyframes: Iterabl
     )
     if refined is None:
         return found
-    # What no sample removes is common to all keyframes, and counted once.
+    # Systematic errors, which more points do not reduce, are common to all keyframes: `information` adds them once.
     measured = found.measured + refined.information
     quality = replace(found.quality, map_points=refined.points)
     better = _judged(rigid.orthonormal(refined.pose), measured, quality, found.keyframe, given.prior)
@@ -293,11 +293,11 @@ def factor_to(found: TrackedFrame, number: int) -> MeasuredRelativePose:
 
     Information from other keyframes is left out: it enters by their own edges and would count twice.
     """
-    own = found.alone or found
+    direct = found.alone or found
     return MeasuredRelativePose(
-        *(own.keyframe.number, number, own.relative, own.information),
-        by_two_view=own.quality.by_two_view,
-        recorded=own.quality.recorded,
+        *(direct.keyframe.number, number, direct.relative, direct.information),
+        by_two_view=direct.quality.by_two_view,
+        recorded=direct.quality.recorded,
     )
 
 
@@ -350,7 +350,8 @@ def _judged(
     return replace(track, quality=quality)
 
 
-def _seen(guess: PoseGuess, matches: int, by_points: Motion | None, dense: Aligned | None) -> TrackingQuality:
+def _quality_of(guess: PoseGuess, matches: int, by_points: Motion | None, dense: Aligned | None) -> TrackingQuality:
+    """Return the measures of a pose by points, and of the dense alignment if there is one."""
     quality = TrackingQuality(matches=matches, inliers=guess.inlier_count, error=guess.error)
     if dense is None:
         return quality

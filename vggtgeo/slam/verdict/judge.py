@@ -24,7 +24,7 @@ from vggtgeo.slam.verdict.findings import Finding, Level, Verdict, conclude
 
 
 def judge(slam: Slam, evidence: CornerTracks = (), input_findings: tuple[Finding, ...] = ()) -> Verdict:
-    """Judge the state after the last adjustment. evidence: of all frames, from an `CornerRecorder`; without it only
+    """Judge the state after the last adjustment. evidence: of all frames, from a `CornerRecorder`; without it only
     the run's own record counts. input_findings: what is known of the input already.
     """
     claim = Claim.of(slam)
