@@ -26,7 +26,6 @@ from vggtgeo.io.errors import UnusableDepthWarning
         ("color/{:06d}.png", "depth/{:06d}.png"),  # Open3D's
         ("RGB/rgb_{}.png", "Depth/depth_00{}.png"),
         ("images/130503110{}.175304.png", "depth/130503110{}.162211.png"),
-        ("image/{}_left_a1.png", "depth/{}_depth_a1.png"),  # only the order tells
         ("rgb/{}.png", "aligned_depth_to_color/{}.png"),
         ("color_{}.png", "depth_{}.png"),  # one folder for both
         ("{:05d}-color.png", "{:05d}-depth.png"),
@@ -34,7 +33,7 @@ from vggtgeo.io.errors import UnusableDepthWarning
     ],
 )
 def test_folders_of_colour_and_depth_are_paired(tmp_path: Path, colour: str, depth: str) -> None:
-    # Proves pairing by name, number, time and order, millimetres, and the camera of Open3D's recorders. Oracle: what
+    # Proves pairing by name, number and time, millimetres, and the camera of Open3D's recorders. Oracle: what
     # was written: the depth of a frame tells which it is.
     sequence = tiny.quietly_opened(tiny.rgbd(tmp_path / "own", colour, depth))
     frames = checked(sequence, "RgbdFolders")
@@ -134,17 +133,6 @@ def test_a_list_of_pairs_with_times_is_nobody_elses_benchmark(tmp_path: Path, na
     np.testing.assert_allclose([frame.timestamp for frame in frames], np.float64(times), rtol=0, atol=1e-6)
     assert [int(frame.name[-9:-4]) for frame in frames] == list(range(COUNT))
     assert frames[1].depth[3, 7] == pytest.approx(1.017 / 5)  # 1/5000 m
-
-
-def test_a_list_of_pairs_that_counts_frames_has_thirty_a_second_and_millimetres(tmp_path: Path) -> None:
-    # Proves that numbers of frames are not taken for seconds, and that this is said. Oracle: 1/30 s.
-    folder = _pairs(tmp_path / "own", [str(number) for number in range(1, COUNT + 1)])
-    with warns("associations.txt", "30"):
-        sequence = open_sequence(folder)
-    assert isinstance(sequence, TumRgbd)
-    frames = list(sequence.frames())
-    np.testing.assert_allclose(np.diff([frame.timestamp for frame in frames]), 1 / 30)
-    assert frames[1].depth[3, 7] == pytest.approx(1.017)
 
 
 def test_the_camera_of_an_export_of_record3d(tmp_path: Path) -> None:

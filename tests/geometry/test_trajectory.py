@@ -73,14 +73,14 @@ def test_commas_comments_and_long_quaternions_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "named"),
     [
-        ("0.2 nan 0 0 0 0 0 1", ("line 3", "nan")),
-        ("0.2 0 0 0 0 0 0", ("line 3", 7, 8)),
+        ("0.2 nan 0 0 0 0 0 1", ("pose 3", "nan")),
+        ("0.2 0 0 0 0 0 0", ("line 3", "0.2 0 0 0 0 0 0", 8)),
         ("0.2 0 0 zero 0 0 0 1", ("line 3", "0.2 0 0 zero 0 0 0 1")),
-        ("0.2 0 0 0 0 0 0 0", ("line 3", "quaternion")),
+        ("0.2 0 0 0 0 0 0 0", ("pose 3", "quaternion")),
     ],
 )
 def test_a_bad_line_is_named(tmp_path: Path, line: str, named: tuple[object, ...]) -> None:
-    # Proves that each kind of bad line is an error with the file, the line, what was found and what was expected.
+    # Proves that each kind of bad line is an error with the file, its number, what was found and what was expected.
     with raises("trajectory.txt", *named):
         Trajectory.load_tum(_file(tmp_path, GOOD + line + "\n"))
 

@@ -38,18 +38,6 @@ def rgbd(images: str) -> Callable[[Path], Path]:
     return make
 
 
-def every_depth(image: np.ndarray) -> Callable[[Path], Path]:
-    """A TUM folder whose depth images are all this one."""
-
-    def make(folder: Path) -> Path:
-        tiny.tum(folder / "desk", count=4)
-        for file in (folder / "desk/depth").iterdir():
-            cv2.imwrite(str(file), image)
-        return folder / "desk"
-
-    return make
-
-
 def video(path: Path, count: int = 12) -> Path:
     """A video that can be read: pictures that have nothing in common."""
     return tiny.video(path, map(picture, range(count)), "mp4v")

@@ -192,7 +192,6 @@ def evaluates(kind: str, given: str, named: tuple[str, ...], make: Callable[[Pat
 WITH_MAP = ("--map", beside("office.map"))
 VERIFY = ("models", "verify", itself)
 SOLVE = ("solve", itself, "-o", beside("solution.npz"))
-MILLIMETRES = np.full((tiny.HEIGHT, tiny.WIDTH), 2, np.uint16)
 FFCONCAT = "ffconcat version 1.0\nfile /etc/passwd\n"
 MANY_POINTS = f"format binary_little_endian 1.0\nelement vertex 1000000000000000\n{XYZ}"
 ROWS = (
@@ -216,7 +215,6 @@ ROWS = (
     Row("truncated", "summary that is not JSON", ("1", "2"), half_a_summary, call=Result.load),
     # Images.
     reads("truncated", "empty image", ("1.png",), empty_image, warned=True),
-    reads("wrong", "metres as 16 bits", ("10.004000.png", "0.0004"), bad.every_depth(MILLIMETRES), warned=True),
     # Lists, poses and cameras.
     reads("missing", "list without a line", ("rgb.txt",), bad.rgbd("# nothing\n")),
     reads("wrong", "time that is a word", ("rgb.txt", "1"), bad.rgbd("now rgb/1.png\n")),

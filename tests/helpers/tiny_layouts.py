@@ -213,9 +213,6 @@ def kitti_raw(folder: Path) -> Path:
     fx, fy, cx, cy = INTRINSICS
     (place.parent / "calib_cam_to_cam.txt").write_text(
         "calib_time: 09-Jan-2012 13:57:47\n"
-        f"S_02: {WIDTH + 8:e} {HEIGHT + 4:e}\n"
-        f"K_02: {fx + 5:e} 0 {cx:e} 0 {fy + 5:e} {cy:e} 0 0 1\n"
-        "D_02: -0.369 0.197 0.001 0.0006 -0.07\n"
         f"S_rect_02: {WIDTH:e} {HEIGHT:e}\n"
         f"P_rect_02: {fx:e} 0 {cx:e} {0.06 * fx:e} 0 {fy:e} {cy:e} 0 0 0 1 0\n"
     )

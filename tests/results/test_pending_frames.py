@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.results.tracking_loop import PendingFrames, read_only
+from vggtgeo.results.tracking_loop import PendingFrames
 from vggtgeo.slam.tracking.tracking_state import FramePose
 
 
@@ -53,12 +53,3 @@ def test_a_frame_left_out_is_forgotten() -> None:
     assert len(list(hand)) == len(frames)
     assert hand.take(_record(frames[2])) is frames[2]
     assert hand.take(_record(frames[3])) is frames[3]
-
-
-def test_who_looks_at_a_frame_cannot_change_it() -> None:
-    """A callback that draws into a frame is refused, and the frame of the map stays; oracle: its own image."""
-    frame = _frame(0)
-    with pytest.raises(ValueError, match="read-only"):
-        read_only(frame).image[:] = 9
-    assert not frame.image.any()
-    assert frame.image.flags.writeable

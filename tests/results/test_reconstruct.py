@@ -21,7 +21,6 @@ from vggtgeo.cli.main import make_app
 from vggtgeo.io.errors import LeftOutWarning
 from vggtgeo.results.output_checks import EXPORTS
 from vggtgeo.results.source import Source, open_source, with_pose_prior
-from vggtgeo.results.summary import RESERVED_KEYS
 from vggtgeo.simulation.sequence import write_tum_folder
 from vggtgeo.slam.settings.table import changed
 
@@ -176,7 +175,6 @@ def test_any_iterable_of_frames_will_do() -> None:
     assert found.record.title == "a list"
     assert found.record.truth is None
     assert expected.record.truth is not None
-    assert expected.summary.keys() <= RESERVED_KEYS  # what no fact of a caller may be called
     with raises("`frames`"):
         vg.reconstruct([])
 
@@ -189,7 +187,6 @@ def test_any_iterable_of_frames_will_do() -> None:
         ("stride", {"stride": 0}),
         ("seed", {"seed": -1}),
         ("dense", {"dense": "stereo"}),
-        ("facts", {"facts": {"frames": 3}}),
         ("facts", {"facts": {"error": np.nan}}),
         ("warned", {"warned": "one text"}),
     ],

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from vggtgeo.cli.options import EXIT_INPUT, JsonOption, QuietOption, parse_size
+from vggtgeo.io.errors import one_line
 
 data = typer.Typer(
     help="Where to get recordings, and what is wrong with one.", no_args_is_help=True, add_completion=False
@@ -49,7 +50,7 @@ def check_command(
         for fact in found.facts:
             typer.echo(fact)
         for problem in found.problems:
-            typer.echo(f"- {problem}")
+            typer.echo(f"- {one_line(problem)}")
         typer.echo(f"{len(found.problems)} problems" if found.problems else "no problem found")
     if found.problems:
         raise typer.Exit(EXIT_INPUT)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from vggtgeo.cli.options import EXIT_FAILED, JsonOption
-from vggtgeo.io.errors import collected_warnings, warn
+from vggtgeo.io.errors import collected_warnings, one_line, warn
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -125,7 +125,7 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
         table.add_row(name, *(shown(value) if value == value else "-" for value in values))
     console.print(table)
     for warning in report.warnings:
-        console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+        console.print(f"warning: {one_line(warning)}", soft_wrap=True, markup=False, highlight=False)
 
 
 _METRIC_ONLY = ("ATE, SE(3)", "ATE, yaw only", "ATE, not aligned", "RPE translation")

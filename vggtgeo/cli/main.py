@@ -28,7 +28,7 @@ from vggtgeo.cli.solve import solve
 from vggtgeo.cli.view import export, view
 from vggtgeo.compilation.jax_environment import jax_environment
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one_line
-from vggtgeo.io.process import end_on_signals, ignore_signals, share_heaps
+from vggtgeo.io.process import end_on_signals, share_heaps
 
 GC_THRESHOLD = 50_000
 """New objects between two garbage collections: with Python's default of 700 they take some per cent of a run."""
@@ -160,9 +160,6 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
         message, code = f"error: `{error.filename}`: {error.strerror}", EXIT_INPUT
     elif isinstance(error, InputError | OSError):
         message, code = f"error: {error}", EXIT_INPUT
-    elif _is_short_of_memory(error):
-        message = f"error: not enough memory ({error}); use fewer or smaller images, or smaller settings"
-        code = EXIT_INPUT
     elif _is_usage_error(error):
         message, code = f"error: {_usage_message(error, command)}", EXIT_INPUT
     else:
@@ -170,12 +167,6 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
         code = EXIT_INTERNAL
     typer.echo(one_line(message), err=True)
     raise typer.Exit(code) from None
-
-
-def _is_short_of_memory(error: BaseException) -> bool:
-    """Return whether memory or threads ran out: NumPy, Python and JAX raise different errors."""
-    words = ("RESOURCE_EXHAUSTED", "can't start new thread")
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(words))
 
 
 def _usage_message(error: Any, command: str) -> str:
@@ -243,10 +234,7 @@ def main() -> None:
             stream.reconfigure(errors="replace")  # `?` for characters that it cannot encode
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # no messages about its cache folder
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
-    try:
-        make_app()(prog_name="vggtgeo")
-    finally:
-        ignore_signals()
+    make_app()(prog_name="vggtgeo")
 
 
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:

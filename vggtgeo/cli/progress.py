@@ -212,4 +212,4 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
     lines += [f"- {reason}" for reason in verdict.reasons]
     lines.append(verdict_line(verdict))
     for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(one_line(line), markup=False, highlight=False, soft_wrap=True)

@@ -58,7 +58,7 @@ def run(
 ) -> None:
     """Estimate trajectory and map of the sequence at PATH."""
     if options.save_map is not None:
-        check_map_place(options.save_map, output)
+        check_map_file(options.save_map)
     with collected_warnings() as warned:
         sequence = open_input(path, given)
     from vggtgeo.cli.run_sequence import run_and_write
@@ -145,16 +145,12 @@ def tables_of_switches(switches: SwitchOptions, options: ResultOptions) -> dict[
     return tables
 
 
-def check_map_place(file: Path, output: Path) -> None:
-    """Raise InputError if the map's file is not writable, or would be replaced by results of the run."""
-    from vggtgeo.io.files import whole_path
-    from vggtgeo.results.output_checks import check_can_be_written, is_result
+def check_map_file(file: Path) -> None:
+    """Raise InputError if the map's file is a folder, or is not writable."""
+    from vggtgeo.results.output_checks import check_can_be_written
 
-    if file.is_dir() or is_result(output, file) or whole_path(file) == whole_path(output):
-        raise InputError(
-            f"`--save-map` is `{file}`, a folder or a result of the run itself; give another file, such as "
-            f"`{output}.map`"
-        )
+    if file.is_dir():
+        raise InputError(f"`--save-map` is `{file}`, a folder; give the name of a file")
     check_can_be_written(file.parent, "--save-map")
 
 

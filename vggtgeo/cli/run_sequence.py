@@ -18,12 +18,11 @@ from vggtgeo.cli.view import serve_until_interrupted
 from vggtgeo.datasets import Frame, Sequence, without_depth
 from vggtgeo.datasets.views import reduced
 from vggtgeo.io.errors import InputError, one_line
-from vggtgeo.io.files import whole_path
 from vggtgeo.io.process import interruption
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.results.checkpoints import Checkpoints
 from vggtgeo.results.files import write_settings, write_trajectories
-from vggtgeo.results.output_checks import EXPORTS, SUMMARY, is_in_results
+from vggtgeo.results.output_checks import EXPORTS, SUMMARY
 from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.results.result import DepthChoice, Result
 from vggtgeo.results.run_folder import RESERVE, RunFolder, open_run_folder
@@ -155,11 +154,9 @@ def _rerun_callbacks(
     """
     if target is None:
         return (), None
-    if check_target(target) not in ("spawn", "serve"):
-        if is_in_results(folder.folder, Path(target)):
-            raise InputError(f"`--rerun` is `{target}`, in a folder that the run replaces; give a file beside it")
-        if whole_path(Path(target).parent) == whole_path(folder.folder):
-            target = str(folder.stage / Path(target).name)
+    is_file = check_target(target) not in ("spawn", "serve")
+    if is_file and Path(target).parent.resolve() == folder.folder.resolve():
+        target = str(folder.stage / Path(target).name)
     opened = open_target(target, name, folder.stage / STAND_IN)
     if opened.url is not None:
         typer.echo(f"follow the run in a browser: {opened.url}", err=True)

@@ -143,12 +143,4 @@ def pipeline_settings(
     for tables in layers:
         for group, values in tables.items():
             together[group] = {**together.get(group, {}), **values}
-    try:
-        return updated(SlamSettings(), together)
-    except InputError:
-        if in_use is not None and in_use.tables:
-            try:  # is the error in the file itself?
-                updated(SlamSettings(), in_use.tables)
-            except InputError as error:
-                raise InputError(f"`{in_use.file}`: {error}") from None
-        raise
+    return updated(SlamSettings(), together)

@@ -132,9 +132,9 @@ def shown_image(path: Path | None) -> np.ndarray:
         from vggtgeo.simulation.sequence import simulate
 
         return simulate("room", 1, 0, (640, 480)).frame(0).image
-    from vggtgeo.datasets.image_files import read_image
+    from vggtgeo.datasets.image_files import read_image_file
 
-    return read_image(path)
+    return read_image_file(path).image
 
 
 def _depth_pixels(session: Session, image: np.ndarray) -> int | None:

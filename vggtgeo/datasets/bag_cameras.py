@@ -21,8 +21,8 @@ from jaxtyping import Float
 
 from vggtgeo.datasets.bag_images import Chosen, is_registered
 from vggtgeo.datasets.intrinsics import is_fisheye, pinhole_of, warn_of_other_size
-from vggtgeo.datasets.pose_files import poses_of
 from vggtgeo.geometry.camera import Camera, check_distortion
+from vggtgeo.geometry.trajectory import poses_of
 from vggtgeo.io.errors import InputError, warn
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"

@@ -45,21 +45,10 @@ COLOUR: dict[str, Coding] = {
     **{f"{bits}UC{count}": Coding(count, change, bits) for bits in (8, 16) for count, change in _PLAIN.items()},
     **dict.fromkeys(("yuv422", "uyvy"), Coding(2, cv2.COLOR_YUV2RGB_UYVY)),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), Coding(2, cv2.COLOR_YUV2RGB_YUY2)),
-    "nv12": Coding(1, cv2.COLOR_YUV2RGB_NV12),
-    "nv21": Coding(1, cv2.COLOR_YUV2RGB_NV21),
 }
-_OF_SQUARES = ("nv12", "nv21")
-"""Encodings with one colour per 2 x 2 pixels (4:2:0), in rows behind the grey values: half as many."""
 _HEAD = 12
 """Bytes before the PNG of a `compressedDepth`: a format, and two parameters of the quantisation."""
 _PNG = b"\x89PNG"
-
-
-@dataclass(frozen=True)
-class Unread:
-    """A damaged message. reason: why it cannot be read."""
-
-    reason: str
 
 
 def encoding_of(message: Any) -> str:
@@ -75,8 +64,8 @@ def kind_of(message: Any) -> str:
 
 
 def _check_read(message: Any, place: Path) -> None:
-    if isinstance(message, Unread):
-        raise InputError(f"`{place}` is damaged: {message.reason}")
+    if isinstance(message, InputError):
+        raise InputError(f"`{place}` is damaged: {message}")
 
 
 def image_of(message: Any, place: Path, min_bits: int = 8) -> ImageFile:
@@ -87,8 +76,7 @@ def image_of(message: Any, place: Path, min_bits: int = 8) -> ImageFile:
     if message.encoding not in COLOUR:
         raise InputError(f"`{place}`: `encoding` is {message.encoding}; it must be one of {', '.join(COLOUR)}")
     coding = COLOUR[message.encoding]
-    rows = message.height * 3 // 2 if message.encoding in _OF_SQUARES else message.height
-    image, bits = eight_bits(_pixels(message, place, f"u{coding.bits // 8}", coding.channels, rows), min_bits)
+    image, bits = eight_bits(_pixels(message, place, f"u{coding.bits // 8}", coding.channels), min_bits)
     if coding.change is not None:
         try:
             image = np.asarray(cv2.cvtColor(image, coding.change))
@@ -115,24 +103,24 @@ def metres_of(message: Any, place: Path) -> np.ndarray:
     return _raw_metres(message, place) if hasattr(message, "encoding") else _compressed_metres(message, place)
 
 
-def _pixels(message: Any, place: Path, kind: str, channels: int, rows: int) -> np.ndarray:
-    """Return the values of a message, [rows, W, channels], after a check of their size; drivers pad rows."""
+def _pixels(message: Any, place: Path, kind: str, channels: int) -> np.ndarray:
+    """Return the values of a message, [H, W, channels], after a check of their size; drivers pad rows."""
     data, element = np.asarray(message.data, np.uint8), np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
     row = message.width * channels * element.itemsize
-    if not row or not rows or message.step < row or message.step * rows != len(data):
+    if not row or not message.height or message.step < row or message.step * message.height != len(data):
         raise InputError(
             f"`{place}` has {len(data)} bytes, and declares {message.width} x {message.height} pixels of "
             f"{message.encoding}, {message.step} bytes a row: they are inconsistent"
         )
-    inside = np.ascontiguousarray(data.reshape(rows, message.step)[:, :row])
-    return inside.view(element).reshape(rows, message.width, channels)
+    inside = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :row])
+    return inside.view(element).reshape(message.height, message.width, channels)
 
 
 def _raw_metres(message: Any, place: Path) -> np.ndarray:
     if message.encoding not in DEPTH:
         raise InputError(f"`{place}`: its encoding is {message.encoding}; depth has {', '.join(DEPTH)}")
     kind = DEPTH[message.encoding]
-    codes = _pixels(message, place, kind, 1, message.height)[..., 0]
+    codes = _pixels(message, place, kind, 1)[..., 0]
     return metres_of_floats(codes) if kind == "f4" else _of_millimetres(codes)
 
 

@@ -29,7 +29,6 @@ from vggtgeo.datasets.bag_cameras import (
 from vggtgeo.datasets.bag_images import (
     IMAGES,
     Chosen,
-    Unread,
     chosen_topics,
     image_of,
     metres_of,
@@ -40,9 +39,9 @@ from vggtgeo.datasets.depth_registration import DepthRegistration
 from vggtgeo.datasets.folder import ImageChecks
 from vggtgeo.datasets.frame import MAX_DELAY, Frame, NearestInTime, check_selection
 from vggtgeo.datasets.intrinsics import guess_with_warning
-from vggtgeo.datasets.pose_files import poses_of, trajectory_of
+from vggtgeo.datasets.pose_files import trajectory_of
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory, poses_of
 from vggtgeo.io.errors import InputError, NoteWarning, install_hint, warn
 
 _Read = TypeVar("_Read")
@@ -59,18 +58,12 @@ def is_bag(path: Path) -> bool:
 
 
 def why_incomplete(folder: Path) -> str | None:
-    """Return why a folder is not one bag: several ROS 1 bags, or a ROS 2 bag without its metadata; None otherwise."""
-    if not folder.is_dir() or (folder / METADATA).is_file():
+    """Return why a folder is not one bag: bags of ROS 1, or a ROS 2 bag without its metadata; None otherwise."""
+    known = not folder.is_dir() or (folder / METADATA).is_file()
+    bags = [] if known else sorted(path.name for path in folder.iterdir() if path.suffix in (".bag", *ROS_2))
+    if not bags:
         return None
-    bags = sorted(path.name for path in folder.iterdir() if path.suffix == ".bag")
-    if len(bags) > 1:
-        return (
-            f"`{folder}` holds {len(bags)} bags of ROS 1, `{bags[0]}` to `{bags[-1]}`; give one of them, or join them: "
-            "`rosbags-convert --src` all of them `--dst` a new folder"
-        )
-    if any(path.suffix in ROS_2 for path in folder.iterdir()):
-        return f"`{folder}` holds a ROS 2 bag without `{METADATA}`; copy it, too, or `ros2 bag reindex {folder}`"
-    return None
+    return f"`{folder}` holds {', '.join(bags[:3])}; give one bag of ROS 1, or a ROS 2 bag with its `{METADATA}`"
 
 
 @dataclass(frozen=True)
@@ -133,7 +126,7 @@ class RosBag:
             return None
         with _reader(self.path) as reader:
             messages = _messages(reader, self.poses)
-            whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, Unread)]
+            whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, InputError)]
         rows = np.reshape(whole, (-1, 8))
         return trajectory_of(rows[:, 0], poses_of(rows[:, 1:4], rows[:, 4:]), self.path)
 
@@ -265,7 +258,7 @@ def _reader(path: Path) -> Iterator[Any]:
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
-    """Return time, s, and content of each message; the recorder's time if the header has none, and `Unread` for a
+    """Return time, s, and content of each message; the recorder's time if the header has none, and an InputError for a
     damaged message.
     """
     connections = [connection for connection in reader.connections if connection.topic == topic]
@@ -273,7 +266,7 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
         try:
             message = reader.deserialize(raw, connection.msgtype)
         except Exception as error:  # noqa: BLE001 - whatever a damaged message makes the package raise
-            yield 1e-9 * stamp, Unread(str(error))
+            yield 1e-9 * stamp, InputError(str(error))
             continue
         header = message.header.stamp
         time = header.sec + 1e-9 * header.nanosec
@@ -282,7 +275,7 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[float, Any]]:
 
 def _first(reader: Any, topic: str) -> Any:
     """Return the first undamaged message of a topic, None without one."""
-    return next((message for _, message in _messages(reader, topic) if not isinstance(message, Unread)), None)
+    return next((message for _, message in _messages(reader, topic) if not isinstance(message, InputError)), None)
 
 
 def _pose(message: Any) -> tuple[float, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.intrinsics import intrinsics_of, is_fisheye
-from vggtgeo.datasets.pose_files import check_size, parsing, poses_of, read_matrices, trajectory_of, yaml_numbers
+from vggtgeo.datasets.pose_files import check_size, load_trajectory, parsing, trajectory_of, yaml_numbers
 from vggtgeo.geometry.camera import Camera, check_distortion
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, NoteWarning, warn
@@ -49,12 +49,9 @@ class Euroc(FolderSequence):
         file = self.folder / "state_groundtruth_estimate0" / "data.csv"
         if not file.is_file():
             return None
-        rows = _numbers(file)
-        if rows.shape[1] < 8:
-            raise InputError(f"`{file}` has {rows.shape[1]} columns; expected a time, a position and a quaternion")
-        body = poses_of(rows[:, 1:4], rows[:, [5, 6, 7, 4]])  # w first in the file
+        body = load_trajectory(file)
         extrinsics = np.reshape(yaml_numbers(self.folder / "cam0" / "sensor.yaml", "data", 16), (4, 4))
-        return trajectory_of(rows[:, 0] * 1e-9, body @ extrinsics, file)
+        return trajectory_of(body.timestamps, body.poses @ extrinsics, file)
 
 
 def _camera(sensor: Path, width: int, height: int) -> Camera:
@@ -79,8 +76,3 @@ def _images(file: Path) -> list[tuple[float, str]]:
         lines = [line.split("#", 1)[0] for line in whole_text(file).splitlines()]
         parts = [[part.strip() for part in line.partition(",")[::2]] for line in lines if line.strip()]
         return [(int(time) * 1e-9, name or f"{time}.png") for time, name in parts]
-
-
-def _numbers(file: Path) -> np.ndarray:
-    lines = [line for line in whole_text(file).splitlines() if line.lstrip()[:1].isdigit()]
-    return read_matrices(file, lines[0].count(",") + 1) if lines else np.zeros((0, 17))

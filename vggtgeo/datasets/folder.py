@@ -27,8 +27,6 @@ from vggtgeo.io.errors import InputError, LeftOutWarning, UnusableDepthWarning, 
 
 LATEST = 1e11
 """Seconds of a time stamp at most, 3,000 years: Unix times in nanoseconds are 1e18."""
-MIN_MEDIAN_DEPTH = 0.01
-"""Metres: below the range of all depth cameras."""
 MAX_ENLARGEMENT = 32
 """Pixels of an image to one of its depth, along a side at most; phones have 8."""
 _SAMPLES = 3
@@ -171,11 +169,6 @@ class FolderSequence:
                 size = self._depth_size_message(path, depth)
                 raise InputError(f"{size}: register the depth to the images, or leave it out with --rgb-only")
             if np.isfinite(depth).any():
-                if (middle := float(np.nanmedian(depth))) < MIN_MEDIAN_DEPTH:
-                    warn(
-                        f"`{path}`: half of its depths are below {middle:.2g} m; if its unit is another, give the "
-                        "values in a metre with `--depth-scale`: 1000 are millimetres"
-                    )
                 return True
         if depths:
             warn(

@@ -23,10 +23,10 @@ from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, metres_of_floats
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import guess_with_warning
-from vggtgeo.datasets.pose_files import numbers_of, parsing, poses_of, read_matrices, trajectory_of
+from vggtgeo.datasets.pose_files import numbers_of, parsing, trajectory_of
 from vggtgeo.datasets.tum import head_of, read_pairs
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory, poses_of, read_matrices
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import whole_text
 

@@ -12,6 +12,7 @@ import struct
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -60,24 +61,17 @@ class ImageFile:
     orientation: int
 
 
-@dataclass(frozen=True)
-class ImageHeader:
-    """Header of an image file. Fields: width, height, pixels; format, Pillow's name; orientation, EXIF, 1 to 8."""
+class ImageHeader(NamedTuple):
+    """Header of an image file. Fields: format, Pillow's name; orientation, EXIF, 1 to 8."""
 
-    width: int
-    height: int
     format: str
     orientation: int
 
 
-def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the image as RGB; raise InputError if the file is missing, damaged or not an image."""
-    return read_image_file(path).image
-
-
 def read_image_file(path: Path, min_bits: int = 8) -> ImageFile:
-    """Return the image and the properties of its file; errors as `read_image`.
+    """Return the image, as RGB, and the properties of its file.
 
+    Raises InputError if the file is missing, damaged or not an image.
     min_bits: the least number of bits of a 16-bit image, however dark it is: that of the images before it.
     """
     return image_in(content_of(path, MAX_BYTES), path, min_bits)
@@ -112,8 +106,8 @@ def image_header(content: bytes, path: Path) -> ImageHeader:
             # Its own `getexif` of a PNG decodes the image.
             tagged = image.format in ("JPEG", "MPO", "PNG", "WEBP")
             orientation = Image.Image.getexif(image).get(_ORIENTATION, 1) if tagged else 1
-            header = ImageHeader(*image.size, image.format or "", orientation if orientation in range(1, 9) else 1)
-            _check_values(path, header.width * header.height)
+            header = ImageHeader(image.format or "", orientation if orientation in range(1, 9) else 1)
+            _check_values(path, image.width * image.height)
             image.verify()  # the check sums of a PNG, up to its end
     except InputError:
         raise

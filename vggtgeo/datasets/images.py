@@ -33,8 +33,6 @@ COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
 DEPTH = ("depth", "depths")
 _NEITHER = {"conf", "confidence", "mask", "inverse", "disparity"}
 """Words of names of files that are neither images nor depth."""
-_FORMAT = re.compile(r"[_. -]?(png|jpe?g|images?|aligned|raw)$")
-"""Endings of folder names without meaning: `rgb_png`, `depth_images`."""
 _LOOSE_SHARE = 0.5
 """Maximum share of images beside the folder of colour that are not of the recording."""
 _WITH_DEPTH = 0.5
@@ -147,9 +145,9 @@ def partners_in_time(images: Sequence[tuple[float, Path]], depths: Sequence[tupl
 class RgbdFolders(FolderSequence):
     """Images in one folder, and their depth in a second one or the same. Ground truth: `groundtruth.txt` (TUM format).
 
-    Depth is paired with the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), of the
-    nearest time within 0.02 s if names are times, or of the same position. Times are as in a folder of images. Depth of
-    fewer pixels (a phone's LiDAR) is enlarged to images of the same aspect.
+    Depth is paired with the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), or of
+    the nearest time within 0.02 s if names are times. Times are as in a folder of images. Depth of fewer pixels (a
+    phone's LiDAR) is enlarged to images of the same aspect.
     """
 
     depth_of_fewer_pixels = True
@@ -208,13 +206,12 @@ def _is_depth(path: Path) -> bool:
 
 
 def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str]) -> Path | None:
-    """Return the first of the folders `names` that has images, in any case; `rgb_png` counts as `rgb`, and any name
-    with the word depth as depth (`aligned_depth_to_color`).
+    """Return the first of the folders `names` that has images, in any case; any name with the word depth counts as
+    depth (`aligned_depth_to_color`).
     """
     there = {}
     for path in sorted(path for path in folder.iterdir() if path.is_dir() and image_files(path, suffixes)):
         there[path.name.lower()] = path
-        there.setdefault(_FORMAT.sub("", path.name.lower()), path)
         if _is_depth(path):
             there.setdefault(DEPTH[0], path)
     return next((there[name] for name in names if name in there), None)
@@ -232,9 +229,6 @@ def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path
         rows = partners_in_time(list(zip(image_times, images, strict=True)), listed)
         if any(row is not None for row in rows):
             return [None if row is None else listed[row][1] for row in rows]
-    if len(images) == len(depths):
-        warn(f"`{folder}`: the names of images and depths have nothing in common; they are paired in their order")
-        return list(depths)
     raise InputError(
         f"`{folder}`: the {len(images)} images ({images[0].name}, ...) and the {len(depths)} depths ({depths[0].name}, "
         f"...) cannot be paired: give both the same names or numbers, or times no more than {MAX_DELAY} s apart"

@@ -79,9 +79,8 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
     """Return the camera of a file in `folder`, None without one.
 
     Files: `calibration.txt` (`fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`, the coefficients also in `distortion.txt`
-    beside it; or `fx fy cx cy k1 k2 k3 k4 fisheye`), else
-    `camera-intrinsics.txt` (3 x 3), else JSON of Open3D's and RealSense's recorders, else Record3D's `metadata.json`.
-    Raises InputError for an invalid file.
+    beside it; or `fx fy cx cy k1 k2 k3 k4 fisheye`), else `camera-intrinsics.txt` (3 x 3), else `intrinsic.json` of
+    Open3D's recorders, else Record3D's `metadata.json`. Raises InputError for an invalid file.
     """
     for name, (read, expected) in _READERS.items():
         file = folder / name
@@ -186,45 +185,18 @@ def _read_matrix(file: Path, width: int, height: int) -> Camera:
 
 
 def _read_json_camera(file: Path, width: int, height: int) -> Camera:
-    """Read a camera of Open3D (`width`, `height` and `intrinsic_matrix`, nine numbers by columns) or RealSense (`fx`,
-    `fy`, `ppx`, `ppy`, or `cx`, `cy`).
-    """
+    """Read a camera of Open3D: `intrinsic_matrix`, nine numbers by columns, and perhaps `width` and `height`."""
     content = read_json(file)
     check_size(file, (content.get("width", width), content.get("height", height)), (width, height))
-    matrix = content.get("intrinsic_matrix")
-    if matrix is not None:
-        found = np.reshape(matrix, 9)[[0, 4, 6, 7]].tolist()
-    else:
-        centre = ("cx", "cy") if "cx" in content else ("ppx", "ppy")
-        found = [content[name] for name in ("fx", "fy", *centre)]
-    return Camera(check_intrinsics(tuple(map(float, found))), width, height, _of_realsense(file, content))
-
-
-def _of_realsense(file: Path, content: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return k1 k2 p1 p2 k3 of `coeffs` if its `model` is OpenCV's; warn of another model (the inverse one), which is
-    ignored.
-    """
-    coefficients = content.get("coeffs") or ()
-    model = str(content.get("model", "")).lower().removeprefix("distortion.").replace(" ", "_")
-    if not any(coefficients) or model == "none":
-        return ()
-    if model in ("", "brown_conrady", "modified_brown_conrady"):
-        return check_distortion(tuple(map(float, coefficients)))
-    text = f"`model` is {model[:40]}, which is not read: its `coeffs` are left out; undistort the images"
-    warn(f"`{file}`: {text}")
-    return ()
+    found = np.reshape(content["intrinsic_matrix"], 9)[[0, 4, 6, 7]]
+    return Camera(check_intrinsics(found.tolist()), width, height)
 
 
 _CALIBRATION_EXPECTED = "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or fx fy cx cy k1 k2 k3 k4 fisheye"
-_JSON_EXPECTED = "`intrinsic_matrix` (nine numbers, as Open3D has it) or `fx fy cx cy`"
 _READERS = {
     CALIBRATION: (_read_calibration, _CALIBRATION_EXPECTED),
     "camera-intrinsics.txt": (_read_matrix, "a 3 x 3 matrix of intrinsics"),
-    # Of recorders.
-    "intrinsic.json": (_read_json_camera, _JSON_EXPECTED),
-    "intrinsics.json": (_read_json_camera, _JSON_EXPECTED),
-    "camera_intrinsic.json": (_read_json_camera, _JSON_EXPECTED),
-    "camera_intrinsics.json": (_read_json_camera, _JSON_EXPECTED),
+    "intrinsic.json": (_read_json_camera, "`intrinsic_matrix`: nine numbers by columns, as Open3D writes it"),
 }
 
 

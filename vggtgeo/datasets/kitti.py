@@ -14,9 +14,9 @@ import numpy as np
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_or_guess, intrinsics_of
-from vggtgeo.datasets.pose_files import parsing, poses_of_rows, read_matrices, trajectory_of_rows
+from vggtgeo.datasets.pose_files import check_size, parsing, poses_of_rows, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory, read_matrices
 from vggtgeo.io.errors import InputError, NoteWarning, warn
 from vggtgeo.io.files import whole_text
 
@@ -96,16 +96,17 @@ def _times(folder: Path, place: Path) -> list[float]:
 
 def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, float]:
     """Return the camera, and its baseline from the left grey one: the fourth number of `P` is `-fx b`."""
+    size = name.replace("image", "S_rect")
     for file in (
         folder / "calib.txt",
         folder / "calib_cam_to_cam.txt",
         folder.resolve().parent / "calib_cam_to_cam.txt",
     ):
         values = _calibration(file)
-        if _is_unrectified(file, values, name[-2:], (width, height)):
-            return _as_calibrated(file, values, name[-2:], width, height), 0.0
         for key in _LINES[name]:
             if key in values:
+                if size in values:  # a drive that is not rectified has larger images
+                    check_size(file, _numbers(file, values, size, 2).tolist(), (width, height))
                 row = _numbers(file, values, key, 12)
                 intrinsics = intrinsics_of(file, row[[0, 5, 2, 6]].tolist())
                 return Camera(intrinsics, width, height), float(-row[3] / row[0])
@@ -117,20 +118,6 @@ def _calibration(file: Path) -> dict[str, str]:
     lines = whole_text(file).splitlines() if file.is_file() else []
     parts = [line.partition(":") for line in lines]
     return {key.strip(): rest for key, _, rest in parts}
-
-
-def _is_unrectified(file: Path, values: Mapping[str, str], number: str, size: tuple[int, int]) -> bool:
-    """Return whether images have the size before rectification, as in the drives `_extract`."""
-    if f"S_{number}" not in values:
-        return False
-    original, rectified = (tuple(_numbers(file, values, f"{key}_{number}", 2)) for key in ("S", "S_rect"))
-    return original == size != rectified
-
-
-def _as_calibrated(file: Path, values: Mapping[str, str], number: str, width: int, height: int) -> Camera:
-    matrix, lens = _numbers(file, values, f"K_{number}", 9), _numbers(file, values, f"D_{number}", 5)
-    intrinsics = intrinsics_of(file, matrix[[0, 4, 2, 5]].tolist())
-    return Camera(intrinsics, width, height, distortion=tuple(lens.tolist()))
 
 
 def _numbers(file: Path, values: Mapping[str, str], key: str, count: int) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Live cameras: a webcam (`webcam:0`) or a stream by its address (`rtsp://...`, `http://...`), read by OpenCV."""
 
-import math
 import re
 import sys
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ from vggtgeo.datasets.frame import Frame, check_range
 from vggtgeo.datasets.intrinsics import guess_with_warning
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
-from vggtgeo.io.errors import InputError, warn
+from vggtgeo.io.errors import InputError
 
 _WEBCAM = re.compile(r"webcam(?::([0-9]{1,9}))?")
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]*://.+", re.IGNORECASE)
@@ -42,15 +41,9 @@ class LiveCamera:
         """Open a camera and read one frame for the size; raise InputError if no camera answers."""
         with _capture(source) as capture:
             there, image = capture.read()
-            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         if not there:
             raise InputError(f"`{_public(source)}` gives no frame: is the camera connected, and not in use?")
         height, width = image.shape[:2]
-        if _ADDRESS.fullmatch(source) and math.isfinite(count) and count > 0:  # a live camera has no length
-            warn(
-                f"`{_public(source)}` is a recording of {count:.0f} frames, whose times would be those of arrival: "
-                "download it first (`curl -O ADDRESS`), and give the file"
-            )
         return cls(source, guess_with_warning(_public(source), width, height))
 
     @property

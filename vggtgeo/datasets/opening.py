@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from vggtgeo.datasets.bags import RosBag, is_bag, why_incomplete
 from vggtgeo.datasets.euroc import Euroc
@@ -26,18 +26,7 @@ from vggtgeo.datasets.views import with_rate
 from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError, warn
 
-
-class FolderReader(Protocol):
-    """A reader of one layout."""
-
-    def matches(self, folder: Path) -> bool:
-        """Return whether `folder` has this layout."""
-
-    def open(self, folder: Path) -> Sequence:
-        """Open the sequence in `folder`; raise InputError if it is invalid."""
-
-
-FOLDER_KINDS: dict[str, FolderReader] = {
+FOLDER_KINDS: dict[str, Any] = {
     "euroc": Euroc,
     "replica": Replica,
     "scannet": ScanNet,
@@ -56,7 +45,7 @@ FOLDER_KINDS: dict[str, FolderReader] = {
     "rgbd": RgbdFolders,
     "images": ImageFolder,
 }
-"""Readers by name, in the order in which a folder is tried: the plain ones last."""
+"""Readers by name, in the order in which a folder is tried: the plain ones last. Each has `matches` and `open`."""
 KINDS = (*FOLDER_KINDS, "video", "bag", "camera")
 
 

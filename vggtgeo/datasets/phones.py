@@ -19,7 +19,6 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -28,23 +27,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.datasets.folder import FolderSequence, existing
-from vggtgeo.datasets.frame import MAX_DELAY, Frame, check_selection
+from vggtgeo.datasets.frame import Frame, check_selection
 from vggtgeo.datasets.image_files import MILLIMETRES, read_codes, read_depth
-from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like
+from vggtgeo.datasets.images import files_like, partners_in_time
 from vggtgeo.datasets.intrinsics import intrinsics_of
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.datasets.pose_files import (
-    check_size,
-    parsing,
-    poses_of,
-    read_json,
-    read_matrices,
-    read_matrix,
-    trajectory_of,
-)
+from vggtgeo.datasets.pose_files import check_size, parsing, read_json, read_matrix, trajectory_of
 from vggtgeo.datasets.video import VideoFile
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory, poses_of, read_matrices
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, warn
 from vggtgeo.io.files import whole_text
 
@@ -151,7 +142,10 @@ class ArkitScenes(FolderSequence):
     def open(cls, folder: Path) -> Self:
         """List the images, and pair each with the depth nearest in time."""
         images, depths = _timed(folder / "lowres_wide"), _timed(folder / "lowres_depth")
-        frames = [(time, image, _nearest(time, depths)) for time, image in images]
+        frames = [
+            (time, image, None if partner is None else depths[partner][1])
+            for (time, image), partner in zip(images, partners_in_time(images, depths), strict=True)
+        ]
         return cls.listed(folder, frames, lambda *size: _pincam(folder, *size))
 
     def ground_truth(self) -> Trajectory | None:
@@ -183,11 +177,6 @@ def _timed(folder: Path) -> list[tuple[float, Path]]:
         with suppress(ValueError):
             found.append((float(path.stem.rsplit("_", 1)[-1]), path))
     return sorted(found)
-
-
-def _nearest(time: float, depths: list[tuple[float, Path]]) -> Path | None:
-    other, path = min(depths, key=lambda entry: abs(entry[0] - time), default=(np.inf, None))
-    return path if abs(other - time) <= MAX_DELAY else None
 
 
 def _pincam(folder: Path, width: int, height: int) -> Camera:
@@ -269,8 +258,7 @@ class PhoneExport(FolderSequence):
                 views[one] = cls.view_of(one.camera)
             except InputError as error:
                 warn(LeftOutWarning(f"{error}; `{one.image.name}` is left out"))
-        times = _times(folder, [view.time for view in views.values()])
-        frames = [(time, one.image, existing(one.depth)) for time, one in zip(times, views, strict=True)]
+        frames = [(view.time, one.image, existing(one.depth)) for one, view in views.items()]
         camera = lambda *size: _camera(folder, list(views.values()), *size)
         poses = {one.image: view.pose for one, view in views.items()}
         trusted = {one.depth: one.confidence for one in views if one.confidence.is_file()}
@@ -326,14 +314,6 @@ class Polycam(PhoneExport):
             pose[:3] = [[content[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
             size = float(content["width"]), float(content["height"])
             return _View(float(content.get("timestamp", file.stem)) * 1e-6, intrinsics, size, pose)
-
-
-def _times(folder: Path, stated: list[float]) -> list[float]:
-    """Return those of the files where they rise, else 30 frames a second."""
-    if np.isfinite(stated).all() and all(before < after for before, after in pairwise(stated)):
-        return stated
-    warn(f"`{folder}`: the times do not increase; {FRAMES_PER_SECOND:g} frames a second are assumed")
-    return [index / FRAMES_PER_SECOND for index in range(len(stated))]
 
 
 def _camera(folder: Path, views: list[_View], width: int, height: int) -> Camera:

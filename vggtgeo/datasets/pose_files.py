@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from vggtgeo.geometry.trajectory import MAX_COORDINATE, MAX_QUATERNION, MAX_TIME, MIN_QUATERNION, Trajectory, rising
+from vggtgeo.geometry.trajectory import MAX_COORDINATE, MAX_TIME, Trajectory, poses_of, read_matrices, rising
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning, warn
 from vggtgeo.io.files import whole_text
 
@@ -38,23 +37,6 @@ def parsing(file: Path, expected: str) -> Iterator[None]:
             raise
         found = f"{error} is missing" if isinstance(error, LookupError) else error
         raise InputError(f"`{file}`: {found}; expected {expected}") from None
-
-
-def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
-    """Return lines of `columns` numbers, separated by blanks or commas; raise InputError naming an invalid line."""
-    rows = []
-    for number, line in enumerate(whole_text(file).splitlines(), start=1):
-        words = line.split(skip, 1)[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        if len(row) != columns:
-            raise InputError(f"`{file}`, line {number}: found {line.strip()[:60]!r}; expected {columns} numbers")
-        rows.append(row)
-    return np.array(rows, np.float64).reshape(-1, columns)
 
 
 def read_matrix(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "r c"]:
@@ -113,21 +95,6 @@ def poses_of_rows(rows: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 4 4"]
     """Return matrices of their upper three rows, as KITTI writes them."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    return poses
-
-
-def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
-    """Return matrices of positions [n, 3] and quaternions [n, 4], x y z w; the rotation is 0 if the length of a
-    quaternion is not about 1.
-    """
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    with np.errstate(over="ignore", invalid="ignore"):
-        length = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    turned = (length >= MIN_QUATERNION) & (length <= MAX_QUATERNION)
-    rotations = Rotation.from_quat(np.where(turned, quaternions, [0.0, 0.0, 0.0, 1.0])).as_matrix()
-    unknown = np.where(np.isfinite(length), 0.0, np.nan)
-    poses[:, :3, :3] = np.where(turned[..., None], rotations, unknown[..., None])
-    poses[:, :3, 3] = positions
     return poses
 
 

@@ -29,9 +29,9 @@ from vggtgeo.datasets.image_files import MAX_BYTES, ImageFile, image_in, metres_
 from vggtgeo.datasets.images import FRAMES_PER_SECOND
 from vggtgeo.datasets.intrinsics import camera_of_record3d, guess_with_warning
 from vggtgeo.datasets.nerfstudio import FROM_OPENGL
-from vggtgeo.datasets.pose_files import json_in, parsing, poses_of, same_size, trajectory_of
+from vggtgeo.datasets.pose_files import json_in, parsing, same_size, trajectory_of
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory, poses_of
 from vggtgeo.io.archives import UNREADABLE
 from vggtgeo.io.errors import InputError, install_hint, warn
 from vggtgeo.io.files import MAX_BYTES as MAX_TEXT

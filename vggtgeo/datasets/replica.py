@@ -14,9 +14,9 @@ from vggtgeo.datasets.folder import FolderSequence, existing
 from vggtgeo.datasets.image_files import DepthFormat
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, rows_of
 from vggtgeo.datasets.intrinsics import camera_from_folder, intrinsics_of
-from vggtgeo.datasets.pose_files import check_size, parsing, read_json, read_matrices, trajectory_of_rows
+from vggtgeo.datasets.pose_files import check_size, parsing, read_json, trajectory_of_rows
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.trajectory import Trajectory
+from vggtgeo.geometry.trajectory import Trajectory, read_matrices
 from vggtgeo.io.errors import InputError
 
 _PUBLISHED = (600.0, 600.0, 599.5, 339.5)
@@ -40,7 +40,7 @@ class Replica(FolderSequence):
     @classmethod
     def open(cls, folder: Path) -> Self:
         images = files_like(folder / "results", "frame*")
-        rows = rows_of(images, _poses_in(folder / "traj.txt"))
+        rows = rows_of(images, len(read_matrices(folder / "traj.txt", 16)))
         depths = (image.with_name(image.stem.replace("frame", "depth") + ".png") for image in images)
         frames = [
             ((row - rows[0]) / FRAMES_PER_SECOND, image, existing(depth))
@@ -60,14 +60,6 @@ class Replica(FolderSequence):
         file = self.folder / "traj.txt"
         poses = read_matrices(file, 16)
         return trajectory_of_rows([one.timestamp for one in self.files], self.rows, poses, file)
-
-
-def _poses_in(file: Path) -> int | None:
-    """Return the number of poses; None if the file is invalid, which `ground_truth` reports."""
-    try:
-        return len(read_matrices(file, 16))
-    except InputError:
-        return None
 
 
 def _camera(file: Path, stated: Mapping[str, Any], width: int, height: int) -> Camera:

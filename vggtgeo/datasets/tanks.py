@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files, rows_of
 from vggtgeo.datasets.intrinsics import camera_or_guess
-from vggtgeo.datasets.pose_files import have_rotations, parsing, read_json, read_matrix, trajectory_of
+from vggtgeo.datasets.pose_files import parsing, read_json, read_matrix, trajectory_of
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
@@ -54,7 +54,7 @@ class TanksAndTemples(FolderSequence):
         numbers, poses = _read_log(file)
         alignment = self.folder / file.name.replace(_LOG, "_trans.txt")
         if alignment.is_file():
-            poses = moved(poses, _similarity(alignment))
+            poses = moved(poses, read_matrix(alignment, (4, 4)))
         return trajectory_of(np.array(numbers) / FRAMES_PER_SECOND, poses, file)
 
     @property
@@ -87,17 +87,6 @@ class TanksAndTemples(FolderSequence):
         return None if file is None else file.name.removesuffix(_LOG)
 
 
-def _similarity(file: Path) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix of a file; raise InputError unless it is a similarity transformation."""
-    matrix = read_matrix(file, (4, 4))
-    with np.errstate(all="ignore"):
-        rigid = matrix.copy()
-        rigid[:3, :3] /= np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
-        if not np.isfinite(rigid).all() or not have_rotations(rigid[None])[0]:
-            raise InputError(f"`{file}` must be a scale, rotation and translation of the world, got {matrix.tolist()}")
-    return matrix
-
-
 def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 4 4"]:
     """Return camera -> world after a similarity `[s R, t]` of the world; rotations stay rotations."""
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
@@ -109,6 +98,8 @@ def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"
 
 def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Return which points are in the volume of `SCENE.json`: a polygon across an axis, between two bounds on it."""
+    from skimage.measure import points_in_poly  # slow to import
+
     with parsing(file, "orthogonal_axis, axis_min below axis_max, and a bounding_polygon of three corners or more"):
         crop = read_json(file)
         axis = _AXES.index(str(crop["orthogonal_axis"]).upper())
@@ -118,18 +109,7 @@ def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray
             raise ValueError(f"axis_min is {low:g}, axis_max {high:g}, and the polygon {polygon.tolist()}")
     across = [number for number in range(3) if number != axis]
     between = (points[:, axis] >= low) & (points[:, axis] <= high)
-    return between & _in_polygon(points[:, across], polygon[:, across])
-
-
-def _in_polygon(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Apply the even-odd rule: a ray along the first axis crosses the boundary an odd number of times."""
-    inside = np.zeros(len(points), bool)
-    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        spans = (ay > points[:, 1]) != (by > points[:, 1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            crossing = ax + (points[:, 1] - ay) / (by - ay) * (bx - ax)
-        inside ^= spans & (points[:, 0] < crossing)
-    return inside
+    return between & points_in_poly(points[:, across], polygon[:, across])
 
 
 def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Self
 
 from vggtgeo.datasets.folder import LATEST, FolderSequence
-from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS, MILLIMETRES, DepthFormat
-from vggtgeo.datasets.images import FRAMES_PER_SECOND, partners_in_time
+from vggtgeo.datasets.image_files import FIVE_THOUSANDTHS
+from vggtgeo.datasets.images import partners_in_time
 from vggtgeo.datasets.intrinsics import camera_from_folder, guess_with_warning, published_camera
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.io.errors import InputError, LeftOutWarning, warn
@@ -21,8 +21,6 @@ from vggtgeo.io.files import whole_text
 
 _MAX_LETTERS = 200
 _PAIRS = ("associated.txt", "associations.txt", "association.txt", "associate.txt")
-_MAX_FRAMES = 1e6
-"""Integers up to this one are numbers of frames, not times."""
 _Entry = tuple[float, Path]
 _Frame = tuple[float, Path, Path | None]
 
@@ -39,11 +37,8 @@ class TumRgbd(FolderSequence):
     def open(cls, folder: Path) -> Self:
         """Read and pair the lists; without `depth.txt` the sequence has no depth."""
         file = _list_of(folder)
-        if file is None or file.name == "rgb.txt":
-            frames, coding = _of_lists(folder), FIVE_THOUSANDTHS
-        else:
-            frames, coding = _of_pairs(file)
-        return cls.listed(folder, frames, lambda *size: _camera(folder, *size), coding)
+        frames = _of_lists(folder) if file is None or file.name == "rgb.txt" else _of_pairs(file)
+        return cls.listed(folder, frames, lambda *size: _camera(folder, *size), FIVE_THOUSANDTHS)
 
 
 def _camera(folder: Path, width: int, height: int) -> Camera:
@@ -82,20 +77,11 @@ def _of_lists(folder: Path) -> list[_Frame]:
     ]
 
 
-def _of_pairs(file: Path) -> tuple[list[_Frame], DepthFormat]:
-    """Return the frames, and the unit of their depth: millimetres if the list counts frames, as no benchmark does."""
-    pairs = read_pairs(file, "TIME")
-    counted = all(time.is_integer() and abs(time) < _MAX_FRAMES for time, *_ in pairs)
-    if counted:
-        warn(f"`{file}` counts frames: {FRAMES_PER_SECOND:g} a second are assumed, and depth in millimetres")
-    elif file.name != _PAIRS[0]:
+def _of_pairs(file: Path) -> list[_Frame]:
+    if file.name != _PAIRS[0]:
         warn(f"`{file}`: depth is taken in 1/5000 m, as TUM RGB-D has it; millimetres need --depth-scale 1000")
-    depths = {
-        (time / FRAMES_PER_SECOND if counted else time, file.parent / image): file.parent / depth
-        for time, image, depth in pairs
-    }
-    frames: list[_Frame] = [(at, image, depths[at, image]) for at, image in _in_order(file, list(depths), frames=True)]
-    return frames, MILLIMETRES if counted else FIVE_THOUSANDTHS
+    depths = {(time, file.parent / image): file.parent / depth for time, image, depth in read_pairs(file, "TIME")}
+    return [(at, image, depths[at, image]) for at, image in _in_order(file, list(depths), frames=True)]
 
 
 def read_pairs(file: Path, time: str) -> list[tuple[float, str, str]]:

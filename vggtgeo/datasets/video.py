@@ -36,8 +36,6 @@ _NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 """Control characters other than those of text and terminals: every video has some."""
 _NO_TIMESTAMPS = 0x80
 """Flag of FFmpeg's formats that are streams without a container (AVFMT_NOTIMESTAMPS)."""
-_IMAGES = ("_pipe", "gif", "image2", "ico")
-"""Formats of FFmpeg that hold images: it takes one for a video of one frame."""
 _PREDICTED = (2, 3)
 """Types of frames that are made of others: P and B."""
 _DEPTH = re.compile(r"(^|[^a-z])depth([^a-z]|$)", re.IGNORECASE)
@@ -314,10 +312,6 @@ def _open_stream(path: Path, track: Track) -> Iterator[_Stream]:
 def _tracks(path: Path, depth: bool) -> ChosenTracks:
     """Return the tracks that are read, with a note if there are others; raise InputError if no track is a video."""
     with _open_container(path) as container:
-        if container.format.name.endswith(_IMAGES):
-            raise InputError(
-                f"`{path}` is an image ({container.format.name}); give the folder of the sequence, or a video file"
-            )
         streams = enumerate(container.streams.video)
         tracks = [_track(number, stream) for number, stream in streams if stream.codec_context is not None]
     if not tracks:

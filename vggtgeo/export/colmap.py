@@ -14,7 +14,6 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.io.errors import InputError
-from vggtgeo.io.files import atomic_open
 from vggtgeo.results.scene import MASK, Scene
 
 PINHOLE = 1
@@ -30,8 +29,7 @@ def copy_pictures(scene: Scene, source: Path, target: Path) -> bytes | None:
         file = source / "images" / scene.image_name(view)
         if not file.is_file():
             raise InputError(f"`{file}` does not exist; run again, with `-o {source}`")
-        with atomic_open(target / "images" / file.name, "wb") as handle:
-            handle.write(file.read_bytes())
+        (target / "images" / file.name).write_bytes(file.read_bytes())
     mask = source / MASK
     return mask.read_bytes() if mask.is_file() else None
 
@@ -47,18 +45,16 @@ def write_colmap(source: Path, target: Path) -> dict[str, float]:
     if not len(scene.tracks):
         raise InputError(f"`{source / 'scene.npz'}` has no point with observations in two keyframes")
     mask = copy_pictures(scene, source, target)
-    for view in range(len(scene.frames) if mask is not None else 0):
-        with atomic_open(target / "masks" / f"{scene.image_name(view)}.png", "wb") as handle:
-            handle.write(mask)
+    if mask is not None:
+        (target / "masks").mkdir()
+        for view in range(len(scene.frames)):
+            (target / "masks" / f"{scene.image_name(view)}.png").write_bytes(mask)
     place_of = _places(scene)
     model = target / "sparse" / "0"
-    for name, content in (
-        ("cameras.bin", _cameras(scene)),
-        ("images.bin", _images(scene)),
-        ("points3D.bin", _points(scene, place_of)),
-    ):
-        with atomic_open(model / name, "wb") as handle:
-            handle.write(content)
+    model.mkdir(parents=True)
+    (model / "cameras.bin").write_bytes(_cameras(scene))
+    (model / "images.bin").write_bytes(_images(scene))
+    (model / "points3D.bin").write_bytes(_points(scene, place_of))
     return {
         "images": len(scene.frames),
         "points": len(scene.tracks),

@@ -19,7 +19,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError, warn
-from vggtgeo.io.files import atomic_path, not_written, whole_path, whole_text, write_json, write_picture, write_text
+from vggtgeo.io.files import not_written, whole_text, write_json, write_picture, write_text
 from vggtgeo.results.files import DEPTH_UNIT
 from vggtgeo.results.output_checks import EXPORTS, check_is_run
 from vggtgeo.results.scene import Scene
@@ -36,8 +36,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
     poses = rigid.invert(scene.poses) @ FROM_OPENGL
     mask = copy_pictures(scene, source, target)
     if mask is not None:
-        with atomic_path(target / "mask.png") as temporary:
-            temporary.write_bytes(mask)
+        (target / "mask.png").write_bytes(mask)
     frames, deep = [], 0
     for view in range(len(scene.frames)):
         name = scene.image_name(view)
@@ -115,7 +114,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
         raise InputError(f"`to` must be one of {', '.join(FORMATS)}, got {to!r}")
     check_is_run(place)
     output = path_of("target", target) if target is not None else place / EXPORTS / to
-    if whole_path(output) == whole_path(place):
+    if output.resolve() == place.resolve():
         raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
     verdict = read_summary(place)[1]
     if verdict.level == "failed":
@@ -123,7 +122,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     with _staged(output) as stage:  # existing files stay until all new ones are complete
         written = FORMATS[to](place, stage)
         names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
-        _record(output, names, ours=whole_path(output) == whole_path(place / EXPORTS / to))
+        _record(output, names, ours=output.resolve() == (place / EXPORTS / to).resolve())
         for name in names:
             (output / name).parent.mkdir(parents=True, exist_ok=True)
             (stage / name).replace(output / name)
@@ -139,8 +138,8 @@ def _staged(output: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=output, ignore_cleanup_errors=True) as stage:
             yield Path(stage)
     except OSError as error:
-        # Name the output in the error: the stage does not exist afterwards.
-        if error.filename is not None and Path(error.filename).is_relative_to(output):
+        # Name the output in the error: the stage does not exist afterwards, and the error of a full disk has no name.
+        if error.filename is None or Path(error.filename).is_relative_to(output):
             raise not_written(output, error) from None
         raise
     finally:

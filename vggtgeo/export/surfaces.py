@@ -23,7 +23,6 @@ from jaxtyping import UInt8, UInt16
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError, install_hint
-from vggtgeo.io.files import atomic_path
 
 UPRIGHT = np.array([1.0, -1.0, -1.0])
 """From y down, z forward (the first camera's axes) to glTF's y up, z backward."""
@@ -77,8 +76,8 @@ def write_glb(source: Path, target: Path) -> dict[str, float]:
     shape.visual = trimesh.visual.TextureVisuals(material=matte)
     opaque = np.full(len(mesh.colours), FULL_SCALE, np.uint16)
     shape.vertex_attributes[_CUSTOM_ATTRIBUTE] = np.column_stack([linear_16_bits(mesh.colours), opaque])
-    with atomic_path(target / "map.glb") as temporary:
-        temporary.write_bytes(trimesh.Scene(shape).export(file_type="glb", tree_postprocessor=_as_colours))
+    content = trimesh.Scene(shape).export(file_type="glb", tree_postprocessor=_as_colours)
+    (target / "map.glb").write_bytes(content)
     return {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
 
 
@@ -101,8 +100,7 @@ def write_las(source: Path, target: Path) -> dict[str, float]:
     record = laspy.LasData(header)
     record.x, record.y, record.z = points.T
     record.red, record.green, record.blue = (cloud.colours.astype(np.uint16) * (FULL_SCALE // 255)).T
-    with atomic_path(target / "map.las") as temporary:
-        record.write(str(temporary))
+    record.write(str(target / "map.las"))
     return {"points": len(cloud)}
 
 

@@ -6,6 +6,7 @@ A line of the file is `timestamp tx ty tz qx qy qz qw`: seconds, metres, unit qu
 import os
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -104,16 +105,24 @@ class Trajectory:
         """Read the TUM format (blanks or commas; `#` begins a comment).
 
         Quaternions are normalised. Lines out of order are sorted, and of lines with one time the first is
-        kept, both with an InputWarning. InputError names the file and line for a missing file, a wrong number
-        of columns, what is not a finite number, or a quaternion of length zero.
+        kept, both with an InputWarning. InputError names the file, and the line or the pose, for a missing file, a
+        wrong number of columns, what is not a finite number, or a quaternion of length zero.
         """
-        rows = _read_rows(path)
+        file = path_of("path", path)
+        rows = read_matrices(file, 8)
+        if not len(rows):
+            raise InputError(f"`{file}` has no pose; a line must be `timestamp tx ty tz qx qy qz qw`")
+        with np.errstate(over="ignore"):
+            lengths = np.linalg.norm(rows[:, 4:], axis=1)
+        valid = np.isfinite(rows).all(axis=1) & (lengths >= MIN_QUATERNION) & (lengths <= MAX_QUATERNION)
+        if not valid.all():
+            bad = int(np.argmin(valid))
+            raise InputError(
+                f"`{file}`: pose {bad + 1} of {len(rows)} is {rows[bad].tolist()}; expected finite numbers `timestamp "
+                "tx ty tz qx qy qz qw`, with a quaternion of length 1"
+            )
         rows = rows[rising(path, rows[:, 0])]
-        quaternions = rows[:, 4:]
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
-        poses[:, :3, 3] = rows[:, 1:4]
-        return cls(rows[:, 0], poses)
+        return cls(rows[:, 0], poses_of(rows[:, 1:4], rows[:, 4:]))
 
 
 def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
@@ -136,29 +145,36 @@ def _check(timestamps: np.ndarray, poses: np.ndarray) -> None:
         raise InputError(f"pose {int(np.argmax(bad))} of {count} must have a rotation in its upper left 3 x 3 block")
 
 
-def _read_rows(path: str | os.PathLike[str]) -> np.ndarray:
-    file = path_of("path", path)
+def read_matrices(file: Path, columns: int, skip: str = "#") -> Float[np.ndarray, "n c"]:
+    """Return lines of `columns` numbers, separated by blanks or commas; raise InputError naming an invalid line."""
     rows = []
     for number, line in enumerate(whole_text(file).splitlines(), start=1):
-        text = line.split("#", 1)[0].replace(",", " ").strip()
-        if text:
-            rows.append(_parse_row(f"`{file}`, line {number}", text))
-    if not rows:
-        raise InputError(f"`{file}` has no pose; a line must be `timestamp tx ty tz qx qy qz qw`")
-    return np.array(rows)
+        words = line.split(skip, 1)[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if len(row) != columns:
+            raise InputError(f"`{file}`, line {number}: found {line.strip()[:60]!r}; expected {columns} numbers")
+        rows.append(row)
+    return np.array(rows, np.float64).reshape(-1, columns)
 
 
-def _parse_row(where: str, text: str) -> list[float]:
-    expected = "expected 8 finite numbers: `timestamp tx ty tz qx qy qz qw`"
-    try:
-        row = [float(word) for word in text.split()]
-    except ValueError:
-        raise InputError(f"{where}: found {text!r}; {expected}") from None
-    if len(row) != 8 or not np.isfinite(row).all():
-        raise InputError(f"{where}: found {len(row)} columns, {text!r}; {expected}")
-    if not MIN_QUATERNION <= np.linalg.norm(row[4:]) <= MAX_QUATERNION:
-        raise InputError(f"{where}: the quaternion has length {np.linalg.norm(row[4:]):.3g}; {expected}")
-    return row
+def poses_of(positions: np.ndarray, quaternions: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
+    """Return matrices of positions [n, 3] and quaternions [n, 4], x y z w; the rotation is 0 if the length of a
+    quaternion is not about 1.
+    """
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    turned = (length >= MIN_QUATERNION) & (length <= MAX_QUATERNION)
+    rotations = Rotation.from_quat(np.where(turned, quaternions, [0.0, 0.0, 0.0, 1.0])).as_matrix()
+    unknown = np.where(np.isfinite(length), 0.0, np.nan)
+    poses[:, :3, :3] = np.where(turned[..., None], rotations, unknown[..., None])
+    poses[:, :3, 3] = positions
+    return poses
 
 
 def rising(path: str | os.PathLike[str], times: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:

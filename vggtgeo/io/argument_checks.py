@@ -155,13 +155,6 @@ def check_index(name: str, array: np.ndarray, count: int, lowest: int) -> None:
         raise ValueError(f"`{name}` must be at least {lowest}, got {array.min()}")
 
 
-def check_image(name: str, image: np.ndarray) -> None:
-    """Raise ValueError unless an image is uint8 [H, W, 3]."""
-    check_array(name, image, (None, None, 3))
-    if image.dtype != np.uint8:
-        raise ValueError(f"`{name}` must be uint8, got {image.dtype}")
-
-
 def check_pose(name: str, pose: np.ndarray) -> None:
     """Raise ValueError unless a pose is a finite 4 x 4 rigid motion (to 1e-4: it may come from float32)."""
     check_array(name, pose, (4, 4))

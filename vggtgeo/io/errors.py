@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,15 +21,9 @@ class InputError(ValueError):
 
     """
 
-    def __str__(self) -> str:
-        return shortened(super().__str__())
-
 
 class InputWarning(UserWarning):
     """A part of the user's input is left out or assumed; the message names it, and the work continues."""
-
-    def __str__(self) -> str:
-        return shortened(super().__str__())
 
 
 class NoteWarning(InputWarning):
@@ -60,21 +53,13 @@ def warn(message: str | InputWarning, category: type[InputWarning] = InputWarnin
 
 MAX_LENGTH = 1200
 """Characters of a line; a message may quote a whole damaged file."""
-_LONG_WORD = re.compile(r"[^\s]{500,}")
-"""Longer words are no file names, which have at most 255 characters."""
-
-
-def shortened(message: str) -> str:
-    """Return `message` with the middle of very long words left out."""
-    return _LONG_WORD.sub(lambda word: f"{word[0][:60]}...{word[0][-60:]}", message)
 
 
 def one_line(message: str) -> str:
     """Return `message` without line breaks and control characters (a file name may contain a code that clears the
     screen), at most `MAX_LENGTH` characters, its middle left out.
     """
-    words = shortened(" ".join(message.split()))
-    text = "".join(sign if sign.isprintable() else f"\\x{ord(sign):02x}" for sign in words)
+    text = "".join(sign if sign.isprintable() else f"\\x{ord(sign):02x}" for sign in " ".join(message.split()))
     half = MAX_LENGTH // 2
     return text if len(text) <= MAX_LENGTH else f"{text[:half]} ... {text[-half:]}"
 

@@ -26,13 +26,6 @@ from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError
 
 
-def whole_path(path: Path) -> Path:
-    """Return a path absolute and without links; a path with a cycle of links, for which `Path.resolve` raises
-    RuntimeError, is returned as it is.
-    """
-    return Path(os.path.realpath(path))
-
-
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path`, with its suffix, which replaces `path` at the end of the block.

@@ -60,15 +60,6 @@ def end_on_signals() -> None:
             signal.signal(number, signal.default_int_handler)
 
 
-def ignore_signals() -> None:
-    """Ignore these signals: the work is done, and an error at the end of the process (JAX's devices) would be
-    confusing.
-    """
-    for number in _signals():
-        if signal.getsignal(number) is not signal.SIG_DFL:
-            signal.signal(number, signal.SIG_IGN)
-
-
 @contextmanager
 def interruption() -> Iterator[Interruption]:
     """Record signals that would raise KeyboardInterrupt instead of raising it; yields the same object inside another.

@@ -45,7 +45,7 @@ NAMES = (
 )
 """Patterns of all files that a run may write, in the order in which `publish` removes old ones."""
 NOTE = "README.txt"
-"""In `unfinished/`: explains the folder to the user."""
+"""In `unfinished/`: explains the folder to the user, and tells that it is a run's."""
 _SEQUENCE_FILES = ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "camera-intrinsics.txt")
 
 
@@ -79,8 +79,8 @@ def check_can_be_shown(folder: Path) -> None:
 
 
 def check_output(place: Path, source: Path | None = None) -> None:
-    """Raise InputError for an invalid output folder: a file, the input itself, or a folder with images or other files
-    that are not a run's.
+    """Raise InputError for an invalid output folder: a file, the input itself, or a folder that is not a run's and has
+    images, files of a sequence, or files that a run would replace.
 
     source: file or folder that the run reads.
     """
@@ -94,30 +94,17 @@ def check_output(place: Path, source: Path | None = None) -> None:
             f"the input `{source}` is inside `{place / inside}`, which the run would replace; give another folder "
             "for the results with `-o`"
         )
-    if not place.is_dir():
+    # A run that was killed while its files were moved has no summary.
+    marks = (place / SUMMARY, place / UNFINISHED / NOTE, place / UNFINISHED / CHECKPOINT)
+    if not place.is_dir() or any(mark.is_file() for mark in marks):
         return
-    stage = place / UNFINISHED
-    if not (place / SUMMARY).is_file():
-        for path in sorted(place.iterdir()):
-            is_image = (mimetypes.guess_type(path.name, strict=False)[0] or "").startswith("image/")
-            if path.name in _SEQUENCE_FILES or (is_image and not is_known(path.name)):
-                raise InputError(
-                    f"`{place}` contains images or a sequence (`{path.name}`); give another folder for the results "
-                    "with `-o`"
-                )
-            # A run killed while its files were moved has no summary either.
-            if not stage.is_dir() and any(fnmatchcase(path.name, pattern) for pattern in NAMES):
-                raise InputError(
-                    f"`{place}` contains `{path.name}`, which the run would replace, but no `{SUMMARY}`: it is not "
-                    "the folder of a run; give another folder for the results with `-o`"
-                )
-    if stage.exists() and not stage.is_dir():
-        raise InputError(f"`{stage}` is a file, and a run creates a folder there; give another folder with `-o`")
-    for path in stage.iterdir() if stage.is_dir() and not stage.is_symlink() else ():
-        if not (is_known(path.name) or path.name.startswith(".") or path.name in (CHECKPOINT, NOTE)):
+    for path in sorted(place.iterdir()):
+        is_image = (mimetypes.guess_type(path.name, strict=False)[0] or "").startswith("image/")
+        is_replaced = path.name == UNFINISHED or any(fnmatchcase(path.name, pattern) for pattern in NAMES)
+        if is_image or is_replaced or path.name in _SEQUENCE_FILES:
             raise InputError(
-                f"`{stage}` contains `{path.name}`, which is not a run's and which the run would delete; give another "
-                "folder with `-o`"
+                f"`{place}` contains `{path.name}` and is not the folder of a run; give another folder for the results "
+                "with `-o`"
             )
 
 
@@ -137,17 +124,6 @@ def _inside(place: Path, source: Path) -> str | None:
     if not inner.is_relative_to(outer):
         return None
     return (inner.relative_to(outer).parts or (".",))[0]
-
-
-def is_result(folder: Path, file: Path) -> bool:
-    """Return whether `file` is, or is inside, a path that a run into `folder` writes."""
-    part = _inside(folder, file)
-    return part is not None and (is_known(part) or part == UNFINISHED)
-
-
-def is_in_results(folder: Path, file: Path) -> bool:
-    """Return whether `file` is in a folder that a run into `folder` replaces: `images`, `depth`, `unfinished`."""
-    return is_result(folder, file) and os.path.realpath(file.parent) != os.path.realpath(folder)
 
 
 def is_known(name: str) -> bool:

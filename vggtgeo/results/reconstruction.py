@@ -29,7 +29,7 @@ from vggtgeo.results.source import (
     reduction_summary,
     with_pose_prior,
 )
-from vggtgeo.results.summary import RESERVED_KEYS, compare_with_truth, summarise
+from vggtgeo.results.summary import compare_with_truth, summarise
 from vggtgeo.results.tracking_loop import RunCallbacks, TrackingLoop
 from vggtgeo.slam.callback import Callback, WindowRecorder
 from vggtgeo.slam.clock import Clock
@@ -93,13 +93,6 @@ class RunOptions:
         check_mode(self.dense)
         check_kind("title", self.title, str | None, "a text")
         check_plain("facts", self.facts)
-        facts: Any = self.facts  # of a user: annotations are not checked
-        invalid = [key for key in facts if not isinstance(key, str) or key in RESERVED_KEYS]
-        if invalid:
-            raise InputError(
-                f"`facts` has the key {invalid[0]!r:.60}; keys must be texts other than the summary's own: "
-                f"{', '.join(sorted(RESERVED_KEYS))}"
-            )
         if isinstance(self.warned, str) or not isinstance(self.warned, Iterable):
             check_kind("warned", self.warned, (), "a list of warnings or texts")
         check_kind("checkpoints", self.checkpoints, Checkpoints | None, "`vggtgeo.settings.Checkpoints`, or None")

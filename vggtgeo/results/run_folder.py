@@ -61,8 +61,6 @@ class RunFolder:
         """Replace the files of an earlier run by those in `stage`; signals are deferred until it is done."""
         with interruption():
             self.release_reserve()
-            if not self.keeps:
-                (self.stage / NOTE).unlink(missing_ok=True)
             # File managers and network file systems leave hidden files.
             ours = (path for path in self.stage.iterdir() if not path.name.startswith("."))
             written = (path for path in ours if path.name not in (CHECKPOINT, NOTE))

@@ -41,17 +41,6 @@ def compare_with_truth(slam: Slam, truth: Trajectory | None) -> TrajectoryReport
         return None
 
 
-RESERVED_KEYS = frozenset(
-    {
-        *("verdict", "settings", "versions", "frames", "frames_tracked", "keyframes", "pairs", "submaps"),
-        *("peak_memory_gb", "scale", "scale_basis", "pose_sigma", "intrinsics", "lens", "rolling_shutter"),
-        *("seconds_by_stage", "notes", "map_points", "dense", "frames_per_second", "interrupted", "images_reduced"),
-        *("static_overlay", "truth", "frames_per_second_whole_run", "pose_prior"),
-    }
-)
-"""Keys of every summary, which `facts` of `vggtgeo.RunOptions` must not use."""
-
-
 def summarise(
     slam: Slam,
     verdict: Verdict,

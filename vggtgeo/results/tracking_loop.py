@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 from vggtgeo.datasets import Frame
@@ -50,17 +50,6 @@ class PendingFrames:
             frame = self._read.popleft()
             if (frame.index, frame.timestamp) == (record.frame, record.timestamp):
                 return frame
-
-
-def read_only(frame: Frame) -> Frame:
-    """Return the frame with read-only arrays: callbacks must not change those that the map holds."""
-    views = [None if array is None else array.view() for array in (frame.image, frame.depth)]
-    for view in views:
-        if view is not None:
-            view.setflags(write=False)
-    image, depth = views
-    assert image is not None
-    return replace(frame, image=image, depth=depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +105,7 @@ class TrackingLoop:
                 frames, self.source.camera, roles, self.settings, clock, known, before, waiting=self.stop.at_once
             )
             for slam in run:
-                frame = read_only(frames.take(slam.frames[-1]))
+                frame = frames.take(slam.frames[-1])
                 self.hooks.each("on_frame", slam, frame)
                 if writer is not None:
                     writer.on_frame(slam, frame)

@@ -24,7 +24,6 @@ VIEWER_PORT = 9876
 """Usual port of the viewer, and of a served recording."""
 WEB_PORT = 9090
 """Usual port of the page that shows a served recording."""
-_MAGIC = b"RRF"
 _TIMEOUT = 10.0
 """Seconds for a viewer to open, and to receive the last data."""
 _PROBE_SIZE = 2**20
@@ -46,15 +45,7 @@ def check_target(target: str) -> str:
         raise InputError(
             f"`--rerun` must be `spawn` (a window), `serve` (a browser) or a file ending with `.rrd`, got {target!r}"
         )
-    if Path(target).is_file() and not _is_recording(Path(target)):
-        raise InputError(f"`--rerun` is `{target}`, which exists and is not a recording; give the name of a new file")
     return target
-
-
-def _is_recording(file: Path) -> bool:
-    """Return whether Rerun wrote the file, so that a new recording may replace it."""
-    with file.open("rb") as handle:
-        return handle.read(len(_MAGIC)) in (_MAGIC, b"")
 
 
 def open_target(target: str, name: str, instead: Path) -> Opened:
