@@ -140,7 +140,7 @@ def _whole_row(name: str, result: vg.Result, truth: vg.Trajectory, scale: float)
     turned_off = (goals.inv() * (goals * each.inv()).mean() * each).magnitude()
     moved, turned = scale * stated.translation, stated.rotation
     consistency = pose_consistency(result.trajectory, truth, moved, turned, scale)
-    nees = [f"{one.mean / one.degrees:.2f}" for one in consistency]
+    nees = [f"{one.mean() / 3:.2f}" for one in consistency]
     compared = ((aligned, moved), (first[0], moved), (turned_off, turned), (first[1], turned))
     known = np.isfinite(moved)
     within = [f"{100 * np.mean(error[known] <= 3 * sigma[known]):.0f} %" for error, sigma in compared]
@@ -167,8 +167,8 @@ def _drawn_row(name: str, source: Sequence, runs: int) -> str:
         assert stated is not None
         assert true is not None
         both = pose_consistency(result.trajectory, true, stated.translation, stated.rotation, 1.0)
-        squares.append([one.mean / one.degrees for one in both])
-        within.append([np.mean(one.nees <= 3.0**2) for one in both])
+        squares.append([one.mean() / 3 for one in both])
+        within.append([np.mean(one <= 3.0**2) for one in both])
     mean, error = np.mean(squares, 0), np.std(squares, 0, ddof=1) / np.sqrt(runs)
     nees = [f"{value:.2f} ± {spread:.2f}" for value, spread in zip(mean, error, strict=True)]
     shares = [f"{100 * share:.0f} %" for share in np.mean(within, 0)]

@@ -72,7 +72,7 @@ def row(name: str, arguments: argparse.Namespace) -> str:
 def _exact(sequence: SyntheticSequence) -> Iterator[np.ndarray]:
     """World points of the renderer's depth, of every second frame."""
     for index in range(0, len(sequence), 2):
-        yield _points(sequence.true_depth(index), sequence.pose(index), np.array(sequence.camera.intrinsics))
+        yield _points(sequence.picture(index).depth, sequence.pose(index), np.array(sequence.camera.intrinsics))
 
 
 def _measured(sequence: Sequence) -> Iterator[np.ndarray]:
@@ -107,7 +107,7 @@ def _nees(result: vg.Result, sequence: SyntheticSequence, scale: float) -> float
     squares = []
     for keyframe, depth_map in zip(result.record.slam.keyframes, result.record.dense.depth_maps, strict=True):
         if depth_map is not None:
-            error = scale * depth_map.depth / sequence.true_depth(keyframe.frame) - 1
+            error = scale * depth_map.depth / sequence.picture(keyframe.frame).depth - 1
             square = ((error / depth_map.sigma) ** 2)[::4, ::4]
             squares.append(square[square < 25])
     return float(np.concatenate(squares).mean())

@@ -28,8 +28,6 @@ import numpy as np
 
 from vggtgeo.io.argument_checks import check_array, check_confidence, check_index, check_pose
 
-# --- point matches -----------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class Features:
@@ -94,7 +92,6 @@ class PointMatcher(Protocol):
 
     def describe(self, image: np.ndarray) -> Features:
         """Return key points and descriptors of `image` (uint8 [H, W, 3]); zero key points on a blank image."""
-        ...
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
         """Return geometrically verified matches from view i to view j.
@@ -102,10 +99,6 @@ class PointMatcher(Protocol):
         predicted: float [M_i, 2], where each key point of i is expected in j, NaN where unknown; a hint that an
         implementation may ignore.
         """
-        ...
-
-
-# --- line segments -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -174,7 +167,6 @@ class LineDetector(Protocol):
 
     def detect(self, image: np.ndarray) -> Segments:
         """Return segments of `image` (uint8 [H, W, 3]), best first; none on a blank image."""
-        ...
 
 
 @runtime_checkable
@@ -183,16 +175,11 @@ class LineMatcher(Protocol):
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
         """Return the appearance of `segments` in `image` (uint8 [H, W, 3])."""
-        ...
 
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
         """Return the matches from view i to view j; with `relative`, only those that the geometry allows."""
-        ...
-
-
-# --- metric depth and dense confidence ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -225,7 +212,6 @@ class MetricDepth(Protocol):
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
         """Return depth of `image` (uint8 [H, W, 3]); `sensor_depth` is float32 [H, W] metres, NaN = none."""
-        ...
 
 
 @runtime_checkable
@@ -234,14 +220,10 @@ class DenseConfidence(Protocol):
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         """Return Omega, float32 [H, W] in [0, 1], of `image` (uint8 [H, W, 3])."""
-        ...
-
-
-# --- initial geometry --------------------------------------------------------------------------------------------
 
 
 class GeometryResult(IntEnum):
-    """Result code of a geometric estimate; `message` explains it and what to do."""
+    """Result code of a geometric estimate."""
 
     SUCCESS = 0
     TOO_FEW_MATCHES = 1
@@ -250,21 +232,6 @@ class GeometryResult(IntEnum):
     DEGENERATE = 4
     NO_PREDICTION = 5
     AMBIGUOUS = 6
-
-    @property
-    def message(self) -> str:
-        return _MESSAGES[self]
-
-
-_MESSAGES = {
-    GeometryResult.SUCCESS: "the estimate is supported by enough matches",
-    GeometryResult.TOO_FEW_MATCHES: "too few matches; the view shows another place, is blurred, or has no texture",
-    GeometryResult.TOO_FEW_INLIERS: "too few matches agree on one motion; treat tracking as lost here",
-    GeometryResult.LOW_PARALLAX: "the camera turned without moving enough; wait for a frame farther away",
-    GeometryResult.DEGENERATE: "the matches do not determine the motion; use a frame with more spread points",
-    GeometryResult.AMBIGUOUS: "two motions explain the matches, which show a plane; wait for a frame that shows more",
-    GeometryResult.NO_PREDICTION: "there is neither a match nor a predicted pose; give at least one of them",
-}
 
 
 @dataclass(frozen=True)
@@ -337,7 +304,6 @@ class InitialGeometry(Protocol):
 
     def locate(self, query: PoseQuery) -> PoseGuess:
         """Return the pose of the query's frame in the world its points live in. Failure is a result code."""
-        ...
 
     def start(
         self,
@@ -350,7 +316,6 @@ class InitialGeometry(Protocol):
 
         images: the two views, uint8 [H, W, 3], for implementations that use them; may be empty.
         """
-        ...
 
 
 @dataclass(frozen=True)
@@ -384,4 +349,3 @@ class WindowGeometry(Protocol):
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
         """Return poses, intrinsics (found if None), depth and confidence of `images` (uint8 [H, W, 3], one size)."""
-        ...

@@ -43,7 +43,6 @@ class WindowLocator:
     parallax: float = float(np.deg2rad(1.0))
 
     def locate(self, query: PoseQuery) -> PoseGuess:
-        """Return the pose of the query's frame; see `InitialGeometry.locate`."""
         predicted = self._predict(query)
         if predicted is None:
             return self.judge.locate(query)
@@ -60,7 +59,6 @@ class WindowLocator:
         intrinsics: np.ndarray,
         images: Sequence[np.ndarray] = (),
     ) -> StartGuess:
-        """Return motion and structure of the first two views; see `InitialGeometry.start`."""
         guess = self._start(pixels_i, pixels_j, np.asarray(intrinsics), images) if len(images) else None
         return self.judge.start(pixels_i, pixels_j, intrinsics, images) if guess is None else guess
 

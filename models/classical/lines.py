@@ -12,7 +12,7 @@ from vggtgeo.models.classical.pixel_matcher import mutual_nearest, unit
 from vggtgeo.models.roles import LineFeatures, LineMatches, RelativeView, Segments
 
 from vggtgeo.geometry import pinhole, rigid
-from vggtgeo.io.argument_checks import check_fields, check_image
+from vggtgeo.io.argument_checks import check_fields
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,6 @@ class BandLineMatcher:
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
         """Return band descriptors float32 [L, 8 * bands], of unit length, of `segments` in `image`."""
-        check_image("image", image)
         if not len(segments):
             return LineFeatures(segments, np.zeros((0, 8 * self.bands), np.float32))
         strips = _strips(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), segments.endpoints, self.width)
@@ -45,7 +44,6 @@ class BandLineMatcher:
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
-        """Return the matches from view i to view j; see `LineMatcher.match`."""
         similarity = features_i.descriptors @ features_j.descriptors.T
         return match_segments(similarity, features_i, features_j, relative, self.ratio, self.similarity)
 
@@ -65,17 +63,17 @@ def match_segments(
     return LineMatches(index_i, index_j, np.clip(1.0 - clarity**2, 0.05, 1.0))
 
 
-def _strips(gray: np.ndarray, endpoints: np.ndarray, width: int, samples: int = 24) -> np.ndarray:
-    """Return float32 [L, samples, 2 width + 2]: the image around each segment, along the segment and across it."""
+def _strips(gray: np.ndarray, endpoints: np.ndarray, width: int) -> np.ndarray:
+    """Return float32 [L, 24, 2 width + 2]: the image around each segment, along the segment and across it."""
     smooth = cv2.GaussianBlur(gray, (0, 0), 1.0)
     along = endpoints[:, 1] - endpoints[:, 0]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-    place = np.linspace(0.0, 1.0, samples)[:, None, None]
+    place = np.linspace(0.0, 1.0, 24)[:, None, None]
     offset = np.arange(-width - 0.5, width + 1.0)[None, :, None]
     pixels = endpoints[:, None, None, 0] + place * along[:, None, None] + offset * normal[:, None, None]
     flat = pixels.reshape(len(endpoints), -1, 2).astype(np.float32)
     cut = cv2.remap(smooth, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return cut.reshape(len(endpoints), samples, -1).astype(np.float32)
+    return cut.reshape(len(endpoints), len(place), -1).astype(np.float32)
 
 
 def _band_statistics(strips: np.ndarray, bands: int) -> np.ndarray:
@@ -113,7 +111,6 @@ class LsdDetector:
 
     def detect(self, image: np.ndarray) -> Segments:
         """Return segments of `image` (uint8 [H, W, 3]), longest first; none on a blank image."""
-        check_image("image", image)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         # The detector is made anew for each image: it holds buffers, and making it costs microseconds.
         found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, _SCALE).detect(gray)[0]
@@ -125,32 +122,32 @@ class LsdDetector:
         return Segments(ends[order], length[order])
 
 
-def allowed_pairs(
-    ends_i: np.ndarray,
-    ends_j: np.ndarray,
-    relative: RelativeView | None,
-    angle: float = float(np.deg2rad(30.0)),
-    distance: float = 12.0,
-    overlap: float = 0.3,
-) -> np.ndarray:
+_ANGLE = float(np.deg2rad(30.0))
+"""Largest angle between the directions of two segments that can be one line, radians."""
+_DISTANCE = 12.0
+"""Largest distance of a segment of known depth from the other one, pixels."""
+_OVERLAP = 0.3
+"""Least common part, a share of the shorter segment."""
+
+
+def allowed_pairs(ends_i: np.ndarray, ends_j: np.ndarray, relative: RelativeView | None) -> np.ndarray:
     """Return bool [L_i, L_j]: pairs of segments that can be one line.
 
-    Without `relative`: their directions differ by less than `angle`, radians. With it, a segment whose depth is known
-    is moved into j and must lie within `distance` pixels of the other, plus the error of the view, in its direction,
-    and overlap it by the share `overlap` of the shorter one; one whose depth is unknown must overlap the other between
-    the epipolar lines of its ends.
+    Without `relative`: their directions differ by less than `_ANGLE`. With it, a segment whose depth is known is moved
+    into j and must lie within `_DISTANCE` of the other, plus the error of the view, in its direction, and overlap it by
+    `_OVERLAP`; one whose depth is unknown must overlap the other between the epipolar lines of its ends.
 
     ends_i: float [L_i, 2, 2]. ends_j: float [L_j, 2, 2].
     """
     if not len(ends_i) or not len(ends_j):
         return np.zeros((len(ends_i), len(ends_j)), dtype=bool)
     if relative is None:
-        return _direction_cosine(ends_i, ends_j) > np.cos(angle)
+        return _direction_cosine(ends_i, ends_j) > np.cos(_ANGLE)
     moved = _move(ends_i, relative)
     known = np.isfinite(moved).all(axis=(1, 2))
     allowed = np.zeros((len(ends_i), len(ends_j)), dtype=bool)
-    allowed[known] = _near(moved[known], ends_j, distance + relative.error, overlap)
-    allowed[~known] = _on_epipolar_beam(ends_i[~known], ends_j, relative, angle, overlap)
+    allowed[known] = _near(moved[known], ends_j, _DISTANCE + relative.error)
+    allowed[~known] = _on_epipolar_beam(ends_i[~known], ends_j, relative)
     return allowed
 
 
@@ -178,7 +175,7 @@ def _move(ends: np.ndarray, relative: RelativeView) -> np.ndarray:
     return pinhole.project(points, relative.intrinsics)
 
 
-def _near(moved: np.ndarray, ends_j: np.ndarray, distance: float, overlap: float) -> np.ndarray:
+def _near(moved: np.ndarray, ends_j: np.ndarray, distance: float) -> np.ndarray:
     lines = line_coefficients(ends_j)
     direction, length = _directions(ends_j)
     start = (ends_j[:, 0] * direction).sum(axis=1)
@@ -189,7 +186,7 @@ def _near(moved: np.ndarray, ends_j: np.ndarray, distance: float, overlap: float
         places.append(end @ direction.T - start)
     common = _common_part(places[0], places[1], length, _directions(moved)[1])
     # A predicted end may miss by `distance`; both together must not turn the segment by more than 15 degrees.
-    return near & (common > overlap) & (_direction_cosine(moved, ends_j) > np.cos(0.26))
+    return near & (common > _OVERLAP) & (_direction_cosine(moved, ends_j) > np.cos(0.26))
 
 
 def _common_part(first: np.ndarray, second: np.ndarray, length: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -198,11 +195,7 @@ def _common_part(first: np.ndarray, second: np.ndarray, length: np.ndarray, own:
     return common / np.maximum(np.minimum(length[None, :], own[:, None]), 1.0)
 
 
-def _on_epipolar_beam(
-    ends_i: np.ndarray, ends_j: np.ndarray, relative: RelativeView, angle: float, overlap: float
-) -> np.ndarray:
-    if not len(ends_i):
-        return np.zeros((0, len(ends_j)), dtype=bool)
+def _on_epipolar_beam(ends_i: np.ndarray, ends_j: np.ndarray, relative: RelativeView) -> np.ndarray:
     to_rays = np.linalg.inv(pinhole.matrix(relative.intrinsics))
     fundamental = to_rays.T @ rigid.skew(relative.pose[:3, 3]) @ relative.pose[:3, :3] @ to_rays
     epipolar = np.concatenate([ends_i, np.ones_like(ends_i[..., :1])], axis=2) @ fundamental.T
@@ -216,8 +209,8 @@ def _on_epipolar_beam(
         places.append(-(line[:, :2] @ ends_j[:, 0].T + line[:, 2:]) / np.where(parallel, 1.0, rate))
         anywhere |= parallel
     own = np.abs(places[1] - places[0]).mean(axis=1)
-    meets = _common_part(places[0], places[1], length, own) > overlap
-    return (meets | anywhere) & (_direction_cosine(_turned(ends_i, relative), ends_j) > np.cos(angle))
+    meets = _common_part(places[0], places[1], length, own) > _OVERLAP
+    return (meets | anywhere) & (_direction_cosine(_turned(ends_i, relative), ends_j) > np.cos(_ANGLE))
 
 
 def _turned(ends: np.ndarray, relative: RelativeView) -> np.ndarray:
@@ -262,16 +255,22 @@ def sample_segments(endpoints: np.ndarray, spacing: float = 10.0) -> tuple[np.nd
     return index, endpoints[index, 0] + fraction[:, None] * along[index], fraction
 
 
-def segment_depths(endpoints: np.ndarray, depth: np.ndarray, tolerance: float = 0.03, least: int = 4) -> np.ndarray:
+_TOLERANCE = 0.03
+"""Largest difference of a sample's inverse depth from the affine function that explains it, relative."""
+_LEAST = 4
+"""Samples that must agree."""
+
+
+def segment_depths(endpoints: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Return depth of both ends, float64 [L, 2] in metres, NaN where the image's depth does not show a straight edge.
 
     Along the image of a 3D line inverse depth is affine, so an affine function is fitted to the inverse depths under
     each segment: for every pair of samples far apart, the function through both is scored by how many samples it
-    explains within `tolerance` (relative), and the best is refitted to those. An edge is the rim of what is in front,
+    explains within `_TOLERANCE`, and the best is refitted to those. An edge is the rim of what is in front,
     so each sample takes the depth of the foremost surface among its 3 x 3 pixels, and of two equal fits the nearer one
     wins.
 
-    endpoints: float [L, 2, 2]. depth: float [H, W] metres, NaN = none. least: samples that must agree.
+    endpoints: float [L, 2, 2]. depth: float [H, W] metres, NaN = none.
     """
     index, pixels, fraction = sample_segments(endpoints, 5.0)
     values = _foremost_depth(depth, pixels)
@@ -279,13 +278,13 @@ def segment_depths(endpoints: np.ndarray, depth: np.ndarray, tolerance: float = 
     bounds = np.searchsorted(index, np.arange(len(endpoints) + 1))
     for segment, (low, high) in enumerate(pairwise(bounds)):
         known = np.isfinite(values[low:high])
-        if np.count_nonzero(known) >= least:
-            result[segment] = _affine_ends(fraction[low:high][known], 1.0 / values[low:high][known], tolerance, least)
+        if np.count_nonzero(known) >= _LEAST:
+            result[segment] = _affine_ends(fraction[low:high][known], 1.0 / values[low:high][known])
     return result
 
 
-def _foremost_depth(depth: np.ndarray, pixels: np.ndarray, jump: float = 0.15) -> np.ndarray:
-    """Return the median of those of the 3 x 3 depths that are within `jump` (relative) of the nearest, NaN = none.
+def _foremost_depth(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the median of those of the 3 x 3 depths that are within 15 % of the nearest, NaN = none.
 
     The nearest itself would be biased: on a floor seen at a grazing angle, and under noise, one of nine pixels is
     always nearer by a few per cent, and edges that are too near make the whole map too small.
@@ -301,20 +300,20 @@ def _foremost_depth(depth: np.ndarray, pixels: np.ndarray, jump: float = 0.15) -
     ).astype(np.float64)
     ordered = np.sort(around, axis=0)  # NaN last
     with np.errstate(invalid="ignore"):
-        count = (ordered <= ordered[0] * (1.0 + jump)).sum(axis=0)
+        count = (ordered <= ordered[0] * 1.15).sum(axis=0)
     middle = np.maximum(count - 1, 0)
     pick = lambda row: np.take_along_axis(ordered, row[None], axis=0)[0]
     return 0.5 * (pick(middle // 2) + pick((middle + 1) // 2))
 
 
-def _affine_ends(fraction: np.ndarray, inverse: np.ndarray, tolerance: float, least: int) -> np.ndarray:
+def _affine_ends(fraction: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     first, second = _far_apart(len(fraction))
     slope = (inverse[second] - inverse[first]) / (fraction[second] - fraction[first])
     offset = inverse[first] - slope * fraction[first]
-    explained = np.abs(offset[:, None] + slope[:, None] * fraction - inverse) < tolerance * inverse
+    explained = np.abs(offset[:, None] + slope[:, None] * fraction - inverse) < _TOLERANCE * inverse
     score = explained.sum(axis=1) + 1e-3 * offset / max(offset.max(), 1e-9)
     best = explained[int(np.argmax(score))]
-    if np.count_nonzero(best) < max(least, len(fraction) // 2):
+    if np.count_nonzero(best) < max(_LEAST, len(fraction) // 2):
         return np.full(2, np.nan)
     x, y = fraction[best], inverse[best]
     centred = x - x.mean()

@@ -144,17 +144,20 @@ _SYMMETRIES = [
 ]
 
 
-def _search(planes: _Planes, near: float, longest: int = 24, kept: int = 12) -> np.ndarray:
-    """Return the rotation whose axes explain most length, among candidates from pairs of the longest segments."""
+def _search(planes: _Planes, near: float) -> np.ndarray:
+    """Return the rotation whose axes explain most length, among candidates from pairs of the 24 longest segments.
+
+    One axis of a candidate is one of the 12 directions that most length supports.
+    """
     normals, lengths = planes.normals, planes.lengths
-    top = np.argsort(-lengths)[:longest]
+    top = np.argsort(-lengths)[:24]
     first, second = np.triu_indices(len(top), k=1)
     crossing = np.cross(normals[top[first]], normals[top[second]])
     size = np.linalg.norm(crossing, axis=1)
     directions = crossing[size > 0.05] / size[size > 0.05, None]
     support = lengths @ (np.abs(normals @ directions.T) < near)
     best, most = np.eye(3), -1.0
-    for direction in directions[np.argsort(-support)[:kept]]:
+    for direction in directions[np.argsort(-support)[:12]]:
         across = np.cross(direction, normals[top])
         size = np.linalg.norm(across, axis=1)
         for other in across[size > 0.2] / size[size > 0.2, None]:

@@ -16,7 +16,7 @@ from vggtgeo.models.classical.sub_pixel import PatchAlignment
 from vggtgeo.models.classical.verification import EpipolarVerifier
 from vggtgeo.models.roles import Features, PointMatches
 
-from vggtgeo.io.argument_checks import check_fields, check_image
+from vggtgeo.io.argument_checks import check_fields
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,6 @@ class PixelMatcher:
         check_fields(self, count="[1, inf)", ratio="(0, 1]")
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
-        """Return refined mutual nearest neighbours that pass ratio test and verifier; see `PointMatcher.match`."""
         first: PixelDescriptors = features_i.descriptors
         second: PixelDescriptors = features_j.descriptors
         similarity = first.vectors @ second.vectors.T
@@ -83,20 +82,24 @@ def confidence_of(clarity: np.ndarray) -> np.ndarray:
     return np.clip(1.0 - clarity**2, 0.02 ** (2 / 3), 1.0) ** 1.5
 
 
-def spread(pixels: np.ndarray, scores: np.ndarray, count: int, size: tuple[int, int], cells: int = 10) -> np.ndarray:
+_CELLS = 10
+"""Columns of the grid over which key points are spread."""
+
+
+def spread(pixels: np.ndarray, scores: np.ndarray, count: int, size: tuple[int, int]) -> np.ndarray:
     """Return indices (int [<= count], best first) of key points that are strong and cover the image.
 
-    The image has a grid of square cells, `cells` columns. Points are taken in rounds: the strongest of every cell, then
-    the second strongest of every cell, and so on. So a poor region keeps its points, and a rich one loses its weakest.
-    Cost: one sort.
+    The image has a grid of square cells in `_CELLS` columns. Points are taken in rounds: the strongest of every cell,
+    then the second strongest of every cell, and so on. So a poor region keeps its points, and a rich one loses its
+    weakest. Cost: one sort.
 
     pixels: float [M, 2]. scores: float [M]. size: (width, height) of the image.
     """
     if not len(pixels):
         return np.zeros(0, dtype=np.int64)
-    cell = max(size[0] / cells, 1.0)
+    cell = max(size[0] / _CELLS, 1.0)
     columns, rows = (pixels // cell).astype(np.int64).T
-    bucket = rows * (cells + 1) + columns
+    bucket = rows * (_CELLS + 1) + columns
     order = np.lexsort((-scores, bucket))
     starts = np.flatnonzero(np.diff(bucket[order], prepend=bucket[order[0]] - 1))
     lengths = np.diff(starts, append=len(order))
@@ -119,7 +122,6 @@ class OrbMatcher(PixelMatcher):
 
     def describe(self, image: np.ndarray) -> Features:
         """Return key points and binary vectors of `image` (uint8 [H, W, 3]); none on a blank image."""
-        check_image("image", image)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         points, bits = self._orb.detectAndCompute(gray, None)
         pixels = np.array([p.pt for p in points], dtype=np.float64).reshape(-1, 2)
@@ -158,7 +160,6 @@ class SiftMatcher(PixelMatcher):
 
     def describe(self, image: np.ndarray) -> Features:
         """Return key points and RootSIFT vectors of `image` (uint8 [H, W, 3]); none on a blank image."""
-        check_image("image", image)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         small, ratio = _shrunk(gray, self.area)
         points, vectors = self._sift.detectAndCompute(small, None)
@@ -187,6 +188,8 @@ def _shrunk(gray: np.ndarray, area: int) -> tuple[np.ndarray, np.ndarray]:
 
 _NEIGHBOURS = 4
 """Key points near a predicted position that are compared; there are never more within some pixels."""
+_RATIO, _SIMILARITY = 0.85, 0.8
+"""Of a search near a predicted position: largest ratio of distances, least inner product."""
 
 
 def can_search(features: Features) -> bool:
@@ -207,14 +210,12 @@ def search_near(
     tree: cKDTree,
     *,
     radius: float,
-    ratio: float = 0.85,
-    similarity: float = 0.8,
 ) -> PointMatches:
     """Return the matches of some key points of view i within `radius` pixels of their predicted position in view j.
 
-    The most similar key point there is matched if its inner product is at least `similarity` and the ratio of distances
-    to the second best passes (Lowe's `ratio`). A key point of j is matched once, to the most similar. There is no
-    epipolar verification: the predicted position is stricter.
+    The most similar key point there is matched if its inner product is at least `_SIMILARITY` and the ratio of
+    distances to the second best is below `_RATIO` (Lowe). A key point of j is matched once, to the most similar. There
+    is no epipolar verification: the predicted position is stricter.
 
     index: int [n], key points of i. predicted: float [n, 2], pixels. tree: `search_tree(features_j)`.
     """
@@ -229,7 +230,7 @@ def search_near(
     rows = np.arange(len(index))
     best, next_best = alike[rows, order[:, 0]], alike[rows, order[:, 1]]
     clarity = distance_ratio(best, next_best)
-    good = np.nonzero((best > similarity) & (clarity < ratio))[0]
+    good = np.nonzero((best > _SIMILARITY) & (clarity < _RATIO))[0]
     good = good[np.argsort(-best[good], kind="stable")]
     target = near[good, order[good, 0]]
     keep = np.sort(np.unique(target, return_index=True)[1])
@@ -245,12 +246,11 @@ def search_around(
     features_j: Features,
     *,
     radius: float,
-    ratio: float = 0.85,
 ) -> PointMatches:
     """Return mutual matches within a larger `radius`, for rough predictions; otherwise as `search_near`."""
     similarity = _vectors(features_i)[index] @ _vectors(features_j).T
     exclude_far(similarity, predicted, features_j.pixels, radius)
-    rows, target, clarity = mutual_nearest(similarity, ratio)
+    rows, target, clarity = mutual_nearest(similarity, _RATIO)
     own = index[rows]
     return PointMatches(own, target, features_i.pixels[own], features_j.pixels[target], confidence_of(clarity))
 

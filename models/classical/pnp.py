@@ -30,7 +30,6 @@ class _TwoViewGeometry:
         intrinsics: np.ndarray,
         images: Sequence[np.ndarray] = (),
     ) -> StartGuess:
-        """Return motion and structure of the first two views, from the matches; see `InitialGeometry.start`."""
         return self.two_view.start(pixels_i, pixels_j, intrinsics)
 
 
@@ -56,7 +55,6 @@ class PnpGeometry(_TwoViewGeometry):
         check_fields(self, threshold="(0, inf)", least="[6, inf)")
 
     def locate(self, query: PoseQuery) -> PoseGuess:
-        """Return the pose of the query's frame; see `InitialGeometry.locate`."""
         if len(query.points) < self.least:
             return failed_guess(query, GeometryResult.TOO_FEW_MATCHES)
         intrinsics = np.asarray(query.intrinsics, dtype=np.float64)
@@ -121,7 +119,6 @@ class ConstantVelocity(_TwoViewGeometry):
     threshold: float = 30.0
 
     def locate(self, query: PoseQuery) -> PoseGuess:
-        """Return the prediction, with the matches it explains to `threshold`; see `InitialGeometry.locate`."""
         if query.predicted is None:
             return failed_guess(query, GeometryResult.NO_PREDICTION)
         errors = _errors(query.predicted, query)

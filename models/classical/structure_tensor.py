@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vggtgeo.io.argument_checks import check_fields, check_image
+from vggtgeo.io.argument_checks import check_fields
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,6 @@ class StructureTensor:
         check_fields(self, sigma="(0, inf)", noise="(0, inf)", edges="[0, inf)")
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
-        """Return Omega, float32 [H, W] in [0, 1], of `image` (uint8 [H, W, 3])."""
-        check_image("image", image)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         # Scharr's 3 x 3 derivative sums to 32 for a ramp of one grey level a pixel.
         dx = cv2.Scharr(gray, cv2.CV_32F, 1, 0, scale=1 / 32)

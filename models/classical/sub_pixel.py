@@ -125,10 +125,13 @@ class PatchFlow:
 
 
 def _patch_correlation(
-    gray_i: np.ndarray, gray_j: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray, radius: int = 7
+    gray_i: np.ndarray, gray_j: np.ndarray, pixels_i: np.ndarray, pixels_j: np.ndarray
 ) -> np.ndarray:
-    """Return the normalised cross-correlation of the patches around `pixels_i` and `pixels_j` [n, 2], float32 [n]."""
-    side = _side(radius)
+    """Return the normalised cross-correlation of the patches of 15 x 15 pixels around `pixels_i` and `pixels_j` [n, 2].
+
+    Returns float32 [n].
+    """
+    side = _side(7)
     first, second = (
         _normalised(_upright(gray, at, side, side)) for gray, at in ((gray_i, pixels_i), (gray_j, pixels_j))
     )

@@ -7,7 +7,7 @@ no segment, no view), and counted for the verdict. A network that fails to run s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -35,6 +35,7 @@ from vggtgeo.models.roles import (
 from vggtgeo.geometry.camera import Camera
 
 _Role = TypeVar("_Role")
+_Answer = TypeVar("_Answer")
 NEAREST, FARTHEST = 0.05, 100.0
 """Minimum and maximum depth of an indoor world, a sports hall included, metres."""
 AVERAGE = 0.5
@@ -60,10 +61,6 @@ class Refusals:
         self.refused += refused
         self.without += not left
 
-    def note_failure(self, values: int = 1) -> None:
-        """Count an answer that is not valid at all, of so many values."""
-        self.note(values, values, left=False)
-
     @property
     def share(self) -> float:
         """Return the rejected share, of answers or of values, whichever is larger."""
@@ -77,6 +74,14 @@ class _Bounded(Generic[_Role]):
     source: _Role
     refusals: Refusals = field(default_factory=Refusals)
 
+    def _answer(self, ask: Callable[[], _Answer], values: int = 1) -> _Answer | None:
+        """Return the answer of the source; None if it raises `NetworkValueError`, counted as `values` refused."""
+        try:
+            return ask()
+        except NetworkValueError:
+            self.refusals.note(values, values, left=False)
+            return None
+
 
 @dataclass(frozen=True, eq=False)
 class BoundedDepth(_Bounded[MetricDepth]):
@@ -88,10 +93,8 @@ class BoundedDepth(_Bounded[MetricDepth]):
         sensor_depth: np.ndarray | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> DepthEstimate:
-        try:
-            found = self.source.estimate(image, sensor_depth, intrinsics)
-        except NetworkValueError:
-            self.refusals.note_failure(image[..., 0].size)
+        found = self._answer(lambda: self.source.estimate(image, sensor_depth, intrinsics), image[..., 0].size)
+        if found is None:
             return no_depth(image.shape[:2])
         with np.errstate(invalid="ignore"):
             given = np.isfinite(found.depth)
@@ -113,10 +116,8 @@ class BoundedConfidence(_Bounded[DenseConfidence]):
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
         average = np.full(image.shape[:2], AVERAGE, np.float32)
-        try:
-            found = self.source.confidence(image)
-        except NetworkValueError:
-            self.refusals.note_failure(average.size)
+        found = self._answer(lambda: self.source.confidence(image), average.size)
+        if found is None:
             return average
         with np.errstate(invalid="ignore"):
             good = np.isfinite(found) & (found >= 0) & (found <= 1)
@@ -129,10 +130,8 @@ class BoundedLines(_Bounded[LineDetector]):
     """A `LineDetector` with segments inside the image."""
 
     def detect(self, image: np.ndarray) -> Segments:
-        try:
-            found = self.source.detect(image)
-        except NetworkValueError:
-            self.refusals.note_failure()
+        found = self._answer(lambda: self.source.detect(image))
+        if found is None:
             return _NO_SEGMENTS
         inside = (found.endpoints >= 0) & (found.endpoints <= np.array(image.shape[1::-1]) - 1)
         good = inside.all(axis=(1, 2)) & (found.endpoints[:, 0] != found.endpoints[:, 1]).any(axis=1)
@@ -145,10 +144,8 @@ class BoundedLineMatcher(_Bounded[LineMatcher]):
     """A `LineMatcher` without segments for an image on which its network failed."""
 
     def describe(self, image: np.ndarray, segments: Segments) -> LineFeatures:
-        try:
-            found = self.source.describe(image, segments)
-        except NetworkValueError:
-            self.refusals.note_failure()
+        found = self._answer(lambda: self.source.describe(image, segments))
+        if found is None:
             return LineFeatures(_NO_SEGMENTS)
         self.refusals.note(1, 0, left=True)
         return found
@@ -166,19 +163,14 @@ class BoundedPoints(_Bounded[PointMatcher]):
     """A `PointMatcher` without matches if its network fails; bounds are checked by `PointMatches`."""
 
     def describe(self, image: np.ndarray) -> Features:
-        try:
-            return self.source.describe(image)
-        except NetworkValueError:
-            self.refusals.note_failure()
-            return Features(np.zeros((0, 2)), np.zeros(0))
+        found = self._answer(lambda: self.source.describe(image))
+        return Features(np.zeros((0, 2)), np.zeros(0)) if found is None else found
 
     def match(self, features_i: Features, features_j: Features, predicted: np.ndarray | None = None) -> PointMatches:
         if not (len(features_i) and len(features_j)):
             return PointMatches.none()
-        try:
-            found = self.source.match(features_i, features_j, predicted)
-        except NetworkValueError:
-            self.refusals.note_failure()
+        found = self._answer(lambda: self.source.match(features_i, features_j, predicted))
+        if found is None:
             return PointMatches.none()
         self.refusals.note(len(found), 0, left=True)  # two views may have nothing in common
         return found
@@ -190,10 +182,8 @@ class BoundedWindow(_Bounded[WindowGeometry]):
 
     def window(self, images: Sequence[np.ndarray], intrinsics: np.ndarray | None = None) -> WindowGuess:
         count, (height, width) = len(images), images[0].shape[:2]
-        try:
-            found = self.source.window(images, intrinsics)
-        except NetworkValueError:
-            self.refusals.note_failure(count)
+        found = self._answer(lambda: self.source.window(images, intrinsics), count)
+        if found is None:
             camera = Camera.guess(width, height).intrinsics if intrinsics is None else intrinsics
             return WindowGuess(
                 np.tile(np.eye(4), (count, 1, 1)),

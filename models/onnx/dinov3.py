@@ -32,7 +32,6 @@ class DinoFeatures:
     cache: OutputCache = field(default_factory=MemoryCache)
 
     def confidence(self, image: np.ndarray) -> np.ndarray:
-        """Return Omega, float32 [H, W] in [0, 1), of `image` (uint8 [H, W, 3])."""
         outputs, fit = self._outputs(image)
         omega = saliency(outputs["attention"]).reshape(_grid(fit))
         fine = cv2.resize(omega, fit.network_size[::-1], interpolation=cv2.INTER_LINEAR)
@@ -107,7 +106,6 @@ class DenseLineMatcher:
     def match(
         self, features_i: LineFeatures, features_j: LineFeatures, relative: RelativeView | None = None
     ) -> LineMatches:
-        """Return the matches from view i to view j; see `LineMatcher.match`."""
         similarity = segment_similarity(features_i.descriptors, features_j.descriptors)
         return match_segments(similarity, features_i, features_j, relative, self.ratio, self.similarity)
 

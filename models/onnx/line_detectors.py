@@ -48,20 +48,20 @@ def cut_off(endpoints: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.stack([start + enter[:, None] * way, start + leave[:, None] * way], axis=1)
 
 
-def directed(gray: np.ndarray, endpoints: np.ndarray, samples: int = 16, reach: float = 3.0) -> np.ndarray:
+def directed(gray: np.ndarray, endpoints: np.ndarray) -> np.ndarray:
     """Return `endpoints` [L, 2, 2] with ends swapped so that the brighter side is on the left, as LSD has it.
 
-    gray: uint8 [H, W]. The sides are compared `reach` pixels from the segment; left is as seen in the image from end 0
+    gray: uint8 [H, W]. The sides are compared 3 pixels from the segment; left is as seen in the image from end 0
     to end 1. Line descriptors and gates compare directions, which are arbitrary in networks.
     """
     if not len(endpoints):
         return endpoints
     along = endpoints[:, 1] - endpoints[:, 0]
     right = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-    place = np.linspace(0.1, 0.9, samples)[:, None]
+    place = np.linspace(0.1, 0.9, 16)[:, None]
     middle = endpoints[:, None, 0] + place * along[:, None]
     smooth = cv2.GaussianBlur(gray, (0, 0), 1.0).astype(np.float32)
-    sides = [_read(smooth, middle + sign * reach * right[:, None]).mean(axis=1) for sign in (1.0, -1.0)]
+    sides = [_read(smooth, middle + reach * right[:, None]).mean(axis=1) for reach in (3.0, -3.0)]
     swap = sides[0] > sides[1]
     return np.where(swap[:, None, None], endpoints[:, ::-1], endpoints)
 
@@ -86,7 +86,6 @@ class LetrDetector:
     count: int = 200
 
     def detect(self, image: np.ndarray) -> Segments:
-        """Return segments of `image` (uint8 [H, W, 3]), most probable first."""
         factor = SHORT_SIDE / min(image.shape[:2])
         height, width = (round(factor * side) for side in image.shape[:2])
         fit = self.session.fit(image, (height, width))
@@ -131,7 +130,6 @@ class MlsdDetector:
     count: int = 200
 
     def detect(self, image: np.ndarray) -> Segments:
-        """Return segments of `image` (uint8 [H, W, 3]), best first."""
         run = lambda: {"maps": self.session.run({"image": prepare(image)[None]})["maps"][0, :5]}
         outputs = self.cache.get((self.session,), ("lines",), (image,), run)
         ends, scores = decode_maps(outputs["maps"], self.score, self.min_length, self.count)

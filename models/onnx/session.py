@@ -33,7 +33,6 @@ from vggtgeo.models.onnx.contracts import (
 )
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 
-from vggtgeo.io.argument_checks import check_image
 from vggtgeo.io.errors import InputError, install_hint, put_back_hint
 
 _log = logging.getLogger(__name__)
@@ -108,7 +107,6 @@ class Session:
 
     def prepare(self, image: np.ndarray, fit: Fit) -> np.ndarray:
         """Return `image` (uint8 [H, W, 3]) as input, resized and normalised, float32 [1, 3, *fit.network_size]."""
-        check_image("image", image)
         return self.contract.normalisation.apply(fit.resize(image))[None]
 
     def run(self, inputs: Mapping[str, Input], wanted: Iterable[str] | None = None) -> dict[str, np.ndarray]:

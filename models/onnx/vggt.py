@@ -99,12 +99,12 @@ def shared_intrinsics(cameras: np.ndarray) -> np.ndarray:
     return np.array([*focal, *(robust_mean(column) for column in cameras[:, 2:].T)])
 
 
-def robust_mean(values: np.ndarray, reach: float = 3.0) -> float:
-    """Return the mean of the values within `reach` robust standard deviations of the median."""
+def robust_mean(values: np.ndarray) -> float:
+    """Return the mean of the values within 3 robust standard deviations of the median."""
     middle = np.median(values)
     off = np.abs(values - middle)
     # 1.4826 times the median absolute deviation estimates a normal standard deviation.
-    return float(values[off <= reach * 1.4826 * np.median(off) + 1e-12 * abs(middle)].mean())
+    return float(values[off <= 3.0 * 1.4826 * np.median(off) + 1e-12 * abs(middle)].mean())
 
 
 def confidence_of(certainty: np.ndarray) -> np.ndarray:

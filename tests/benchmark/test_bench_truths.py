@@ -153,8 +153,8 @@ def test_nees_tells_whether_stated_deviations_are_those_of_the_errors(factor: fl
     )
     off[:, :3, 3] /= scale
     place, rotation = pose_consistency(Trajectory(times, off), truth, sigma, turned, scale)
-    assert place.mean / 3 == pytest.approx(factor**2, rel=0.15)
-    assert rotation.mean / 3 == pytest.approx(factor**2, rel=0.15)
+    assert place.mean() / 3 == pytest.approx(factor**2, rel=0.15)
+    assert rotation.mean() / 3 == pytest.approx(factor**2, rel=0.15)
 
 
 def test_a_run_that_states_deviations_has_its_nees_in_the_row(tmp_path: Path) -> None:

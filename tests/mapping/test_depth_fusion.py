@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
-from vggtgeo.mapping.depth_fusion import SurfaceFusion, fused_mesh
+from vggtgeo.mapping.depth_fusion import SurfaceFusion
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.tsdf import merge_meshes
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -52,11 +53,20 @@ def _around() -> list[np.ndarray]:
     return [Rotation.align_vectors([[0.0, 0.0, -1.0]], [direction])[0].as_matrix() for direction in directions]
 
 
+def fused(
+    keyframes: list[Keyframe], depth_maps: Sequence[DepthMap | None], voxel: float = VOXEL, min_views: int = 2
+) -> Mesh:
+    """The mesh of all views at once."""
+    fusion = SurfaceFusion(INTRINSICS, voxel, min_views)
+    fusion.update(keyframes, depth_maps)
+    return fusion.mesh
+
+
 def test_the_mesh_is_the_sphere() -> None:
     # Proves that noisy views fuse to a closed surface (each edge has two faces, also where blocks meet), within a
     # quarter of a voxel of the truth on average, with outward normals and faces, and the colours seen. Oracle: the
     # sphere.
-    mesh = fused_mesh(*sphere_views(noise=0.01), INTRINSICS, VOXEL)
+    mesh = fused(*sphere_views(noise=0.01))
     radius = np.linalg.norm(mesh.vertices, axis=1)
     assert np.abs(radius - RADIUS).mean() < 0.25 * VOXEL
     assert np.abs(radius - RADIUS).max() < 1.5 * VOXEL
@@ -99,7 +109,7 @@ def test_what_moved_is_fused_again_and_nothing_else() -> None:
     keyframes, depth_maps = [*far, *keyframes], [*depth_maps[:2], *depth_maps]
     first = len(far)
     wrong = [*far, moved(keyframes[first], 2 * VOXEL), *keyframes[first + 1 :]]
-    whole = fused_mesh(keyframes, depth_maps, INTRINSICS, VOXEL)
+    whole = fused(keyframes, depth_maps)
     fusion = SurfaceFusion(INTRINSICS, VOXEL, bound=0.5)
     fusion.update(wrong[:-1], depth_maps[:-1])
     fusion.update(wrong, depth_maps)
@@ -115,7 +125,7 @@ def test_what_moved_is_fused_again_and_nothing_else() -> None:
     for metres, some in ((0.4 * VOXEL, False), (0.6 * VOXEL, True)):
         assert bool(fusion.update([moved(keyframes[0], metres), *keyframes[1:]], depth_maps)) is some
     fusion.update(keyframes[1:], depth_maps[1:])
-    same(fusion.mesh, fused_mesh(keyframes[1:], depth_maps[1:], INTRINSICS, VOXEL))
+    same(fusion.mesh, fused(keyframes[1:], depth_maps[1:]))
 
 
 def same(found: Mesh, expected: Mesh) -> None:
@@ -133,13 +143,13 @@ def test_a_second_view_changes_what_one_view_is_enough_for() -> None:
     fusion.update(*(part[:1] for part in opposite))
     assert len(fusion.mesh.faces)
     fusion.update(*opposite)
-    same(fusion.mesh, fused_mesh(*opposite, INTRINSICS, VOXEL))
+    same(fusion.mesh, fused(*opposite))
 
 
 def test_the_mesh_of_a_building_is_joined() -> None:
     """Blocks that share vertices are joined however far others are; oracle: the parts' own vertices, counted."""
     keyframes, depth_maps = sphere_views()
-    part = fused_mesh(keyframes[:4], depth_maps[:4], INTRINSICS, VOXEL, 1)
+    part = fused(keyframes[:4], depth_maps[:4], min_views=1)
     far = replace(part, vertices=part.vertices + np.float32([150, 120, 50]))
     whole = merge_meshes([part, far, part, far], VOXEL)
     assert len(part.vertices) > 500
@@ -150,11 +160,11 @@ def test_the_mesh_of_a_building_is_joined() -> None:
 def test_a_small_piece_is_left_out() -> None:
     # Proves that a false depth of a few pixels, apart from everything, makes no surface. Oracle: the mesh without it.
     keyframes, depth_maps = sphere_views()
-    mesh = fused_mesh(keyframes, depth_maps, INTRINSICS, VOXEL)
+    mesh = fused(keyframes, depth_maps)
     false = depth_maps[0].depth.copy()
     false[5:9, 5:9] = 1.0
     spoilt = DepthMap(false, np.full(SHAPE, 0.001, np.float32), np.isfinite(false).astype(np.float32))
-    again = fused_mesh(keyframes, [spoilt, *depth_maps[1:]], INTRINSICS, VOXEL)
+    again = fused(keyframes, [spoilt, *depth_maps[1:]])
     assert np.linalg.norm(again.vertices, axis=1).max() == pytest.approx(
         np.linalg.norm(mesh.vertices, axis=1).max(), abs=VOXEL
     )
@@ -179,14 +189,14 @@ def test_no_depth_is_no_mesh(tmp_path: Path) -> None:
     # Proves that without any depth there is an empty mesh, that a mesh comes back from its file, and the errors of what
     # cannot be a mesh. Oracle: the mesh written.
     keyframes, depth_maps = sphere_views()
-    nothing = fused_mesh(keyframes, [None] * len(keyframes), INTRINSICS, VOXEL)
+    nothing = fused(keyframes, [None] * len(keyframes))
     assert len(nothing.faces) == 0
-    mesh = fused_mesh(keyframes[:1], depth_maps[:1], INTRINSICS, 2 * VOXEL)
+    mesh = fused(keyframes[:1], depth_maps[:1], 2 * VOXEL)
     mesh.save_ply(tmp_path / "mesh.ply")
     again = Mesh.load_ply(tmp_path / "mesh.ply")
     for name in ("vertices", "faces", "normals", "colours"):
         np.testing.assert_array_equal(getattr(again, name), getattr(mesh, name))
     with pytest.raises(InputError, match=r"`voxel` .*0"):
-        fused_mesh(keyframes, depth_maps, INTRINSICS, 0.0)
+        SurfaceFusion(INTRINSICS, 0.0)
     with pytest.raises(InputError, match="`faces` names vertex"):
         Mesh(mesh.vertices[:2], mesh.faces, mesh.normals[:2], mesh.colours[:2])

@@ -51,7 +51,7 @@ def test_a_frame_without_depth_gets_that_of_the_keyframes(run: RecordedRun) -> N
     """
     slam, row = run.slam, ordinary(run.slam)
     maps = dense_depths(slam.keyframes, slam.intrinsics)
-    truth = run.sequence.true_depth(slam.frames[row].frame)
+    truth = run.sequence.picture(slam.frames[row].frame).depth
     found = dict(depth_of_frames(slam, maps))
     assert list(found) == [record.frame for record in slam.frames]
     own = found[slam.frames[row].frame]

@@ -30,7 +30,7 @@ def room() -> tuple[list[Keyframe], list[np.ndarray], np.ndarray]:
     sequence = vg.simulate("room", 24, 0, SIZE, rate=10.0)
     rng, keyframes, truths = np.random.default_rng(0), [], []
     for number, index in enumerate(range(0, 24, 4)):
-        truth = sequence.true_depth(index)
+        truth = sequence.picture(index).depth
         rows, columns = np.nonzero(np.isfinite(truth))
         chosen = rng.choice(len(rows), 120, replace=False)
         rows, columns = rows[chosen], columns[chosen]

@@ -84,7 +84,7 @@ def test_worlds_have_no_holes_and_walks_keep_clear(world: str) -> None:
     count = 14
     sequence = simulate(world, frames=count, seed=0, size=SIZE, rate=count * motion.speed / motion.length)
     for frame, index in zip(sequence.frames(), range(count), strict=True):
-        depth = sequence.true_depth(index)
+        depth = sequence.picture(index).depth
         assert np.isfinite(depth).all(), f"frame {index}: {np.isnan(depth).sum()} pixels without a surface"
         assert depth.min() > 0.25, f"frame {index}: {depth.min()=}"
         assert 60 < frame.image.mean() < 190, f"frame {index}: {frame.image.mean()=}"
@@ -100,12 +100,12 @@ def test_sensor_noise_has_the_stated_deviation(walk: SyntheticSequence) -> None:
     assert 0.75 * 3.0 < deviation < 1.25 * 3.0, f"{deviation=}"
     relative = (noisy.depth - clean.depth) / clean.depth**2
     assert abs(relative.std() / 0.002 - 1) < 0.05, f"{relative.std()=}"
-    assert np.array_equal(clean.depth, walk.true_depth(5).astype(np.float32))
+    assert np.array_equal(clean.depth, walk.picture(5).depth.astype(np.float32))
 
 
 def test_depth_outside_the_range_is_missing(walk: SyntheticSequence) -> None:
     # Depth is NaN exactly where the measured value lies outside the range.
-    depth = walk.true_depth(3)
+    depth = walk.picture(3).depth
     far = float(np.median(depth))
     seen = replace(walk, sensor=Sensor(depth_noise=0.0, depth_range=(0.1, far))).frame(3).depth
     assert seen is not None

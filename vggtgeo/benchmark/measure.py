@@ -89,7 +89,7 @@ def mean_nees(result: Result, truth: Trajectory, scale: float) -> dict[str, Any]
         found = pose_consistency(result.trajectory, truth, factor * stated.translation, stated.rotation, factor)
     except InputError:
         return {}
-    return {name: one.mean / one.degrees for name, one in zip(("nees_place", "nees_rotation"), found, strict=True)}
+    return {name: float(one.mean()) / 3 for name, one in zip(("nees_place", "nees_rotation"), found, strict=True)}
 
 
 def truth_of_run(result: Result, truth: Trajectory | None) -> Trajectory | None:
@@ -243,12 +243,7 @@ def _sparse(points: np.ndarray) -> np.ndarray:
 
 
 def _columns(found: CloudError) -> dict[str, Any]:
-    return {
-        "f_score": found.f_score,
-        "precision": found.precision,
-        "recall": found.recall,
-        "accuracy_m": found.accuracy,
-        "completeness_m": found.completeness,
-        "mean_distance_m": found.mean_distance,
-        "threshold_m": found.threshold,
-    }
+    shares = ("f_score", "precision", "recall")
+    lengths = ("accuracy", "completeness", "mean_distance", "threshold")
+    row = {name: getattr(found, name) for name in shares}
+    return row | {f"{name}_m": getattr(found, name) for name in lengths}

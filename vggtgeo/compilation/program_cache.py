@@ -67,11 +67,6 @@ class CachedProgram(Generic[_Result]):
                 program.call = self._cached(args) or self._plain
         return program.call(*args)
 
-    @property
-    def prepared(self) -> int:
-        """Return the number of structures and shapes of the calls so far."""
-        return len(self._programs)
-
     def _cached(self, args: tuple[Any, ...]) -> Callable[..., _Result] | None:
         """Return a call of the cached program for such arguments; None if there is none and it cannot be cached."""
         folder, named = _folder(), _lasting_name((self._function, args))

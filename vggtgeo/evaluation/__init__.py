@@ -17,7 +17,6 @@ from vggtgeo.evaluation.offsets import estimate_offsets as estimate_offsets
 from vggtgeo.evaluation.pose_errors import AbsoluteError as AbsoluteError
 from vggtgeo.evaluation.pose_errors import ErrorStatistics as ErrorStatistics
 from vggtgeo.evaluation.pose_errors import absolute_error as absolute_error
-from vggtgeo.evaluation.pose_errors import consistency as consistency
 from vggtgeo.evaluation.pose_errors import pose_consistency as pose_consistency
 from vggtgeo.evaluation.pose_errors import relative_error as relative_error
 from vggtgeo.evaluation.pose_errors import rotation_angle as rotation_angle

@@ -9,8 +9,8 @@ RPE is their root mean square. No alignment is needed; a reconstruction of free 
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
 
 NEES, the normalised estimation error squared: for an error `e` of k numbers and its covariance C, `e' C^-1 e` follows
-the chi-square law with k degrees of freedom, so its mean over n independent errors, n times, that with n k. Source: Y.
-Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.
+the chi-square law with k degrees of freedom, whose mean is k. Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan,
+"Estimation with Applications to Tracking and Navigation", 2001, section 5.4.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,6 @@ from typing import Literal, Self, get_args
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from vggtgeo.evaluation.alignment import VERTICAL, Alignment, Similarity, align
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, nearest_in_time
@@ -33,8 +32,6 @@ UNITS: tuple[Unit, ...] = get_args(Unit)
 _MAX_POSES = 2**31
 PATH_TOLERANCE = 0.1
 """Share of a delta in seconds or metres by which overlapping pairs may miss it; evo's default."""
-LEVEL = 0.95
-"""Probability of the interval of a mean NEES."""
 
 
 @dataclass(frozen=True)
@@ -194,50 +191,18 @@ def _motion(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return motion
 
 
-@dataclass(frozen=True, eq=False)
-class Consistency:
-    """Fields:
-    nees: float64 [n], of each error.
-    degrees: dimension of an error, the expected NEES for correct covariances.
-    low, high: interval of the mean for correct covariances and independent errors, with probability `LEVEL`.
-    """
-
-    nees: Float[np.ndarray, " n"]
-    degrees: int
-    low: float
-    high: float
-
-    @property
-    def mean(self) -> float:
-        """Mean NEES. Above `high` the covariances are too small (overconfident), below `low` too large."""
-        return float(self.nees.mean())
-
-
-def consistency(errors: Float[np.ndarray, "n k"], covariances: Float[np.ndarray, "n k k"]) -> Consistency:
-    """Return the NEES of `errors` with their `covariances`, in the same coordinates and units.
-
-    InputError if there is no error. Covariances must be positive definite.
-    """
-    if not errors.size:
-        raise InputError("`errors` is empty; at least one error is needed")
-    white = np.linalg.solve(np.linalg.cholesky(covariances), errors[..., None])[..., 0]
-    count, degrees = errors.shape
-    low, high = chi2.ppf([0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], count * degrees) / count
-    return Consistency((white**2).sum(axis=1), degrees, float(low), float(high))
-
-
 def pose_consistency(
     estimate: Trajectory,
     truth: Trajectory,
     place_sigma: Float[np.ndarray, " n"],
     rotation_sigma: Float[np.ndarray, " n"],
     scale: float = 1.0,
-) -> tuple[Consistency, Consistency]:
-    """Return the NEES of positions and of rotations, for standard deviations relative to the first pose.
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " k"]]:
+    """Return the NEES of each position and of each rotation, for standard deviations relative to the first pose.
 
-    Both trajectories are expressed relative to the first matched pose. Standard deviations (metres, rad) are isotropic.
-    scale: factor on the estimate's lengths. Poses with a standard deviation of zero or NaN are left out; InputError if
-    none is left.
+    3 is expected where the deviations are right, more where they are too small. Both trajectories are expressed
+    relative to the first matched pose. Standard deviations (metres, rad) are isotropic. scale: factor on the estimate's
+    lengths. Poses with a standard deviation of zero or NaN are left out; InputError if none is left.
     """
     rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, MAX_TIME_DIFFERENCE)
     found, true = (
@@ -246,9 +211,14 @@ def pose_consistency(
     )
     moved = scale * found[:, :3, 3] - true[:, :3, 3]
     turned = Rotation.from_matrix(found[:, :3, :3].mT @ true[:, :3, :3]).as_rotvec() if len(rows) else moved
-    return _by_deviations(moved, place_sigma[rows]), _by_deviations(turned, rotation_sigma[rows])
+    return _nees(moved, place_sigma[rows]), _nees(turned, rotation_sigma[rows])
 
 
-def _by_deviations(errors: np.ndarray, sigma: np.ndarray) -> Consistency:
+def _nees(errors: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Return the NEES of errors [n, 3] with the covariances `sigma`^2 I, of those with a standard deviation."""
     stated = np.isfinite(sigma) & (sigma > 0)
-    return consistency(errors[stated], sigma[stated, None, None] ** 2 * np.eye(3))
+    if not stated.any():
+        raise InputError("`place_sigma` and `rotation_sigma` must be positive and finite for at least one matched pose")
+    covariances = sigma[stated, None, None] ** 2 * np.eye(3)
+    white = np.linalg.solve(np.linalg.cholesky(covariances), errors[stated][..., None])[..., 0]
+    return (white**2).sum(axis=1)

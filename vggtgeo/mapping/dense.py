@@ -13,7 +13,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError
 from vggtgeo.mapping.cloud import map_points
-from vggtgeo.mapping.depth_fusion import fused_mesh, measured_depth
+from vggtgeo.mapping.depth_fusion import SurfaceFusion, measured_depth
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.mapping.keyframe_depth import fused_depths
 from vggtgeo.mapping.stereo import stereo_depths
@@ -55,7 +55,9 @@ class DenseMap:
         """Mesh, world frame, computed on first access; None without dense depth."""
         # Stereo depth has been confirmed by two other views already, measured depth has not.
         measured = any(keyframe.images.has_depth for keyframe in self.keyframes)
-        found = fused_mesh(self.keyframes, self.own_maps, self.intrinsics, self.voxel, 2 if measured else 1)
+        fusion = SurfaceFusion(self.intrinsics, self.voxel, 2 if measured else 1)
+        fusion.update(self.keyframes, self.own_maps)
+        found = fusion.mesh
         return found if len(found.faces) else None
 
 

@@ -29,29 +29,6 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.threads import map_in_threads
 
 
-def fused_mesh(
-    keyframes: Sequence[Keyframe],
-    depth_maps: Sequence[DepthMap | None],
-    intrinsics: np.ndarray,
-    voxel: float = 0.02,
-    min_views: int = 2,
-) -> Mesh:
-    """Return one coloured mesh of all keyframes' depth, world frame.
-
-    Args:
-        keyframes: poses world -> camera.
-        depth_maps: one per keyframe, None if unknown.
-        intrinsics: float64 [4], pixels.
-        voxel: edge of a voxel, metres.
-        min_views: number of keyframes that must measure a voxel, if there are as many; 1 if other views have
-            confirmed each depth already.
-
-    """
-    fusion = SurfaceFusion(intrinsics, voxel, min_views)
-    fusion.update(keyframes, depth_maps)
-    return fusion.mesh
-
-
 @dataclass(frozen=True, eq=False)
 class _Fused:
     """A fused view: the blocks of its surface, the corners of what it sees (camera frame, float [n, 3]), and the object
@@ -80,7 +57,8 @@ class SurfaceFusion:
     Args:
         intrinsics: float64 [4], pixels.
         voxel: edge of a voxel, metres.
-        min_views: as in `fused_mesh`.
+        min_views: number of keyframes that must measure a voxel, if there are as many; 1 if other views have
+            confirmed each depth already.
         bound: motion of a view's surface, voxels, above which it is fused again; measured where depth is large.
 
     Raises:

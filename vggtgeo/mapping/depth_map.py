@@ -11,7 +11,6 @@ from typing import Self
 import numpy as np
 
 from vggtgeo.geometry import pinhole
-from vggtgeo.io.errors import InputError
 from vggtgeo.slam.sparse_map.keyframe import CompressedImage, array_of
 
 COMPRESS_FROM = 200
@@ -31,15 +30,9 @@ class DepthMap:
         sigma: float32 [H, W], relative standard deviation.
         confidence: float32 [H, W] in [0, 1], 0 where depth is unknown.
 
-    Raises:
-        InputError: the shapes differ, or are not [H, W].
-
     """
 
     def __init__(self, depth: np.ndarray, sigma: np.ndarray, confidence: np.ndarray) -> None:
-        for name, part in (("depth", depth), ("sigma", sigma), ("confidence", confidence)):
-            if part.shape != depth.shape or len(part.shape) != 2:
-                raise InputError(f"`{name}` must be [H, W] as `depth` {depth.shape}, got shape {part.shape}")
         self._parts: tuple[np.ndarray | CompressedImage, ...] = (depth, sigma, confidence)
         self._unit = 1.0
         self._known: float | None = None  # share of known pixels, if compressed

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -164,10 +164,6 @@ class SyntheticSequence:
         """Render what an ideal camera sees at the frame's instant: light, exact depth, surfaces, glass."""
         return self._render(self.pose(index), 0, self.camera.height)
 
-    def true_depth(self, index: int) -> np.ndarray:
-        """Return the exact depth, float64 [H, W], metres; NaN without a surface."""
-        return self.picture(index).depth
-
     def _pose_at(self, time: float) -> np.ndarray:
         return np.linalg.inv(self.motion.camera_to_world(time))
 
@@ -222,7 +218,7 @@ def simulate(
     build, walk = WORLDS[scene]
     motion = HandheldMotion.along(walk, seed)
     if speed is not None:
-        motion = motion.at_speed(speed)
+        motion = replace(motion, speed=speed)
     return SyntheticSequence(build(seed), motion, camera_of(size), sensor or Sensor(), frames, rate, seed)
 
 

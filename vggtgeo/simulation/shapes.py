@@ -105,11 +105,6 @@ class SceneBuilder:
             loop = np.array([origin, origin + along, origin + along + up, origin + up, origin])
             self.edges.extend(np.stack([loop[:-1], loop[1:]], axis=1))
 
-    def disc(self, centre: Vector, radius: float, look: Look) -> None:
-        """Add a horizontal disc that faces up."""
-        corner = np.asarray(centre, float) - [radius, radius, 0]
-        self._add(DISC, corner, np.array([2 * radius, 0, 0]), np.array([0, 2 * radius, 0]), look)
-
     def pane(self, origin: Vector, along: Vector, up: Vector) -> None:
         """Add a sheet of clear glass: it lets light through and mirrors what is in front of it."""
         origin, along, up = (np.asarray(v, float) for v in (origin, along, up))
@@ -155,7 +150,8 @@ class SceneBuilder:
         row = (CYLINDER, base, np.eye(3)[0], np.eye(3)[1], UP, (2 * np.pi * radius, height), corners)
         self.rows.append(row)
         self.looks.append(look)
-        self.disc(base + [0, 0, height], radius, look)
+        top = base + [0, 0, height] - [radius, radius, 0]
+        self._add(DISC, top, np.array([2 * radius, 0, 0]), np.array([0, 2 * radius, 0]), look)
         self.boxes.append((base + [0, 0, 0.5 * height], 0.0, np.array([0.8 * radius, 0.8 * radius, 0.5 * height])))
 
     def _add(self, kind: int, origin: np.ndarray, along: np.ndarray, up: np.ndarray, look: Look) -> None:

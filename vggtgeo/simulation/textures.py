@@ -16,13 +16,11 @@ from scipy.ndimage import gaussian_filter
 Painter = Callable[[np.random.Generator, int], np.ndarray]
 
 
-def fractal(
-    rng: np.random.Generator, size: int, slope: float = 1.0, stretch: float = 1.0, lowest: float = 1.0
-) -> np.ndarray:
+def fractal(rng: np.random.Generator, size: int, slope: float = 1.0, stretch: float = 1.0) -> np.ndarray:
     """Return a periodic Gaussian field with amplitude spectrum |k|^-slope: detail at every scale.
 
     Returns float32 [size, size], mean 0, standard deviation 1. `stretch` > 1 lengthens the grain along x; waves with
-    fewer than `lowest` periods in the tile are removed.
+    less than one period in the tile are removed.
     """
     half = size // 2 + 1
     parts = rng.standard_normal((2, size, half), dtype=np.float32)
@@ -33,7 +31,7 @@ def fractal(
     gain = np.maximum(squared, 1e-6) ** np.float32(-0.5 * slope) * np.exp(
         squared * np.float32(-0.5 / (0.30 * size) ** 2)
     )
-    gain[squared < lowest**2] = 0.0
+    gain[squared < 1.0] = 0.0
     spectrum = np.empty((size, half), np.complex64)
     spectrum.real, spectrum.imag = parts[0] * gain, parts[1] * gain
     noise = scipy.fft.irfft2(spectrum, s=(size, size), overwrite_x=True)
@@ -125,7 +123,7 @@ def parquet(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def wood(rng: np.random.Generator, size: int) -> np.ndarray:
     """Draw veneer of furniture: long grain with rings."""
-    bend = fractal(rng, size, 1.9, stretch=6.0, lowest=1.0)
+    bend = fractal(rng, size, 1.9, stretch=6.0)
     y = np.arange(size, dtype=np.float32)[:, None] / size
     rings = np.sin(2 * np.pi * (9 * y + 0.45 * bend))
     tone = 0.5 + 0.16 * rings + 0.16 * fractal(rng, size, 0.8, stretch=18.0)

@@ -7,7 +7,7 @@ many frames are asked for, and poses between frames (motion blur, rolling exposu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -66,9 +66,6 @@ class HandheldMotion:
         path = np.vstack([path, path[0] + [0, 0, 0, winding, 0]])
         step = float(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).mean())
         return cls(path, step, walk.speed, _waves(np.random.default_rng([seed, 17])))
-
-    def at_speed(self, speed: float) -> Self:
-        return replace(self, speed=speed)
 
     @property
     def length(self) -> float:

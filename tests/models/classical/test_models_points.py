@@ -88,7 +88,7 @@ def test_spread_takes_the_best_of_every_cell_first() -> None:
     generator = np.random.default_rng(1)
     pixels = generator.uniform((0, 0), (320, 240), (500, 2))
     scores = generator.uniform(0, 1, 500) + (pixels[:, 0] > 160)
-    chosen = spread(pixels, scores, 80, (320, 240), cells=10)
+    chosen = spread(pixels, scores, 80, (320, 240))
     best: dict[tuple[int, int], int] = {}
     for n, (x, y) in enumerate(pixels):
         cell = (int(x // 32), int(y // 32))
