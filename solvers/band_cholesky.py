@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from vggtgeo.solvers.arrow import ArrowSystem, ArrowVector, back_substitute, dense_gradient
-from vggtgeo.solvers.block_band import BandLayout, Bands, band_layout, band_solver, damped_band, prepare_bands
+from vggtgeo.solvers.block_band import BandLayout, Bands, band_solver, damped_band, prepare_bands
 from vggtgeo.solvers.block_elimination import (
     Elimination,
     SelectedInverse,
@@ -147,7 +147,7 @@ class BandCholesky(AbstractReducedSolver[Bands]):
                 "`system.prior_hessian` must not couple all nodes (a marginalisation prior), since the reduced system "
                 "is then not banded; use `DenseCholesky` or `ConjugateGradients`"
             )
-        return prepare_bands(system, band_layout(system, self.reach, self.place))
+        return prepare_bands(system, BandLayout(system.num_nodes, max(2 * self.reach, 1), self.place))
 
     def step(
         self, system: ArrowSystem, prepared: Bands, damping: Float[Array, ""]

@@ -105,11 +105,6 @@ class BandLayout(AbstractLayout):
         return index if self.place is None else jnp.append(self.place, self.nodes)[index]
 
 
-def band_layout(system: ArrowSystem, reach: int, place: Int[Array, " n"] | None) -> BandLayout:
-    """Return the layout for all edges of a reach of at most `reach`."""
-    return BandLayout(system.num_nodes, max(2 * reach, 1), place)
-
-
 class BandMatrix(eqx.Module):
     """`M` of the module docstring; padding after the last node is zero."""
 

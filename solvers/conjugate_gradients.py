@@ -28,7 +28,7 @@ from vggtgeo.solvers.arrow import (
     inverse_landmark_hessian,
     to_relative,
 )
-from vggtgeo.solvers.block_band import Bands, band_layout, band_solver, prepare_bands
+from vggtgeo.solvers.block_band import BandLayout, Bands, band_solver, prepare_bands
 from vggtgeo.solvers.gauge import at_least, flat_stiffness, free_gauge
 from vggtgeo.solvers.minres import minres
 from vggtgeo.solvers.reduced_solvers import AbstractFactor, AbstractReducedSolver, predicted_decrease
@@ -122,7 +122,7 @@ class BandPreconditioner(AbstractPreconditioner[Bands]):
     reach: int = eqx.field(static=True)
 
     def prepare(self, system: ArrowSystem) -> Bands:
-        return prepare_bands(system, band_layout(system, self.reach, None))
+        return prepare_bands(system, BandLayout(system.num_nodes, max(2 * self.reach, 1), None))
 
     def inverse(self, system: ArrowSystem, prepared: Bands, damping: Float[Array, ""]) -> Apply:
         solve = band_solver(system, prepared, damping)

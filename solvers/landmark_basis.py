@@ -56,7 +56,8 @@ class LandmarkBasis(NamedTuple):
     def expand_variance(self, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
         """Return variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
         if self.segments is not None:
-            variance = expand_segments_variance(self.segments, variance)
+            # Variances of uncorrelated landmarks of the system add up with squared coefficients.
+            variance = _expanded(self.segments.basis**2, variance)
         return variance if self.triples is None else expand_triples_variance(self.triples, variance)
 
     def restrict(self, gradient: Float[Array, "n z"]) -> Float[Array, "n s"]:
@@ -192,11 +193,6 @@ def join_segments(
 def expand_segments(segments: SegmentLandmarks, landmarks: Float[Array, "*rows s"]) -> Float[Array, "*rows z"]:
     """Transform the system's landmarks to those of the problem, the samples of the segments."""
     return _expanded(segments.basis, landmarks)
-
-
-def expand_segments_variance(segments: SegmentLandmarks, variance: Float[Array, "n s"]) -> Float[Array, "n z"]:
-    """Return variances of the problem's landmarks from those of uncorrelated landmarks of the system."""
-    return _expanded(segments.basis**2, variance)
 
 
 def restrict_segments(segments: SegmentLandmarks, landmarks: Float[Array, "n z"]) -> Float[Array, "n s"]:

@@ -160,16 +160,6 @@ def diagnose(problem: Problem, start: State, state: State, energy: Float[Array, 
     )
 
 
-def diagnosis_like(problem: Problem) -> Diagnosis:
-    """Return a diagnosis with the structure of that of `problem` and placeholder values."""
-    count, dtype = len(problem.terms), problem.pixels.dtype
-    whole, share = jnp.zeros(count, int), jnp.zeros(count, dtype)
-    motion, number = jnp.zeros((count, lie.TANGENT), dtype), jnp.zeros((), dtype)
-    names = tuple(term.name for term in problem.terms)
-    shapes = tuple(jnp.shape(term.weight) for term in problem.terms)
-    return Diagnosis(whole, whole, share, share, share, motion, number, jnp.asarray(0), names, shapes)
-
-
 @eqx.filter_jit
 def _diagnose_jit(problem: Problem, state: State) -> Diagnosis:
     return diagnose(prepared(problem), state, state)

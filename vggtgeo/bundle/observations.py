@@ -69,10 +69,10 @@ class Observations:
     edges: np.ndarray
     host: np.ndarray
     pixel: np.ndarray
-    point_edge: np.ndarray
-    point_landmark: np.ndarray
-    point_target: np.ndarray
-    point_weight: np.ndarray
+    point_edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    point_landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    point_target: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    point_weight: np.ndarray = field(default_factory=lambda: np.zeros(0))
     line_edge: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     line_landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     line_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))

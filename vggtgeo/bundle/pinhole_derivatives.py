@@ -81,21 +81,24 @@ def project(ray_x: Array, ray_y: Array, depth: Array, edge: OneEdge) -> Projecti
 
 
 def row(edge: OneEdge, at: Projection, a: Array, b: Array) -> list[Array]:
-    """Return the derivatives of one row with image gradient `(a, b)`: 6 relative pose, 4 intrinsics, inverse depth."""
+    """Return the derivatives of rows with image gradients `(a, b)`, each `[m, p]` or `[p]`.
+
+    In the order: 6 relative pose, 4 intrinsics, inverse depth.
+    """
     fx, fy = edge.intrinsics[:2]
-    rotation, translation = edge.rotation, edge.translation
     g0, g1 = a * fx * at.inverse_z, b * fy * at.inverse_z
     # At its bound `Y_z` is constant, so it has no derivative.
-    g2 = -(g0 * at.x + g1 * at.y) * at.in_front
+    g = jnp.stack([g0, g1, -(g0 * at.x + g1 * at.y) * at.in_front])
+    # `G`, `c_0`, `c_1` and `G . t` by one product: XLA would compute `G` again in each column that has it.
+    factors = jnp.concatenate([jnp.eye(3, dtype=g.dtype), edge.rotation[:, :2].T, edge.translation[None]])
+    g0, g1, g2, c0, c1, depth = (factors @ g.reshape(3, -1)).reshape(6, *a.shape)
     y0, y1, y2 = at.point
-    c0 = g0 * rotation[0, 0] + g1 * rotation[1, 0] + g2 * rotation[2, 0]
-    c1 = g0 * rotation[0, 1] + g1 * rotation[1, 1] + g2 * rotation[2, 1]
     return [
         *(g0 * at.depth, g1 * at.depth, g2 * at.depth),
         *(y1 * g2 - g1 * y2, g0 * y2 - y0 * g2, g1 * y0 - g0 * y1),
         *(a * at.x - c0 * at.ray_x / fx, b * at.y - c1 * at.ray_y / fy),
         *(a - c0 / fx, b - c1 / fy),
-        g0 * translation[0] + g1 * translation[1] + g2 * translation[2],
+        depth,
     ]
 
 

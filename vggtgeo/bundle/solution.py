@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
 from vggtgeo.bundle.checks import check_observed, check_pair
-from vggtgeo.bundle.diagnosis import MAJORITY, Diagnosis, diagnose, diagnosis_like
+from vggtgeo.bundle.diagnosis import MAJORITY, Diagnosis, diagnose
 from vggtgeo.bundle.objective import prepared
 from vggtgeo.bundle.problem import MAX_INVERSE_DEPTH, MIN_INVERSE_DEPTH, Problem, Readable, State
 from vggtgeo.bundle.solver_choice import default_solver
@@ -298,10 +298,9 @@ def _energy_derivative(primals: Any, tangents: Any) -> tuple[Float[Array, ""], F
     return jax.jvp(energy, (moving,), (moved,))
 
 
-def solution_like(
-    problem: Problem, initial: State, solver: SchurLevenbergMarquardt, diagnosis: bool = True
-) -> Solution:
-    """Return a solution with the structure of the result of `solve` and placeholder values, for the JIT cache."""
+def solution_like(problem: Problem, initial: State, solver: SchurLevenbergMarquardt) -> Solution:
+    """Return placeholders with the structure of the result of `solve` without a diagnosis, for the JIT cache."""
+    del problem
     count, number = jnp.asarray(0), jnp.zeros(())
     tries = jnp.zeros(solver.max_iterations + 1)
     moved = jnp.zeros((len(tries), *initial.poses.wxyz_xyz.shape))
@@ -316,6 +315,6 @@ def solution_like(
         polished=jnp.asarray(False),
         gradient_residual=number,
         at_bound=count,
-        diagnosis=diagnosis_like(problem) if diagnosis else None,
+        diagnosis=None,
         record=IterationRecord(tries, tries, tries, moved) if solver.record_iterations else None,
     )

@@ -11,8 +11,12 @@ TUKEY = 4.685
 """Cut of Tukey's biweight in standard deviations: 95 % efficient under Gaussian noise (Holland and Welsch 1977)."""
 MAD_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
-POSE_GATE = float(chi2.ppf(0.9999, 6))
+RARE = 1e-4
+"""Chance of a false decision, at the gates that should hardly ever err."""
+POSE_GATE = float(chi2.isf(RARE, 6))
 """Gate of a squared Mahalanobis distance between poses, 6 degrees of freedom: one right pose in 10,000 is rejected."""
+TINY = float(np.finfo(np.float32).tiny)
+"""Smallest normal number in single precision: bounds a divisor whose numerator is zero where it acts."""
 REGULARISER = 1e-9
 """Information, 1/m^2 and 1/rad^2, that makes a singular matrix invertible: a standard deviation of 30 km."""
 

@@ -30,7 +30,6 @@ from vggtgeo.slam.map_initialisation import (
     without_depth,
 )
 from vggtgeo.slam.perception.description import Description
-from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.pose_prior import RecordedPrior, recorded_prior
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import without_matches
@@ -100,7 +99,7 @@ def step(
     else:
         slam = _refer_to(slam, found.keyframe, roles)
         slam = _with_record(slam, record_of(frame, found))
-        slam = _with_view(slam, data.view, roles)
+        slam = replace(slam, tracker=with_view(slam.map, slam.tracker, data.view, slam.intrinsics, roles))
     return _place_waiting(slam, roles) if was_lost else slam
 
 
@@ -151,7 +150,8 @@ def _track(
     A pending window is taken up first where the frame has no pose, or becomes a keyframe.
     """
     with clock.measure("track"):
-        data = _with_lines(frame_data(frame, description, slam.intrinsics, roles, slam.metric), roles, settings)
+        data = frame_data(frame, description, slam.intrinsics, roles, slam.metric)
+        data = replace(data, find_lines=lambda: find_lines(frame.image, roles, settings))
         # In a map of another run the place of the first frame is unknown: it is searched by appearance alone.
         unknown_place = _only_localises(slam) and slam.tracker.reference is None
         found = None if unknown_place else _find(slam, data, recorded, roles, settings)
@@ -239,11 +239,6 @@ def _prior(slam: Slam, frame: Frame, recorded: RecordedPrior | None) -> MotionPr
     return MotionPrior(predicted, velocity, slam.tracker.lost)
 
 
-def _with_lines(data: FrameData, roles: Roles, settings: SlamSettings) -> FrameData:
-    """Add a function that detects the frame's segments."""
-    return replace(data, find_lines=lambda: find_lines(data.frame.image, roles, settings))
-
-
 def _rank(found: TrackedFrame) -> tuple[bool, int]:
     return found.accepted, found.quality.inliers
 
@@ -319,10 +314,6 @@ def _refer_to(slam: Slam, keyframe: Keyframe, roles: Roles) -> Slam:
         return slam
     reference = keyframe.number, view_of(keyframe, slam.tracker, slam.intrinsics, roles)
     return replace(slam, tracker=against_reference(slam.map, replace(slam.tracker, reference=reference)))
-
-
-def _with_view(slam: Slam, view: RgbdView | None, roles: Roles) -> Slam:
-    return replace(slam, tracker=with_view(slam.map, slam.tracker, view, slam.intrinsics, roles))
 
 
 def _place_waiting(slam: Slam, roles: Roles) -> Slam:

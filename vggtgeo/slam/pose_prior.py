@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import POSE_GATE
 from vggtgeo.slam.global_map.drift_correction import at_poses
 from vggtgeo.slam.global_map.joining import moved_submap
-from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, squared_distance
+from vggtgeo.slam.global_map.pose_graph import squared_distance
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.pose_prior_check import (
     Comparison,
@@ -144,7 +145,7 @@ def _in_recorded_scale(slam: Slam, recorded: RecordedPoses, scales: np.ndarray) 
         for row, (factor, (first, second)) in enumerate(zip(steps, pairwise(numbers), strict=True)):
             before, after = (slam.keyframes[number].pose for number in (first, second))
             poses[second] = longer(after @ rigid.invert(before), 1.0 / local[row]) @ poses[first]
-            if factor is not None and squared_distance(factor, poses) > LOOP_GATE:
+            if factor is not None and squared_distance(factor, poses) > POSE_GATE:
                 recorded_motion = factor.pose if factor.second == second else rigid.invert(factor.pose)
                 poses[second] = recorded_motion @ poses[first]
     factors = tuple(factor for factor in slam.map.factors if not isinstance(factor, MeasuredBaseline))

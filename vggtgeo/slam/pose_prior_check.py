@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import RARE
 from vggtgeo.models.roles import GeometryResult
 from vggtgeo.slam.perception.recorded_poses import RecordedPoses
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -32,8 +33,8 @@ from vggtgeo.slam.tracking.frame_tracking import TrackedFrame
 from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality, worst_sigma
 from vggtgeo.slam.tracking.tracking_state import FramePose
 
-SIGNIFICANT = float(np.log(1e4))
-"""Logarithm of the ratio of likelihoods that decides: one false decision in 10,000 runs, as at the other gates."""
+SIGNIFICANT = -float(np.log(RARE))
+"""Logarithm of the ratio of likelihoods that decides."""
 FOLLOWING = 0.5
 """Share of the tracked motions that follow the recording, if it is of these images."""
 MAX_OTHERS = 32
@@ -183,7 +184,7 @@ class _Record:
         if len(rows) < 2:
             return 0.0
         scale = scales[self.second[rows]]
-        own = _longer(self.motions[rows], scale)
+        own = longer(self.motions[rows], scale)
         noise = [
             np.linalg.inv(self.measured[row].information) + recorded.covariance(motion, float(self.seconds[row]))
             for row, motion in zip(rows, own, strict=True)
@@ -191,7 +192,7 @@ class _Record:
         # Whitens an error: |root^T e|^2 is its squared Mahalanobis distance.
         root = np.linalg.cholesky(np.linalg.inv(np.array(noise)))
         others = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_OTHERS)).round().astype(int))
-        elsewhere = _longer(self.motions[rows[others]][None], scale[:, None])
+        elsewhere = longer(self.motions[rows[others]][None], scale[:, None])
         candidates = np.concatenate([own[:, None], elsewhere], 1)
         measured = np.array([self.measured[row].pose for row in rows])
         error = _tangents(measured[:, None] @ rigid.invert(candidates))
@@ -202,13 +203,6 @@ class _Record:
         count = (~again).sum(1)
         log_ratio = log_likelihood[:, 0] - logsumexp(log_likelihood, axis=1) + np.log(count)
         return float(np.logaddexp(np.log(FOLLOWING) + log_ratio, np.log(1.0 - FOLLOWING)).sum())
-
-
-def _longer(motions: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-    """Multiply translations of motions [..., 4, 4] by ratios that broadcast to [...]."""
-    found = np.broadcast_to(motions, (*np.broadcast_shapes(motions.shape[:-2], ratios.shape), 4, 4)).copy()
-    found[..., :3, 3] *= ratios[..., None]
-    return found
 
 
 def _tangents(motions: np.ndarray) -> np.ndarray:

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from vggtgeo.evaluation import evaluate_trajectory
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import POSE_GATE
 from vggtgeo.slam.clock import Clock
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import LOOP_GATE
 from vggtgeo.slam.local_mapping import merge_pending_window
 from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run_frames
 from vggtgeo.slam.settings.groups import WindowSettings
@@ -81,7 +81,7 @@ def test_true_loops_stay_and_false_ones_that_agree_go(seed: int, bias: float) ->
         for start in (0, SIDE):
             nearby, here = start + row - section, start + row
             loops.append(_measured(rng, nearby, here, np.eye(4), KNOWN))
-    kept = consistent_loops(loops, _odometry(rng, true, bias), LOOP_GATE)
+    kept = consistent_loops(loops, _odometry(rng, true, bias), POSE_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(6)), np.flatnonzero(kept)
 
 
@@ -93,8 +93,8 @@ def test_loops_that_contradict_more_plausible_ones_go(few: int, rows: range, lat
     rng, true = np.random.default_rng(0), _there_and_back()
     motions = _odometry(rng, true, 0.0)
     right, wrong = _loops(rng, true, range(few), 2 * SIDE), _loops(rng, true, rows, later, 0.5)
-    assert np.all(Odometry.of(motions, len(true)).distances(wrong) < LOOP_GATE), "odometry alone should allow them"
-    kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
+    assert np.all(Odometry.of(motions, len(true)).distances(wrong) < POSE_GATE), "odometry alone should allow them"
+    kept = consistent_loops([*wrong, *right], motions, POSE_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(len(wrong), len(wrong) + few)), np.flatnonzero(kept)
 
 
@@ -107,7 +107,7 @@ def test_true_loops_at_several_places_stay(seed: int, bias: float) -> None:
     rng, true = np.random.default_rng(seed), _there_and_back()
     pairs = [(row + start, row + end) for start, end in ((0, 2 * SIDE), (10, 60), (30, 70)) for row in range(6)]
     loops = [_measured(rng, first, second, true[second] @ rigid.invert(true[first]), KNOWN) for first, second in pairs]
-    kept = consistent_loops(loops, _odometry(rng, true, bias), LOOP_GATE)
+    kept = consistent_loops(loops, _odometry(rng, true, bias), POSE_GATE)
     assert kept.all(), np.flatnonzero(~kept)
 
 
@@ -118,10 +118,10 @@ def test_submaps_are_joined_by_the_larger_cluster() -> None:
     rng, true = np.random.default_rng(0), _there_and_back()
     motions = [motion for motion in _odometry(rng, true, 0.0) if motion.second != 2 * SIDE]
     wrong, right = _loops(rng, true, range(3), 2 * SIDE, corridor.SECTION), _loops(rng, true, range(6), 2 * SIDE)
-    kept = consistent_loops([*wrong, *right], motions, LOOP_GATE)
+    kept = consistent_loops([*wrong, *right], motions, POSE_GATE)
     assert np.array_equal(np.flatnonzero(kept), np.arange(3, 9)), np.flatnonzero(kept)
-    assert not consistent_loops(right[:1], motions, LOOP_GATE).any()
-    assert consistent_loops(right[:1], motions, LOOP_GATE, alone=np.array([True])).all()
+    assert not consistent_loops(right[:1], motions, POSE_GATE).any()
+    assert consistent_loops(right[:1], motions, POSE_GATE, alone=np.array([True])).all()
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import POSE_GATE
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import LOOP_GATE, PoseGraph, ScaleRatio, solve_pose_graph, solve_scales
+from vggtgeo.slam.global_map.pose_graph import PoseGraph, ScaleRatio, solve_pose_graph, solve_scales
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 
 LAPS, KEYFRAMES = 2, 60
@@ -90,7 +91,7 @@ def test_large_drift_comes_back_and_false_loops_do_no_harm(seed: int, false: flo
     """
     true, graph, right = _drifting(seed, false, bias, alike)
     before = _errors(graph.poses, true)
-    sure = consistent_loops(graph.loops, graph.motions, LOOP_GATE)
+    sure = consistent_loops(graph.loops, graph.motions, POSE_GATE)
     assert np.mean(sure[right]) > 0.9, "true loops are consistent"
     poses, accepted = solve_pose_graph(replace(graph, loops=tuple(compress(graph.loops, sure))))
     right = right[sure]

@@ -56,7 +56,7 @@ def _terrace() -> SyntheticSequence:
     for number, (x, y) in enumerate(POSTS):
         build.box((x, y, 0.0), (0.5, 0.5, 1.6), _poster(number))
     scene = finish(build, "terrace", ambient=0.3, texel=3.0)
-    motion = HandheldMotion.along(WALK, 0).at_speed(0.8)
+    motion = replace(HandheldMotion.along(WALK, 0), speed=0.8)
     return SyntheticSequence(scene, motion, camera_of((320, 240)), Sensor(), 1, 4.0, 0, has_depth=False)
 
 

@@ -19,8 +19,6 @@ from vggtgeo.slam.perception.description import Description
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.keyframe import Keyframe, make_keyframe
 from vggtgeo.slam.tracking.frame_tracking import (
-    PIXEL_SIGMA,
-    SEARCH_RADIUS,
     FrameData,
     MotionPrior,
     TrackingInput,
@@ -31,7 +29,6 @@ from vggtgeo.slam.tracking.frame_tracking import (
 )
 from vggtgeo.slam.tracking.local_map_tracking import Refined, refine_by_map
 from vggtgeo.slam.tracking.pose_acceptance import tangent
-from vggtgeo.slam.tracking.pose_fusion import with_systematic
 
 SIZE = (320, 240)
 ROLES = Roles(points=SiftMatcher(count=500))
@@ -61,8 +58,7 @@ def _refined(
     view: View, keyframes: tuple[Keyframe, ...], start: np.ndarray, known: np.ndarray = VAGUE
 ) -> Refined | None:
     frame, intrinsics = view[1], view[3]
-    settings = {"radius": SEARCH_RADIUS, "sigma": PIXEL_SIGMA}
-    return refine_by_map(frame.features, keyframes, frame, start, known, intrinsics, with_systematic, **settings)
+    return refine_by_map(frame.features, keyframes, frame, start, known, intrinsics)
 
 
 def test_points_of_several_keyframes_bring_a_pose_right(view: View) -> None:

@@ -307,11 +307,6 @@ def _spectrum(reduced: Reduced, coordinates: _Coordinates) -> Spectra:
 def _sparse_spectrum(blocks: Blocks, layout: SparseLayout, coordinates: _Coordinates) -> Spectra:
     """Return the spectrum of sparse blocks, for the weakest directions only."""
     information, common = sparse_matrix(blocks, layout), np.asarray(coordinates.common)
-    if not np.all(np.isfinite(information.data)):
-        raise ValueError(
-            "the information at `state` has entries that are NaN or infinite: pass the state of a converged solution, "
-            "with finite poses, intrinsics and inverse depths"
-        )
     free = np.nonzero(coordinates.free)[0]
     scaled = sp.diags_array(1 / np.asarray(coordinates.scale)[free])
     values, found = weakest(scaled @ information[free][:, free] @ scaled, KEPT)

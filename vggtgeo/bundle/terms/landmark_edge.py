@@ -113,7 +113,7 @@ class EdgeView(eqx.Module):
         fx, fy, cx, cy = edge.intrinsics
         return fx * at.x + cx, fy * at.y + cy
 
-    def row(self, a: Float[Array, " p"], b: Float[Array, " p"]) -> tuple[list[Array], Array, list[Array]]:
+    def row(self, a: Float[Array, "*m p"], b: Float[Array, "*m p"]) -> tuple[list[Array], Array, list[Array]]:
         """Return the derivatives of a row of residuals with image gradient `(a, b)`: by the shared coordinates, by
         inverse depth, and by the pixel in the host, if it is an unknown.
         """

@@ -69,12 +69,13 @@ class ImageTerm(EdgeTerm):
         residual, normal = self._image(view)
         scale = reweighting(self.kernel, self.weights, squared_norm(residual), correction)
         along = [scale.share * sum(n * r for n, r in zip(of, residual, strict=True)) for of in normal]
-        parts = []
-        for i, r in enumerate(residual):
-            a, b = (scale.root * (of[i] - pulled * r) for of, pulled in zip(normal, along, strict=True))
-            shared, depth, pixel = view.row(a, b)
-            parts.append(jnp.stack([*shared, scale.root * r / scale.soft, depth, *pixel]))
-        return jnp.concatenate(parts, 1)
+        a, b = (
+            jnp.stack([scale.root * (n - pulled * r) for n, r in zip(of, residual, strict=True)])
+            for of, pulled in zip(normal, along, strict=True)
+        )
+        shared, depth, pixel = view.row(a, b)
+        pull = jnp.stack([scale.root * r / scale.soft for r in residual])
+        return jnp.stack([*shared, pull, depth, *pixel]).reshape(len(shared) + 2 + len(pixel), -1)
 
     def gradient(self, view: EdgeView) -> Gradient:
         if isinstance(view.projection, camera_derivatives.Seen):

@@ -18,6 +18,7 @@ from scipy.stats import t as student_t
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residual_values import residuals_at
 from vggtgeo.compilation.program_cache import CachedProgram
+from vggtgeo.geometry import pinhole
 
 CHANCE = 1e-3
 """Significance level of the test."""
@@ -45,15 +46,10 @@ def carried(
     pixels: np.ndarray, inverse: np.ndarray, relative: np.ndarray, camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels [a, b, 2] and inverse depths [a, b] of landmarks in other cameras; relative: [a, 4, 4]."""
-    there = np.einsum("aij,abj->abi", relative[:, :3, :3], rays(pixels, camera))
+    there = np.einsum("aij,abj->abi", relative[:, :3, :3], pinhole.rays(pixels, camera))
     there += relative[:, None, :3, 3] * inverse[..., None]
     with np.errstate(all="ignore"):
         return there[..., :2] / there[..., 2:] * camera[:2] + camera[2:], inverse / there[..., 2]
-
-
-def rays(pixels: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Return rays with depth one, [..., 3]."""
-    return np.concatenate([(pixels - camera[2:]) / camera[:2], np.ones((*pixels.shape[:-1], 1))], -1)
 
 
 def shifted_problem(problem: Problem, shifts: Shifts, factor: float, most: float) -> Problem:

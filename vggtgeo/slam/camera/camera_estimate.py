@@ -75,8 +75,8 @@ class CameraEstimate:
 
     @property
     def calibrated(self) -> bool:
-        """Whether the camera was given, not guessed."""
-        return was_given(self.given, self.sigma, self.self_calibrated)
+        """Whether the camera was given, not guessed. The `sigma` of a self-calibrated one may be small, too."""
+        return bool(not self.self_calibrated and self.sigma[0] < GUESSED * self.given[0])
 
     def window_sigma(self, keyframes: int) -> np.ndarray:
         """Return the prior standard deviation of the intrinsics in a window, float64 [4], pixels.
@@ -87,11 +87,3 @@ class CameraEstimate:
         if not self.self_calibrated and (self.calibrated or keyframes >= MIN_KEYFRAMES_FOR_CAMERA):
             return self.sigma
         return np.full(4, KNOWN_SIGMA * self.given[0])
-
-
-def was_given(given: np.ndarray, sigma: np.ndarray, self_calibrated: bool) -> bool:
-    """Return whether a prior of the intrinsics, mean and standard deviation in pixels, belongs to a given camera.
-
-    self_calibrated: its `sigma` may be a small share of `given`, too, far from the guess.
-    """
-    return bool(not self_calibrated and sigma[0] < GUESSED * given[0])

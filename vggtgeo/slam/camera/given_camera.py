@@ -30,6 +30,7 @@ from scipy.stats import chi2 as chi_square
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import TINY
 from vggtgeo.slam.camera.camera_comparison import CHANCE, gain
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
 from vggtgeo.slam.camera.pairwise_intrinsics import CameraPair, PairwiseIntrinsics, pairwise_intrinsics
@@ -69,12 +70,10 @@ class RefinedCamera:
 
     state: the map with the new camera; None if no trial was made. given, wanted: float64 [4], fx, fy, cx, cy before and
     after, pixels. gain: mean decrease of a held-out match's robust energy; needed: the decrease that is significant.
-    distortion: k1 of the lens, and its standard deviation.
     """
 
     given: np.ndarray
     wanted: np.ndarray
-    distortion: tuple[float, float]
     state: State | None = None
     gain: float = 0.0
     needed: float = float("inf")
@@ -100,18 +99,18 @@ def refine_given_camera(pairs: list[CameraPair], problem: Problem, state: State,
     if estimate is None:
         return None
     wanted, reason = _averaged(estimate, given)
-    distortion = float(estimate.value[3]), float(estimate.sigma[3])
     if not reason:
-        return RefinedCamera(given, given, distortion)
+        return RefinedCamera(given, given)
     held_out = _held_out(problem)
     weight = jnp.asarray(np.where(held_out, 0.0, problem.points.weight))
     training = without_surfaces(problem.with_term(problem.points.reweighted(weight)))
     held = solve(training, state)
     start = eqx.tree_at(lambda s: s.intrinsics, held, jnp.asarray(wanted))
-    moved = solve(camera_held_at(training, wanted), start)
+    prior = eqx.tree_at(lambda term: term.mean, training.intrinsics_prior, jnp.asarray(wanted))
+    moved = solve(training.with_term(prior), start)
     # Weights of the whole problem: in training the held-out matches have weight zero.
     found, needed = gain((problem, held), (problem, moved), held_out)
-    return RefinedCamera(given, wanted, distortion, moved, found, needed)
+    return RefinedCamera(given, wanted, moved, found, needed)
 
 
 def estimate_with_map(problem: Problem, state: State, solve: Solve) -> tuple[Problem, RefinedCamera]:
@@ -126,18 +125,12 @@ def estimate_with_map(problem: Problem, state: State, solve: Solve) -> tuple[Pro
     # No matches are held out: four parameters do not overfit thousands of matches.
     better = gain((problem, state), (free, moved), np.asarray(problem.points.present()), fitted=len(given))
     wanted = np.asarray(moved.intrinsics, np.float64)
-    return free, RefinedCamera(given, wanted, (0.0, float("inf")), moved, *better)
+    return free, RefinedCamera(given, wanted, moved, *better)
 
 
 def calibration_sigma(given: np.ndarray) -> np.ndarray:
     """Return the standard deviation of given intrinsics, float64 [4], pixels."""
     return float(given[0]) * np.array([FOCAL_SIGMA, FOCAL_SIGMA, CENTRE, CENTRE])
-
-
-def camera_held_at(problem: Problem, intrinsics: np.ndarray) -> Problem:
-    """Return the problem with another mean of the prior on the intrinsics."""
-    prior = problem.intrinsics_prior
-    return problem.with_term(eqx.tree_at(lambda term: term.mean, prior, jnp.asarray(intrinsics)))
 
 
 def keyframe_pairs(
@@ -180,7 +173,7 @@ def _averaged(estimate: PairwiseIntrinsics, given: np.ndarray) -> tuple[np.ndarr
     shares, directions = np.linalg.eigh(estimate.covariance[:3, :3] * np.outer(units, units))
     kept = shares <= SHARE
     along = directions.T @ (units * estimate.value[:3])
-    sure = float(np.sum(along[kept] ** 2 / np.maximum(shares[kept], 1e-12)))
+    sure = float(np.sum(along[kept] ** 2 / np.maximum(shares[kept], TINY)))
     step = directions @ np.where(kept, along / (1.0 + shares), 0.0) / units
     wanted = np.array([*(given[:2] * np.exp(step[0])), *(given[2:] + step[1:])])
     return wanted, bool(kept.any()) and sure > float(chi_square.isf(CHANCE, np.count_nonzero(kept)))

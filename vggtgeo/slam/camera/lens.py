@@ -31,6 +31,7 @@ from jaxtyping import Float
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.camera import Camera, Undistorter
+from vggtgeo.geometry.robust import TINY
 from vggtgeo.models.classical.pixel_matcher import PixelDescriptors
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.camera.camera_comparison import Shifts, carried, gain, match_energies, pinhole_of, shifted_problem
@@ -124,9 +125,9 @@ def _is_camera(pinhole: np.ndarray) -> bool:
 def _step(hessian: np.ndarray, gradient: np.ndarray, largest: float) -> np.ndarray:
     """Return the step of Newton's method, downhill also where the energy curves down, not longer than `largest`."""
     curvature, directions = np.linalg.eigh(hessian)
-    bounded = np.maximum(np.abs(curvature), 1e-9)
+    bounded = np.maximum(np.abs(curvature), TINY)
     step: np.ndarray = -directions @ ((directions.T @ gradient) / bounded)
-    return step * min(1.0, largest / np.abs(step).max(initial=1e-12))
+    return step * min(1.0, largest / np.abs(step).max(initial=TINY))
 
 
 def _updated(hessian: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
@@ -231,7 +232,7 @@ def composed(first: Camera, second: Camera) -> Camera:
     Its distortion (k1, k2, p1, p2) is the least-squares fit to both over the image; p1 and p2 are of the principal
     point, which the second may have elsewhere.
     """
-    across, down = np.meshgrid(np.linspace(0, second.width - 1, 20), np.linspace(0, second.height - 1, 20))
+    across, down = np.meshgrid(*(np.linspace(0, side - 1, 20) for side in (second.width, second.height)))
     ideal = np.column_stack([across.ravel(), down.ravel()])
     fx, fy, cx, cy = second.intrinsics
     rays, drawn = ((pixels - [cx, cy]) / [fx, fy] for pixels in (ideal, first.distorted(second.distorted(ideal))))

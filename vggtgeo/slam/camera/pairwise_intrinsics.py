@@ -20,9 +20,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student_t
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import inverse_information
 from vggtgeo.slam.threads import map_in_threads
 
 MIN_PAIRS = 8
@@ -34,18 +34,17 @@ MIN_BLOCKS = PARAMETERS + 2
 ITERATIONS, CONVERGED = 20, 0.002
 """Iteration limit, and the step, as a share of the longest one, that ends the iteration. Half the focal length is seven
 of the longest steps away."""
-POSE_ITERATIONS = 4
-"""Gauss-Newton iterations from poses that were right for other intrinsics."""
 BATCH = 200
 """Pairs per batch, of some hundred points each: 20 MB."""
 HUBER = 1.0
 """Width of the kernel, pixels: the noise of a match."""
 MAX_RESIDUAL = 30.0
 """Pixels: larger residuals are outliers and have no weight."""
-PRIOR = np.array([0.5, 300.0, 300.0, 1.0])
+LONGEST_STEP = np.array([0.1, MAX_RESIDUAL, MAX_RESIDUAL, 0.1])
+"""Longest step of an iteration, in which the linearisation holds: 10 % of the focal length, 0.1 of k1, and pixels: a
+longer one would make outliers of all matches."""
+PRIOR = 10 * LONGEST_STEP
 """Standard deviations: so weak that they only keep the problem solvable."""
-LONGEST_STEP = np.array([0.1, 30.0, 30.0, 0.1])
-"""Longest step of an iteration, in which the linearisation holds: 10 % of the focal length, 30 pixels, 0.1 of k1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,25 +52,16 @@ class PairwiseIntrinsics:
     """The estimate: change of the intrinsics against those that it started from.
 
     value: float64 [4], log factor on the focal lengths, shift of the principal point (x, y, pixels), coefficient k1.
-    covariance: float64 [4, 4], from `blocks` independent blocks of time. better: share of the pairs that the new camera
-    fits better than the initial one, each pose free (1 if not computed); better_half: the largest such share in half of
-    the time.
+    covariance: float64 [4, 4], from independent blocks of time.
     """
 
     value: np.ndarray
     covariance: np.ndarray
-    blocks: int
-    better: float = 1.0
-    better_half: float = 1.0
 
     @property
     def sigma(self) -> np.ndarray:
         """Standard deviations, float64 [4]."""
         return np.sqrt(np.diag(self.covariance))
-
-    def quantile(self, chance: float) -> float:
-        """Return the two-sided quantile of Student's t at this significance level, in standard deviations."""
-        return float(student_t.isf(chance / 2, self.blocks - PARAMETERS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,40 +75,24 @@ class CameraPair:
     block: int
 
 
-def pairwise_intrinsics(
-    pairs: Sequence[CameraPair], intrinsics: np.ndarray, compared: bool = False
-) -> PairwiseIntrinsics | None:
-    """Estimate the intrinsics, starting at `intrinsics` and the pairs' poses; return None if there are too few pairs.
-
-    compared: also compute `better` and `better_half`, which takes longer than the solve.
-    """
+def pairwise_intrinsics(pairs: Sequence[CameraPair], intrinsics: np.ndarray) -> PairwiseIntrinsics | None:
+    """Estimate the intrinsics, starting at `intrinsics` and the pairs' poses; return None for too few pairs."""
     kinds, block = np.unique([pair.block for pair in pairs], return_inverse=True)
     count = len(kinds)
     if len(pairs) < 2 * MIN_PAIRS or count < MIN_BLOCKS:
         return None
     points = _Points.of(pairs)
-    value, poses, reduced = _solved(points, intrinsics)
+    value, reduced = _solved(points, intrinsics)
     inverse = np.linalg.inv(reduced.normal.sum(0) + np.diag(1 / PRIOR**2))
     blocks = np.zeros((count, PARAMETERS))
     np.add.at(blocks, block, reduced.gradient)
     # Correct the sandwich for the degrees of freedom that the fit takes from few blocks.
     covariance = count / (count - PARAMETERS) * (inverse @ blocks.T @ blocks @ inverse)
-    if not compared:
-        return PairwiseIntrinsics(value, covariance, count)
-    better = _costs(points, poses, value, intrinsics) < _costs(points, points.given, np.zeros(4), intrinsics)
-    return PairwiseIntrinsics(value, covariance, count, float(np.mean(better)), _in_best_half(better, block))
+    return PairwiseIntrinsics(value, covariance)
 
 
-def _in_best_half(better: np.ndarray, block: np.ndarray) -> float:
-    """Return the largest share of `better` bool [n] in half of the time, consecutive blocks. block: int [n]."""
-    found, pairs = (np.bincount(block, weights) for weights in (better, None))
-    half = (len(pairs) + 1) // 2
-    inside = lambda values: np.convolve(values, np.ones(half), "valid")
-    return float(np.max(inside(found) / inside(pairs)))
-
-
-def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray, _Reduced]:
-    """Return intrinsics, poses, and the normal equations of the last step."""
+def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, _Reduced]:
+    """Return the intrinsics, and the normal equations of the last step."""
     value, poses = np.zeros(4), points.given
     reduced = _reduce(points, poses, value, intrinsics)
     for _ in range(ITERATIONS):
@@ -129,7 +103,7 @@ def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, np.nda
         if np.all(np.abs(step) < CONVERGED * LONGEST_STEP):
             break
         reduced = _reduce(points, poses, value, intrinsics)
-    return value, poses, reduced
+    return value, reduced
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,10 +131,6 @@ class _Points:
         of = slice(start, end)
         return _Points(self.before[of], self.after[of], self.depth[of], self.pair[of] - own.start, self.given[own])
 
-    def residuals(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-        """Return predicted minus observed pixels, float64 [n, 2]; NaN behind a camera. poses: float64 [pairs, 4, 4]."""
-        return self._carried(poses, value, intrinsics).pixels - self.after
-
     def _carried(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Carried:
         focal = intrinsics[:2] * np.exp(value[0])
         bent = (self.before - intrinsics[2:] - value[1:3]) / focal
@@ -170,13 +140,13 @@ class _Points:
         turns = poses[self.pair, :3, :3]
         local = np.column_stack([x, np.ones(len(x))]) * self.depth[:, None]
         points = (turns @ local[:, :, None])[:, :, 0] + poses[self.pair, :3, 3]
-        z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
+        z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
         y = points[:, :2] / z[:, None]
         return _Carried(bent, x, turns, points, z, y, y * _stretch(y, value[3]) * focal + intrinsics[2:] + value[1:3])
 
     def linearized(self, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
         """Return derivatives of the residuals by a left tangent of the pose (translation first) and by the camera, and
-        the residuals, float64 [n, 2, 6 + 4 + 1].
+        the residuals (predicted minus observed pixels), float64 [n, 2, 6 + 4 + 1]; NaN behind a camera.
         """
         now = self._carried(poses, value, intrinsics)
         focal = intrinsics[:2] * np.exp(value[0])
@@ -200,12 +170,12 @@ class _Points:
         rows = np.empty((len(self.depth), 2, 6 + PARAMETERS + 1))
         rows[:, :, :3] = onto
         rows[:, :, 3:6] = np.cross(now.points[:, None], onto)
-        rows[:, :, 6:10] = onto @ (now.turns[:, :, :2] @ rays) * self.depth[:, None, None]
+        rows[:, :, 6:-1] = onto @ (now.turns[:, :, :2] @ rays) * self.depth[:, None, None]
         rows[:, :, 6] += now.y * _stretch(now.y, k1) * focal
         rows[:, 0, 7] += 1.0
         rows[:, 1, 8] += 1.0
-        rows[:, :, 9] += now.y * square(now.y) * focal
-        rows[:, :, 10] = now.pixels - self.after
+        rows[:, :, -2] += now.y * square(now.y) * focal
+        rows[:, :, -1] = now.pixels - self.after
         return rows
 
 
@@ -226,16 +196,6 @@ class _Carried(NamedTuple):
 def _stretch(points: np.ndarray, k1: float) -> np.ndarray:
     """Return the radial distortion factor at points [n, 2] (normalised), float64 [n, 1]."""
     return 1.0 + k1 * np.sum(points**2, 1, keepdims=True)
-
-
-def _costs(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Return the robust cost of each pair with given intrinsics, after optimising its pose."""
-    for _ in range(POSE_ITERATIONS):
-        poses = rigid.moved(poses, _reduce(points, poses, value, intrinsics).pose_steps(np.zeros(4)))
-    off = np.linalg.norm(points.residuals(poses, value, intrinsics), axis=1)
-    off = np.where(np.isfinite(off), np.minimum(off, MAX_RESIDUAL), MAX_RESIDUAL)
-    cost = np.where(off < HUBER, off**2 / 2, HUBER * (off - HUBER / 2))
-    return np.bincount(points.pair, cost, len(poses))
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,15 +225,15 @@ def _reduce(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: n
 
 def _reduce_part(points: _Points, poses: np.ndarray, value: np.ndarray, intrinsics: np.ndarray) -> _Reduced:
     rows = points.linearized(poses, value, intrinsics)
-    size = np.linalg.norm(rows[:, :, 10], axis=1)
+    size = np.linalg.norm(rows[:, :, -1], axis=1)
     good = np.isfinite(rows).all((1, 2)) & (size < MAX_RESIDUAL)
-    weight = np.where(good, np.minimum(HUBER / np.maximum(size, 1e-9), 1.0), 0.0)
+    weight = np.where(good, HUBER / np.maximum(size, HUBER), 0.0)
     rows = np.where(good[:, None, None], rows, 0.0) * np.sqrt(weight)[:, None, None]
     ends = np.searchsorted(points.pair, np.arange(len(poses) + 1))
-    flat = [rows[start:end].reshape(-1, 11) for start, end in pairwise(ends)]
+    flat = [rows[start:end].reshape(-1, rows.shape[-1]) for start, end in pairwise(ends)]
     squares = np.array([own.T @ own for own in flat])  # Hessian and gradient, [pairs, 11, 11]
-    hessian, gradient = squares[:, :10, :10], squares[:, :10, 10]
-    inverse = np.linalg.inv(hessian[:, :6, :6] + 1e-6 * np.eye(6))
+    hessian, gradient = squares[:, :-1, :-1], squares[:, :-1, -1]
+    inverse = inverse_information(hessian[:, :6, :6])
     cross, own = hessian[:, :6, 6:], gradient[:, :6]
     back = np.swapaxes(cross, 1, 2) @ inverse
     return _Reduced(

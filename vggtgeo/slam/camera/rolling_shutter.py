@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.slam.camera.camera_comparison import (
     MIN_HOSTS,
     Shifts,
@@ -30,7 +30,6 @@ from vggtgeo.slam.camera.camera_comparison import (
     gain,
     match_energies,
     pinhole_of,
-    rays,
     shifted_problem,
 )
 from vggtgeo.slam.camera.camera_estimate import Readout
@@ -40,7 +39,7 @@ FIRST_SHIFT, CONVERGED = 1.0, 0.05
 """Median displacement of matches, pixels: the first step of the search, and the step that ends it."""
 FASTEST = 1e6
 """Pixels a second: larger velocities come from landmarks at the camera's centre."""
-PROBE = 0.05
+PROBE = CONVERGED
 """Step of the finite difference, in the same unit."""
 SOLVES = 6
 """Largest number of adjustments, in which a secant method finds the readout time."""
@@ -110,7 +109,7 @@ def image_shift(
     """Return the velocity in the image [a, b, 2] of pixels [a, b, 2] at inverse depths [a, b] under motions [a, 6],
     times the relative time of their row; zero for points that are not in front of the camera.
     """
-    ray = rays(pixels, camera)
+    ray = pinhole.rays(pixels, camera)
     with np.errstate(all="ignore"):
         moved = motion[:, None, :3] * inverse[..., None] + np.cross(motion[:, None, 3:], ray)
         velocity = (moved[..., :2] - ray[..., :2] * moved[..., 2:]) * camera[:2]

@@ -12,15 +12,9 @@ from itertools import compress
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import POSE_GATE, TINY
 from vggtgeo.slam.global_map.loop_consistency import consistent_loops
-from vggtgeo.slam.global_map.pose_graph import (
-    LOOP_GATE,
-    PoseGraph,
-    ScaleRatio,
-    solve_pose_graph,
-    solve_scales,
-    squared_distance,
-)
+from vggtgeo.slam.global_map.pose_graph import PoseGraph, ScaleRatio, solve_pose_graph, solve_scales, squared_distance
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH, longer, scaled_factor, scaled_keyframe, scaled_motion, submap_of
@@ -65,7 +59,7 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     broken = [
         factor
         for factor in closing
-        if squared_distance(factor, poses) > LOOP_GATE and _pixels(factor, slam) > MAX_LOOP_ERROR
+        if squared_distance(factor, poses) > POSE_GATE and _pixels(factor, slam) > MAX_LOOP_ERROR
     ]
     if not drifted and not broken:
         return slam, list(loops)
@@ -73,7 +67,7 @@ def correct_drift(slam: Slam, loops: Sequence[Loop]) -> tuple[Slam, list[Loop]]:
     graph = _graph(slam, motions, measured, _scales(slam, motions, loops))
     tracked = graph.motions if slam.metric else [motion.of_free_length() for motion in graph.motions]
     # Before the solve: with several wrong loops even a robust kernel may settle on their consensus.
-    sure = consistent_loops(graph.loops, tracked, LOOP_GATE, alone=np.arange(len(measured)) < len(closing))
+    sure = consistent_loops(graph.loops, tracked, POSE_GATE, alone=np.arange(len(measured)) < len(closing))
     if not sure.any():
         agreeing = [loop for loop in loops if loop.agrees(slam)]
         return _with_refused(_without(slam, closing), len(loops) - len(agreeing), len(loops)), agreeing
@@ -112,7 +106,7 @@ def spanning_tree(slam: Slam) -> tuple[list[MeasuredRelativePose], list[Measured
         if number in tree:
             factor = tree[number]
             # Adjusted poses are more accurate than the tracked motion, unless an adjustment went wrong.
-            agrees = squared_distance(factor, poses) < LOOP_GATE
+            agrees = squared_distance(factor, poses) < POSE_GATE
             motions.append(replace(factor, pose=between(factor.first, factor.second)) if agrees else factor)
         elif (number - 1, number) in matched:
             motions.append(MeasuredRelativePose(number - 1, number, between(number - 1, number), loose))
@@ -133,7 +127,7 @@ def _graph(
     inside = lambda measured: scaled_motion(measured, float(scales[measured.first]))
     scaled_motions, scaled_loops = tuple(map(inside, motions)), tuple(map(inside, loops))
     poses = np.array([keyframe.pose for keyframe in slam.keyframes])
-    start = np.array([longer(pose, scale) for pose, scale in zip(poses, scales, strict=True)])
+    start = longer(poses, scales)
     label = submap_of(slam.with_factors(*loops).map)
     fixed = np.zeros(len(poses), bool)
     fixed[np.unique(label, return_index=True)[1]] = True
@@ -185,4 +179,4 @@ def _largest_move(before: Slam, after: Slam) -> str:
     if after.metric:
         return f"{moved:.2f} m"
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
-    return f"{100 * moved / max(extent, 1e-12):.0f} % of the extent of the path"
+    return f"{100 * moved / max(extent, TINY):.0f} % of the extent of the path"

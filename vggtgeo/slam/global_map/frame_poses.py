@@ -37,8 +37,6 @@ STEPS, CONVERGED = 15, 1e-5
 """Iteration limit; step, metres and radians, that ends the iteration: far below the noise of a pose."""
 MIN_NOISE = 0.01
 """Smallest noise of a match, pixels: of their rounding."""
-MAX_DEPTH = 1e6
-"""Largest depth that is used, in map units; the smallest is that of depth sensors."""
 
 _FOUND: WeakKeyDictionary[Slam, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
 """Poses by the state that they are of, which never changes: the outputs of a run ask for them again and again, and each
@@ -97,7 +95,7 @@ def _seen_points(
     assert record.seen is not None
     keyframe, slots = slam.keyframes[record.reference], record.seen.slots
     inverse = keyframe.points.inverse_depth[slots]
-    known = np.isfinite(inverse) & (inverse > 1 / MAX_DEPTH)
+    known = np.isfinite(inverse) & (inverse > 0)
     inverse, own = inverse[known], keyframe.points.pixels[slots[known]]
     pixels = record.seen.pixels[known].astype(np.float64)
     if motions is None or readout is None:

@@ -16,11 +16,10 @@ from vggtgeo.slam.global_map.pose_graph import ScaleRatio
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import NO_LINES, Pair, overlap, some_points
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import PIXEL_SIGMA, Keyframe
 from vggtgeo.slam.sparse_map.map import measured_ratio, submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
-from vggtgeo.slam.tracking.frame_tracking import PIXEL_SIGMA
 
 MIN_VISIBLE, MAX_TURN = 0.4, np.deg2rad(40)
 """Share of one keyframe's points inside the other's image, and angle between them, for a pair to be proposed."""

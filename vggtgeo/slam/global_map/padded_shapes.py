@@ -19,7 +19,7 @@ from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.factors import Factor, MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.window.sliding_window import TOLERANCE, window_size
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced_solvers import DenseCholesky
+from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 SMALL = (16, 64)
 """Keyframes of the smallest shapes; larger ones: 96, 128, 192, 256, ..."""
@@ -78,7 +78,7 @@ def shape_of(
 
 def padded_count(count: int) -> int:
     """Return the smallest of 16, 64, 96, 128, 192, 256, ... that is at least `count`: at most a third is padding."""
-    larger = (size << doubled for doubled in itertools.count() for size in (96, 128))
+    larger = (size << doubled for doubled in itertools.count() for size in (3 * SMALL[-1] // 2, 2 * SMALL[-1]))
     return next(size for size in itertools.chain(SMALL, larger) if size >= count)
 
 
@@ -92,9 +92,10 @@ def padded_edges(edges: int, keyframes: int) -> int:
 
 def global_solver(problem: Problem) -> SchurLevenbergMarquardt:
     """Return the solver for the adjustment of a whole map, given as its problem."""
-    small = problem.num_keyframes <= MAX_DENSE
-    return SchurLevenbergMarquardt(
-        max_iterations=MAX_ITERATIONS,
-        rtol=TOLERANCE,
-        reduced_solver=DenseCholesky() if small else choose_reduced_solver(problem),
-    )
+    reduced = global_reduced_solver(problem)
+    return SchurLevenbergMarquardt(max_iterations=MAX_ITERATIONS, rtol=TOLERANCE, reduced_solver=reduced)
+
+
+def global_reduced_solver(problem: Problem) -> AbstractReducedSolver:
+    """Return the linear solver for the poses of a whole map."""
+    return DenseCholesky() if problem.num_keyframes <= MAX_DENSE else choose_reduced_solver(problem)

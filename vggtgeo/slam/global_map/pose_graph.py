@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,34 +31,27 @@ from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solution import Graduation, Solution, solution_like, solve
-from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.bundle.terms.measured_pose import RelativePose
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import POSE_GATE
-from vggtgeo.slam.global_map.padded_shapes import padded_count
+from vggtgeo.slam.global_map.padded_shapes import global_reduced_solver, padded_count
 from vggtgeo.slam.sparse_map.factors import FACTOR_WIDTH, MeasuredRelativePose, relative_pose_rows
+from vggtgeo.slam.tracking.accumulated_odometry import Odometry
 from vggtgeo.slam.tracking.pose_acceptance import STEP_GROWTH, tangent
 from vggtgeo.solvers.kernels import Cauchy
 from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
-from vggtgeo.solvers.reduced_solvers import DenseCholesky
 
-LOOP_GATE = POSE_GATE
-"""Squared Mahalanobis distance above which a loop is false: one true loop in 10,000 is lost."""
-GRADUATION = Graduation(factors=(256.0, 64.0, 16.0, 4.0), iterations=6)
+GRADUATION = Graduation(factors=tuple(4.0**k for k in range(4, 0, -1)), iterations=6)
 """A loop of 2 cm against 10 m of drift has a residual of 500 standard deviations, half of the first width."""
 ROOM = 32
 """Loops are padded to a multiple of this, and poses to `padded_count`: a graph of about the same size compiles
 nothing."""
-DENSE_POSES = 200
-"""Poses up to which the factor is dense, for any loops; about 20 ms."""
 DRIFT = 0.01
 """Standard deviation of the change of scale from one keyframe to the next."""
-GUESSED = STEP_GROWTH
-"""The same if the length of the motion between them was taken from the motion so far."""
 MIN_RATIO_ERROR = 0.03
 """Smallest standard deviation of the logarithm of a measured ratio: what its points have in common."""
-WIDTHS = (1024.0, 256.0, 64.0, 16.0, 4.0, 2.5, 2.5, 2.5)
+WIDTHS = tuple(max(4.0**k, 2.5) for k in range(5, -3, -1))
 """Widths of the Cauchy kernel on ratios, one reweighting each, in standard deviations: graduated, since after a large
 drift true ratios have residuals as large as false ones."""
 
@@ -68,7 +60,7 @@ def _solve_graph(problem: Problem, initial: State, solver: SchurLevenbergMarquar
     return solve(problem, initial, solver=solver, graduation=GRADUATION, diagnosis=False)
 
 
-solve_graph_jit = CachedProgram(_solve_graph, partial(solution_like, diagnosis=False))
+solve_graph_jit = CachedProgram(_solve_graph, solution_like)
 
 
 class LoopClosure(RelativePose):
@@ -103,7 +95,7 @@ def solve_pose_graph(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
     room = -(-max(len(graph.loops), 1) // ROOM) * ROOM
     loops = LoopClosure(**relative_pose_rows(graph.loops, room), kernel=Cauchy(jnp.asarray(FACTOR_WIDTH)))
     problem, initial, _ = pack(
-        _no_observations(),
+        Observations(np.zeros((0, 2), int), np.zeros(0, int), np.zeros((0, 2))),  # a graph of poses alone
         rigid.to_quaternion(np.concatenate([graph.poses, np.tile(np.eye(4), (padding, 1, 1))])),
         Intrinsics(np.array([1.0, 1.0, 0.0, 0.0]), fixed=True),
         np.zeros(0),
@@ -111,14 +103,12 @@ def solve_pose_graph(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
         fixed_pose=np.concatenate([graph.fixed, np.ones(padding, bool)]),
         terms=(motions, loops),
     )
-    small = count <= DENSE_POSES
-    reduced = DenseCholesky() if small else choose_reduced_solver(problem)
-    solver = SchurLevenbergMarquardt(rtol=1e-6, reduced_solver=reduced)
+    solver = SchurLevenbergMarquardt(rtol=1e-6, reduced_solver=global_reduced_solver(problem))
     solution = solve_graph_jit(problem, initial, solver)
     poses = rigid.to_matrix(np.asarray(solution.state.poses.wxyz_xyz, np.float64)[:count])
     if not np.isfinite(poses).all():
         return graph.poses, np.zeros(len(graph.loops), bool)
-    return poses, np.array([squared_distance(loop, poses) < LOOP_GATE for loop in graph.loops], bool)
+    return poses, np.array([squared_distance(loop, poses) < POSE_GATE for loop in graph.loops], bool)
 
 
 def squared_distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float:
@@ -130,51 +120,11 @@ def squared_distance(measured: MeasuredRelativePose, poses: np.ndarray) -> float
 
 def drift_variance(graph: PoseGraph) -> float:
     """Return the factor on the covariance of the motions that makes the loops likely; at least 1."""
-    parent = np.full(len(graph.poses), -1)
-    # Errors of a motion as right perturbations of the pose: seen from the world they add up along the way.
-    summed, spread = graph.poses.copy(), np.zeros((len(graph.poses), 6, 6))
-    for motion in sorted(graph.motions, key=lambda motion: motion.second):
-        parent[motion.second] = motion.first
-        summed[motion.second] = motion.pose @ summed[motion.first]
-        carry = rigid.adjoint(rigid.invert(summed[motion.second]))
-        spread[motion.second] = spread[motion.first] + carry @ np.linalg.inv(motion.information) @ carry.T
-    distances = []
-    for loop in graph.loops:
-        meeting = _meeting(parent, loop.first, loop.second)
-        if meeting < 0:
-            continue
-        carry = rigid.adjoint(summed[loop.second])
-        drift = carry @ (spread[loop.first] + spread[loop.second] - 2 * spread[meeting]) @ carry.T
-        off = tangent(loop.pose @ summed[loop.first] @ rigid.invert(summed[loop.second]))
-        distances.append(off @ np.linalg.solve(drift + np.linalg.inv(loop.information), off))
-    if not distances:
-        return 1.0
+    odometry = Odometry.of(graph.motions, len(graph.poses), systematic=False)
+    distances = odometry.distances(graph.loops, growth=1.0)
+    known = distances[np.isfinite(distances)]
     # At least 1: few loops that agree by chance do not make odometry better than it states.
-    return float(max(np.median(distances) / chi_square.ppf(0.5, 6), 1.0))
-
-
-def _meeting(parent: np.ndarray, first: int, second: int) -> int:
-    """Return the node at which the ways of two keyframes to the root meet; -1 for different roots."""
-    while first != second and first >= 0 and second >= 0:
-        if first > second:
-            first = int(parent[first])
-        else:
-            second = int(parent[second])
-    return first if first == second else -1
-
-
-def _no_observations() -> Observations:
-    """Return empty observations: a graph of poses alone."""
-    none, nowhere = np.zeros(0, int), np.zeros((0, 2))
-    return Observations(
-        edges=np.zeros((0, 2), int),
-        host=none,
-        pixel=nowhere,
-        point_edge=none,
-        point_landmark=none,
-        point_target=nowhere,
-        point_weight=np.zeros(0),
-    )
+    return float(max(np.median(known) / chi_square.ppf(0.5, 6), 1.0)) if len(known) else 1.0
 
 
 @dataclass(frozen=True)
@@ -205,7 +155,7 @@ def solve_scales(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios
         values = np.tile([-1.0, 1.0], len(first)) * np.repeat(np.sqrt(weight) / sigma, 2)
         design = coo_array((values, (rows, np.stack([first, second], 1).ravel())), shape).tocsc()
         target = np.sqrt(weight) * measured / sigma
-        # The weak hold of every logarithm at 0 decides for keyframes that nothing ties to the first.
+        # A weak prior of every logarithm at 0 decides for keyframes that nothing connects to the first.
         normal = design.T @ design + coo_array((np.full(keyframes, 1e-6), (np.arange(keyframes),) * 2)).tocsc()
         logs = np.asarray(spsolve(normal, design.T @ target))
         logs -= logs[0]
@@ -222,7 +172,7 @@ def scale_drift(motion: MeasuredRelativePose) -> float:
     """
     length = float(np.linalg.norm(motion.pose[:3, 3]))
     if motion.by_two_view or length == 0:
-        return GUESSED
+        return STEP_GROWTH
     along = motion.pose[:3, 3] / length
     sigma = float(np.sqrt(along @ np.linalg.inv(motion.information)[:3, :3] @ along))
-    return min(math.hypot(DRIFT, sigma / length), GUESSED)
+    return min(math.hypot(DRIFT, sigma / length), STEP_GROWTH)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from vggtgeo.geometry import lie, rigid
+from vggtgeo.geometry.robust import POSE_GATE
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.tracking.frame_refinement import by_both
-from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE
 from vggtgeo.slam.tracking.tracking_state import FramePose
 
-GROSS = SHARED_ERRORS * AGREEMENT_GATE
+GROSS = SHARED_ERRORS * POSE_GATE
 """Squared Mahalanobis distance between the tracked and the adjusted pose of a keyframe above which its tracking was an
 outlier: its correction is then not distributed over the frames before it."""
 MAX_GAP = 3.0

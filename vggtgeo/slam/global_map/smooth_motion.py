@@ -20,13 +20,11 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.linalg import spsolve
 
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.robust import sigma_by_median
+from vggtgeo.geometry.robust import REGULARISER, sigma_by_median
 from vggtgeo.slam.global_map.propagated_poses import MAX_GAP
 
 ROUNDS, WIDTH = 10, 3.0
 """Reweighted solutions, and the width of the kernel in standard deviations."""
-FLOOR = 1e-9
-"""Information that is added, so that a frame that nothing determines has a place."""
 
 
 def smoothed(
@@ -52,8 +50,8 @@ def smoothed(
         return poses
     centres, turned = rigid.centres(poses), poses[rows, :3, :3]
     accelerations = motion @ centres
-    sigma = max(sigma_by_median(accelerations), FLOOR)
-    known = information[rows] + FLOOR * np.eye(6)
+    sigma = max(sigma_by_median(accelerations), REGULARISER)
+    known = information[rows] + REGULARISER * np.eye(6)
     # A displacement `d` of the centre is the translation `-R d` of the tangent; the rotation is eliminated.
     follows = np.linalg.solve(known[:, 3:, 3:], known[:, 3:, :3])
     places = turned.mT @ (known[:, :3, :3] - known[:, :3, 3:] @ follows) @ turned

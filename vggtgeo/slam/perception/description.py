@@ -11,9 +11,6 @@ import numpy as np
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 
-SAME_CAMERA = 1e-3
-"""Pixels: intrinsics that differ by less give the same view. Those of a known camera, weakly free, change by less."""
-
 
 class Description:
     """Key points and descriptors of one frame, computed on first access, and its view for the alignment if it was
@@ -47,6 +44,7 @@ class Description:
 
     def view_by(self, intrinsics: np.ndarray) -> RgbdView | None:
         """Return the view if it was computed with these intrinsics, float64 [4], else None."""
-        if self._intrinsics is None or np.abs(self._intrinsics - intrinsics).max() > SAME_CAMERA:
+        # Those of a known camera, weakly free, change by less than this tolerance.
+        if self._intrinsics is None or not np.allclose(self._intrinsics, intrinsics):
             return None
         return self._view

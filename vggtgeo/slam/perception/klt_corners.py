@@ -138,9 +138,7 @@ def common_to_rows(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 def one_a_cell(ids: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Keep the oldest track of each cell; ids grow with time, and rows are in their order."""
-    cells = (pixels // CELL).astype(int)
-    _, first = np.unique(cells[:, 0] + 10_000 * cells[:, 1], return_index=True)
-    kept = np.sort(first)
+    kept = np.sort(np.unique(pixels // CELL, axis=0, return_index=True)[1])
     return ids[kept], pixels[kept]
 
 
@@ -187,5 +185,5 @@ def small_grey(image: np.ndarray) -> np.ndarray:
     around = cv2.blur(cv2.blur(levels, square), square)
     detail = levels - LIGHT_REMOVED * around - (1 - LIGHT_REMOVED) * mean
     detail *= mean / np.maximum(around, DARKEST * mean)
-    gain = min(CONTRAST / max(deviation, 1e-3), 4.0)
+    gain = CONTRAST / max(deviation, CONTRAST / 4.0)
     return np.clip(gain * detail + 128.0, 0, 255).astype(np.uint8)

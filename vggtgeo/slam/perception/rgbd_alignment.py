@@ -26,7 +26,7 @@ from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera import Camera
-from vggtgeo.geometry.robust import MAD_SIGMA, TUKEY
+from vggtgeo.geometry.robust import MAD_SIGMA, REGULARISER, TINY, TUKEY
 from vggtgeo.slam.perception.rgbd_view import LEVELS, Points, RgbdView
 
 MAX_DISTANCE = 0.15
@@ -52,18 +52,15 @@ class Aligned:
     """The result of an alignment.
 
     motion: float64 [4, 4], source camera -> target camera. information: float64 [6, 6] over its left tangent
-    (translation first, 1/m^2 and 1/rad^2), neighbouring samples counted as one. edges, surface: share of the samples in
-    view that agree with the motion, in [0, 1], NaN where there are too few. edge_count, surface_count: samples in view.
-    correlation: of the brightness of all edge samples in view, NaN without any. overlap: share of the source's surface
-    that falls on a known depth of the target.
+    (translation first, 1/m^2 and 1/rad^2), neighbouring samples counted as one. surface: share of the surface samples
+    in view that agree with the motion, in [0, 1], NaN where there are too few. correlation: of the brightness of all
+    edge samples in view, NaN without any. overlap: share of the source's surface that falls on a known depth of the
+    target.
     """
 
     motion: np.ndarray
     information: np.ndarray
-    edges: float
     surface: float
-    edge_count: int
-    surface_count: int
     correlation: float
     overlap: float
 
@@ -103,10 +100,7 @@ class RgbdAlignment:
         return Aligned(
             np.array(motion),
             np.array(information),
-            edges=float(terms.edges.share),
             surface=float(terms.surface.share),
-            edge_count=int(terms.edges.number) if terms.edges.enough else 0,
-            surface_count=seen,
             correlation=float(terms.correlation),
             overlap=seen / max(source.surface.count, 1),
         )
@@ -179,7 +173,7 @@ JUDGED, DONE = -1, -2
 def compile_alignment(camera: Camera) -> None:
     """Compile the alignment for images of this camera."""
     black, wall = np.zeros((camera.height, camera.width, 3), np.uint8), np.ones((camera.height, camera.width))
-    view = RgbdView.of(black, (wall, 0.01 * wall), np.array(camera.intrinsics, np.float64))
+    view = RgbdView.of(black, (wall, wall), np.array(camera.intrinsics, np.float64))
     RgbdAlignment().align(view, view, np.eye(4))
 
 
@@ -221,7 +215,7 @@ def _aligned(
         hessian, gradient, terms = at(carry.motion, level)
         diagonal = jnp.diag(hessian)
         # Light Levenberg-Marquardt damping: the information that is returned is that of the undamped system.
-        damped = hessian + jnp.diag(1e-3 * diagonal + 1e-9 * diagonal.sum() + 1e-9)
+        damped = hessian + jnp.diag(1e-3 * diagonal + REGULARISER * (1.0 + diagonal.sum()))
         change = -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(damped), True), gradient)
         count = carry.number + 1
         converged = jnp.abs(change).max() < jnp.where(level == 0, CONVERGED, 10 * CONVERGED)
@@ -262,9 +256,9 @@ def _brightness(edges: _Samples, target: _Target, level: jax.Array, motion: jax.
     value, dx, dy = _between_pixels(target.picture, u, v, width, offset)
     value, reference = jnp.where(seen, value, 0), jnp.where(seen, edges.values[level], 0)
     both, square = value @ reference, reference @ reference
-    correlation = both / (jnp.sqrt((value @ value) * square) + 1e-9)
+    correlation = both / jnp.maximum(jnp.sqrt((value @ value) * square), TINY)
     # Ratio of the exposures by least squares, in closed form.
-    exposure = jnp.clip(both / (square + 1e-9), 0.6, 1.7)
+    exposure = jnp.clip(both / jnp.maximum(square, TINY), 0.6, 1 / 0.6)
     along_x, along_y = fx * dx / z, fy * dy / z
     by_point = jnp.stack([along_x, along_y, -(along_x * x[0] + along_y * x[1]) / z])
     return _Term(_by_motion(x, by_point), value - exposure * reference, seen), correlation

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.robust import TINY
 
 WIDTH = 300
 """Images are reduced by a whole factor to about this width for the brightness, pixels."""
@@ -88,7 +89,7 @@ class RgbdView:
         surface, edges = Points.none(4, MAX_POINTS), Points.none(LEVELS, MAX_EDGES)
         if depth is not None and np.isfinite(depth[0]).any():
             z, sigma = _cell_means(*depth, factor * BLOCK)
-            points = _unproject_grid(z, coarse)
+            points = pinhole.grid_rays(z.shape, coarse, np.float32) * z[..., None]
             normals = surface_normals(points)
             shape, cells = z.shape, _cells(points, normals, sigma)
             surface, edges = _spread(cells), _edge_samples(levels, z, cameras[0])
@@ -119,8 +120,7 @@ def _pyramid(gray: np.ndarray) -> tuple[np.ndarray, ...]:
         image = _shrink(gray, 2**level)
         # A high-pass filter, since exposure and shading change the mean.
         value = image - cv2.GaussianBlur(image, (0, 0), BACKGROUND)
-        dx = cv2.Scharr(value, cv2.CV_32F, 1, 0, scale=1 / 32)
-        dy = cv2.Scharr(value, cv2.CV_32F, 0, 1, scale=1 / 32)
+        dx, dy = (cv2.Scharr(value, cv2.CV_32F, axis, 1 - axis, scale=1 / 32) for axis in (1, 0))
         levels.append(cv2.merge([value, dx, dy]))
     return tuple(levels)
 
@@ -139,12 +139,12 @@ def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.n
     # Holes count as zeros in both means, so dividing by the share of known pixels removes them.
     share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     mean, square = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (inverse, inverse * inverse))
-    safe = np.maximum(share, 1e-6)
+    safe = np.maximum(share, TINY)
     mean, square = mean / safe, square / safe
     spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
     # A block across a depth jump has a mean on neither surface.
     good = (share >= 0.5) & (spread < 0.05 * mean)
-    cells = np.where(good, 1.0 / np.maximum(mean, 1e-6), np.nan).astype(np.float32)
+    cells = np.where(good, 1.0 / np.maximum(mean, TINY), np.nan).astype(np.float32)
     noise = _zero_where(~known, np.array(sigma[:height, :width], np.float32))
     return cells, cells * cv2.resize(noise, size, interpolation=cv2.INTER_AREA) / safe
 
@@ -152,10 +152,6 @@ def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.n
 def _zero_where(unknown: np.ndarray, image: np.ndarray) -> np.ndarray:
     image[unknown] = 0.0
     return image
-
-
-def _unproject_grid(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    return pinhole.grid_rays(depth.shape, intrinsics, np.float32) * depth[..., None]
 
 
 def surface_normals(points: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.robust import TINY
 from vggtgeo.models.roles import Features, Segments
 
 WIDTH = 480
@@ -103,7 +104,7 @@ class StaticOverlay:
     def without_segments(self, segments: Segments) -> Segments:
         """Return the segments with neither their middle nor a quarter point on the mask."""
         ends = segments.endpoints
-        along = [pinhole.at_pixels(self.mask, (1 - t) * ends[:, 0] + t * ends[:, 1]) for t in (0.25, 0.5, 0.75)]
+        along = [pinhole.at_pixels(self.mask, (1 - t) * ends[:, 0] + t * ends[:, 1]) for t in np.arange(1, 4) / 4]
         keep = ~np.logical_or.reduce(along)
         return Segments(ends[keep], segments.scores[keep])
 
@@ -132,7 +133,7 @@ def static_overlay_of(greys: Sequence[np.ndarray], size: tuple[int, int]) -> Sta
     gradients = [_gradient(grey) for grey in greys]
     lengths = [np.linalg.norm(gradient, axis=0) for gradient in gradients]
     length = np.sum(lengths, axis=0)
-    coherence = np.linalg.norm(np.sum(gradients, axis=0), axis=0) / np.maximum(length, 1e-6)
+    coherence = np.linalg.norm(np.sum(gradients, axis=0), axis=0) / np.maximum(length, TINY)
     structured = length > MIN_GRADIENT * count
     seen = np.mean([one > MIN_GRADIENT for one in lengths], axis=0)
     often = structured & (seen > MIN_SEEN)

@@ -9,19 +9,17 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.roles import LineMatches, PointMatches, RelativeView
 from vggtgeo.slam.settings.slam_settings import Roles, check_answer
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import PIXEL_SIGMA, Keyframe
 
 MIN_MATCHES, MIN_LINE_MATCHES = 12, 4
 """Matches consistent with the tracked poses that connect two keyframes; fewer may be consistent by chance."""
-REPROJECTION_GATE = 8.0
+REPROJECTION_GATE = 4 * PIXEL_SIGMA
 """Largest reprojection error of a match by the tracked poses, pixels. Wide against the noise of a match: the poses
 are not adjusted yet. Outliers within it are left to the robust kernel."""
 EPIPOLAR_GATE = 4.0
 """The same for the epipolar distance, where depth is unknown; narrower, because it checks one direction only."""
 MIN_OVERLAP = 0.25
 """Share of a keyframe's points inside another's image required for matching."""
-GATE_SIGMA = 4.0
-"""Standard deviations within the gate of matches."""
 SAMPLES = 64
 """Key points, spread over the image, that an overlap is measured on."""
 
@@ -154,8 +152,8 @@ def _consistent(
     ray = pinhole.rays(points.pixels_i, intrinsics)
     length, focal = float(np.linalg.norm(relative[:3, 3])), float(intrinsics[0])
     # A depth too uncertain to predict the pixel within the gate would reject right matches.
-    known = first.points.known_for(length, focal, REPROJECTION_GATE / GATE_SIGMA)[points.index_i]
+    known = first.points.known_for(length, focal, PIXEL_SIGMA)[points.index_i]
     moved = ray @ relative[:3, :3].T + np.where(known, inverse, 0.0)[:, None] * relative[:3, 3]
-    off = np.linalg.norm(pinhole.project(moved, intrinsics, nearest=1e-2) - points.pixels_j, axis=1)
+    off = np.linalg.norm(pinhole.project(moved, intrinsics) - points.pixels_j, axis=1)
     epipolar = pinhole.epipolar_distance(points.pixels_i, points.pixels_j, relative, intrinsics)
     return np.where(known & length_known, off < REPROJECTION_GATE, epipolar < EPIPOLAR_GATE)

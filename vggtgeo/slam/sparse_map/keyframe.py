@@ -25,6 +25,11 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings, check_answe
 
 LINE_SPACING = 10.0
 """Pixels between the samples of a segment: closer ones would observe the same part of an edge again."""
+MIN_INVERSE_DEPTH = 1e-3
+"""Smallest initial inverse depth, 1/m."""
+PIXEL_SIGMA = 2.0
+"""Standard deviation of a match, pixels: 0.5 px of the key point, the rest from the keyframe's depth at that one pixel.
+"""
 MAX_DEPTH_ERROR = 0.2
 """Largest relative standard deviation of a depth that is used as a depth."""
 JPEG = (".jpg", (cv2.IMWRITE_JPEG_QUALITY, 95))

@@ -126,10 +126,11 @@ def measured_ratio(
     return float(np.exp(middle)), sigma_by_median(logs - middle) * float(np.sqrt(0.5 * np.pi / len(logs)))
 
 
-def longer(motion: np.ndarray, ratio: float) -> np.ndarray:
-    """Return a rigid motion, float64 [4, 4], with its translation multiplied by `ratio`."""
-    changed = motion.copy()
-    changed[:3, 3] *= ratio
+def longer(motion: np.ndarray, ratio: float | np.ndarray) -> np.ndarray:
+    """Multiply the translations of rigid motions, float64 [..., 4, 4], by ratios that broadcast to [...]."""
+    ratio = np.asarray(ratio)
+    changed = np.broadcast_to(motion, (*np.broadcast_shapes(motion.shape[:-2], ratio.shape), 4, 4)).copy()
+    changed[..., :3, 3] *= ratio[..., None]
     return changed
 
 

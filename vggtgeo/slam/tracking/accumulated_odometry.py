@@ -49,8 +49,11 @@ class Odometry:
     depth: np.ndarray
 
     @classmethod
-    def of(cls, motions: Iterable[MeasuredRelativePose], keyframes: int) -> Self:
-        """Build the forest from the first motion to each keyframe from an earlier one; others are ignored."""
+    def of(cls, motions: Iterable[MeasuredRelativePose], keyframes: int, *, systematic: bool = True) -> Self:
+        """Build the forest from the first motion to each keyframe from an earlier one; others are ignored.
+
+        systematic: whether to add systematic errors to the stated ones.
+        """
         parent, depth = np.full(keyframes, -1), np.zeros(keyframes, int)
         root = np.arange(keyframes)
         poses, spread = np.tile(np.eye(4), (keyframes, 1, 1)), np.zeros((keyframes, 6, 6))
@@ -62,8 +65,9 @@ class Odometry:
             poses[here] = rigid.orthonormal(motion.pose @ poses[before])
             # As right tangents of the pose, errors of the motions on the way add up without further transport.
             carry = rigid.adjoint(rigid.invert(poses[here]))
-            noise = np.linalg.inv(with_systematic(motion.information, motion.pose))
-            spread[here] = spread[before] + carry @ noise @ carry.T
+            stated = motion.information
+            information = with_systematic(stated, motion.pose) if systematic else stated
+            spread[here] = spread[before] + carry @ np.linalg.inv(information) @ carry.T
         return cls(parent, poses, spread, root, depth)
 
     def way(self, start: np.ndarray, end: np.ndarray) -> Way:

@@ -16,17 +16,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.robust import inverse_information
+from vggtgeo.geometry.robust import POSE_GATE, inverse_information
 from vggtgeo.models.classical import SensorDepth
 from vggtgeo.slam.perception.rgbd_alignment import Aligned, RgbdAlignment
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.threads import map_in_threads
+from vggtgeo.slam.tracking.accumulated_odometry import squared_distance
 from vggtgeo.slam.tracking.frame_tracking import view_of
 from vggtgeo.slam.tracking.local_map_tracking import in_view
 from vggtgeo.slam.tracking.pose_acceptance import MIN_CORRELATION, MIN_OVERLAP, MIN_SURFACE, TrackingQuality
-from vggtgeo.slam.tracking.pose_fusion import AGREEMENT_GATE, with_systematic
+from vggtgeo.slam.tracking.pose_fusion import with_systematic
 from vggtgeo.slam.tracking.tracking_state import FramePose, SecondMotion, Tracker, frame_pose
 
 FINEST = (4, 0, 0)
@@ -109,19 +110,11 @@ def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.nd
     off = np.concatenate([apart[:, :3, 3], Rotation.from_matrix(apart[:, :3, :3]).as_rotvec()], 1)
     # Mean of two Gaussians in the tangent space at the tracked pose: `(I1 + I2)^-1 I2 off`.
     share = np.linalg.solve(own + other, np.einsum("nij,nj->ni", other, off)[..., None])[..., 0]
-    agreeing = squared_distance(off, own, other) < AGREEMENT_GATE
+    noise = inverse_information(own) + inverse_information(other)
+    agreeing = squared_distance(placed, poses[rows], noise) < POSE_GATE
     found = poses.copy()
     found[rows] = np.where(agreeing[:, None, None], rigid.moved(poses[rows], share), poses[rows])
     return found
-
-
-def squared_distance(off: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return squared Mahalanobis distances [n] of poses `off` [n, 6] apart, in the noise of both.
-
-    first, second: information of each, [n, 6, 6].
-    """
-    noise = inverse_information(first) + inverse_information(second)
-    return np.asarray(np.einsum("ni,ni->n", off, np.linalg.solve(noise, off[..., None])[..., 0]))
 
 
 def _shows(found: Aligned) -> bool:
@@ -133,4 +126,4 @@ def _shows(found: Aligned) -> bool:
 def tracked_information(quality: TrackingQuality) -> np.ndarray:
     """Return the information [6, 6] of a tracked pose by its worst directions; zero if they are unknown."""
     sigma = np.array([quality.sigma_translation, quality.sigma_rotation])
-    return np.diag(1 / np.repeat(np.maximum(sigma, 1e-6), 3) ** 2) if np.isfinite(sigma).all() else np.zeros((6, 6))
+    return np.diag(1 / np.repeat(sigma, 3) ** 2) if np.isfinite(sigma).all() else np.zeros((6, 6))

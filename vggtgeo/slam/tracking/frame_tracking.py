@@ -25,7 +25,7 @@ from vggtgeo.slam.perception.rgbd_alignment import Aligned
 from vggtgeo.slam.perception.rgbd_view import RgbdView
 from vggtgeo.slam.settings.slam_settings import Roles
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.sparse_map.keyframe import PIXEL_SIGMA, Keyframe
 from vggtgeo.slam.tracking.flow_tracking import Located, located_by_flow
 from vggtgeo.slam.tracking.local_map_tracking import joint_matches, refine_by_map
 from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality, step_chi2, step_information, worst_sigma
@@ -41,11 +41,6 @@ from vggtgeo.slam.tracking.pose_fusion import (
 from vggtgeo.slam.tracking.tracking_state import FramePose, SeenPoints, Tracker
 from vggtgeo.slam.tracking.two_view_motion import explains_more, may_explain_more, two_view_motion
 
-PIXEL_SIGMA = 2.0
-"""Standard deviation of a match, pixels: 0.5 px of the key point, the rest from the keyframe's depth at that one pixel.
-"""
-SEARCH_RADIUS = 8.0
-"""Search radius around a projected map point, pixels: four standard deviations of a match."""
 ROUGH_RADIUS = 60.0
 """The same for a pose by the motion prior alone: its 6 degrees are 52 px at a focal length of 500."""
 
@@ -237,7 +232,7 @@ def _placed(
     if known:
         information = pose_information(guess.pose, located.points[guess.inliers], given.intrinsics, located.sigma)
         by_points = Motion(guess.pose @ rigid.invert(keyframe.pose), information)
-    quality = _quality_of(guess, located.matches, by_points, dense)
+    quality = _quality_of(guess, located.matches, dense)
     if known and not given.roles.metric:
         quality = replace(quality, metre=metre_of(located.points[guess.inliers], guess.pose))
     prior = None if given.prior is None else given.prior.motion_from(keyframe)
@@ -262,17 +257,8 @@ def refined_by_map(found: TrackedFrame, given: TrackingInput, keyframes: Iterabl
     """Return the track refined by the points of all other keyframes in view if it is weakly constrained."""
     if not weakly_constrained(Motion(found.relative, found.measured)):
         return found
-    refined = refine_by_map(
-        given.data.features,
-        tuple(keyframes),
-        found.keyframe,
-        found.pose,
-        found.information,
-        given.intrinsics,
-        with_systematic,
-        radius=SEARCH_RADIUS,
-        sigma=PIXEL_SIGMA,
-    )
+    known = found.keyframe, found.pose, found.information
+    refined = refine_by_map(given.data.features, tuple(keyframes), *known, given.intrinsics)
     if refined is None:
         return found
     # Systematic errors, which more points do not reduce, are common to all keyframes: `information` adds them once.
@@ -350,22 +336,12 @@ def _judged(
     return replace(track, quality=quality)
 
 
-def _quality_of(guess: PoseGuess, matches: int, by_points: Motion | None, dense: Aligned | None) -> TrackingQuality:
+def _quality_of(guess: PoseGuess, matches: int, dense: Aligned | None) -> TrackingQuality:
     """Return the measures of a pose by points, and of the dense alignment if there is one."""
-    quality = TrackingQuality(matches=matches, inliers=guess.inlier_count, error=guess.error)
+    quality = TrackingQuality(matches=matches, inliers=guess.inlier_count)
     if dense is None:
         return quality
-    apart = float("nan")
-    if by_points is not None:
-        apart = float(np.linalg.norm(by_points.motion[:3, 3] - dense.motion[:3, 3]))
-    return replace(
-        quality,
-        correlation=dense.correlation,
-        edges=dense.edges,
-        surface=dense.surface,
-        overlap=dense.overlap,
-        agreement=apart,
-    )
+    return replace(quality, correlation=dense.correlation, surface=dense.surface, overlap=dense.overlap)
 
 
 def view_of(keyframe: Keyframe, tracker: Tracker, intrinsics: np.ndarray, roles: Roles) -> RgbdView | None:

@@ -28,8 +28,8 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.robust import TUKEY, sigma_by_median
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
-from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.perception.rgbd_alignment import CONVERGED, MIN_DEPTH
+from vggtgeo.slam.sparse_map.keyframe import MIN_INVERSE_DEPTH, Keyframe
 from vggtgeo.slam.tracking.pose_acceptance import tangent, worst_sigma
 
 END_SIGMA = 0.7
@@ -62,30 +62,26 @@ class SpaceSegments:
         """Return the segments with ends from the current inverse depths of their samples: affine along a segment."""
         count, samples, segment = len(keyframe.lines), keyframe.samples, keyframe.sample_segment
         known = np.isfinite(samples.inverse_depth) & np.isfinite(samples.prior_sigma)
-        start, along = _ends_of(keyframe, count)
+        ends = keyframe.lines.segments.endpoints.reshape(count, 2, 2)
+        start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
         fraction = ((samples.pixels - start[segment]) * along[segment]).sum(1) / (along**2).sum(1)[segment]
         total = lambda values: np.bincount(segment[known], values[known], count)
         # Sums of the normal equations of all lines at once.
         n, t, tt = total(np.ones_like(fraction)), total(fraction), total(fraction**2)
         d, td, s = total(samples.inverse_depth), total(fraction * samples.inverse_depth), total(samples.prior_sigma)
         spread = n * tt - t * t
-        index = np.nonzero((n >= 2) & (spread > 1e-9))[0]
+        index = np.nonzero(n >= 2)[0]  # samples are pixels apart
         n, t, tt, d, td, spread = (values[index] for values in (n, t, tt, d, td, spread))
         # Least-squares line through the samples: inverse depth is affine in the pixel along the image of a straight
         # line.
         offset, slope = (tt * d - t * td) / spread, (n * td - t * d) / spread
         inverse = np.stack([offset, offset + slope], 1)
         # An end behind the camera, or at infinity, comes from extrapolation.
-        good = (inverse > 1e-3).all(1)
+        good = (inverse > MIN_INVERSE_DEPTH).all(1)
         index = index[good]
         rays = pinhole.rays(keyframe.lines.segments.endpoints[index], intrinsics)
         sigma = np.repeat((s[index] / n[good])[:, None], 2, 1)
         return cls(index, rays, inverse[good], sigma)
-
-
-def _ends_of(keyframe: Keyframe, count: int) -> tuple[np.ndarray, np.ndarray]:
-    ends = keyframe.lines.segments.endpoints.reshape(count, 2, 2)
-    return ends[:, 0], ends[:, 1] - ends[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +133,7 @@ def align_lines(
             rows = _rows(segments, own, theirs, motion, intrinsics)
             step = _step(rows, motion, start, known)
             motion = exponential(step) @ motion
-            if np.abs(step).max() < 1e-4:
+            if np.abs(step).max() < CONVERGED:
                 break
         rows = _rows(segments, own, theirs, motion, intrinsics)
         believed = known + _normal(rows.jacobian, _weights(rows.residual))

@@ -8,7 +8,7 @@ the covariance of the motion between it and the reference keyframe. A keyframe t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +20,12 @@ from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.robust import POSE_GATE, TUKEY, inverse_information
 from vggtgeo.models.classical import can_search, search_around, search_near, search_tree
 from vggtgeo.models.roles import Features
-from vggtgeo.slam.sparse_map.keyframe import Keyframe
+from vggtgeo.slam.perception.rgbd_alignment import CONVERGED, MIN_DEPTH
+from vggtgeo.slam.sparse_map.covisibility import REPROJECTION_GATE
+from vggtgeo.slam.sparse_map.keyframe import PIXEL_SIGMA, Keyframe
 from vggtgeo.slam.tracking.flow_tracking import MAX_POINTS
 from vggtgeo.slam.tracking.pose_acceptance import tangent
+from vggtgeo.slam.tracking.pose_fusion import with_systematic
 
 MAX_KEYFRAMES = 4
 """Further keyframes that are searched: each costs a search in the frame's key points."""
@@ -46,10 +49,6 @@ class Refined:
     keyframes: int
 
 
-Bound = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""(information [6, 6], motion [4, 4]) -> information after adding the error of the motion."""
-
-
 def refine_by_map(
     features: Features,
     keyframes: Sequence[Keyframe],
@@ -57,28 +56,23 @@ def refine_by_map(
     pose: np.ndarray,
     known: np.ndarray,
     intrinsics: np.ndarray,
-    bound: Bound,
-    *,
-    radius: float,
-    sigma: float,
 ) -> Refined | None:
     """Return the frame's pose refined by the points of `keyframes`; None without any.
 
-    pose: world -> camera, with information `known` [6, 6] over its left tangent. radius: of the search, pixels; sigma:
-    standard deviation of a match, pixels.
+    pose: world -> camera, with information `known` [6, 6] over its left tangent.
     """
     if not can_search(features):
         return None
     tree = search_tree(features)
     parts = []
     for keyframe in in_view(keyframes, pose, reference.number):
-        part = _matched(keyframe, features, tree, pose, intrinsics, radius)
-        if part is not None and _agrees(part.equations(pose, intrinsics, sigma), known, bound):
+        part = _matched(keyframe, features, tree, pose, intrinsics)
+        if part is not None and _agrees(part.equations(pose, intrinsics), known):
             parts.append(part)
     current, information = pose, np.zeros((6, 6))
     for _ in range(STEPS if parts else 0):
-        equations = [part.equations(current, intrinsics, sigma) for part in parts]
-        limited = [bound(own.hessian, own.motion) for own in equations]
+        equations = [part.equations(current, intrinsics) for part in parts]
+        limited = [with_systematic(own.hessian, own.motion) for own in equations]
         information = np.sum(limited, axis=0)
         gradient = known @ tangent(current @ rigid.invert(pose))
         # Each keyframe pulls towards the pose that its points prefer, but only with the information that its own place
@@ -86,7 +80,7 @@ def refine_by_map(
         gradient -= np.sum([known @ own.step() for known, own in zip(limited, equations, strict=True)], axis=0)
         step = damped_step(information + known, gradient)
         current = exponential(step) @ current
-        if np.abs(step).max() < 1e-4:
+        if np.abs(step).max() < CONVERGED:
             break
     return Refined(current, information, sum(len(part.points) for part in parts), len(parts)) if parts else None
 
@@ -142,22 +136,22 @@ class _Part:
     points: np.ndarray
     pixels: np.ndarray
 
-    def equations(self, pose: np.ndarray, intrinsics: np.ndarray, sigma: float) -> _Equations:
+    def equations(self, pose: np.ndarray, intrinsics: np.ndarray) -> _Equations:
         local = self.points @ pose[:3, :3].T + pose[:3, 3]
-        # Metres; the projection's derivative is unbounded at the camera.
-        front = local[:, 2] > 0.1
+        # The projection's derivative is unbounded at the camera.
+        front = local[:, 2] > MIN_DEPTH
         local = local[front]
-        residual = (pinhole.project(local, intrinsics) - self.pixels[front]) / sigma
+        residual = (pinhole.project(local, intrinsics) - self.pixels[front]) / PIXEL_SIGMA
         rows = pinhole.projection_rows(local, intrinsics)
         size = np.linalg.norm(residual, axis=1)
         weight = np.maximum(1.0 - (size / TUKEY) ** 2, 0.0) ** 2
-        hessian = sum((row * weight) @ row.T for row in rows) / sigma**2
-        gradient = sum(row @ (weight * residual[:, axis]) for axis, row in enumerate(rows)) / sigma
+        hessian = sum((row * weight) @ row.T for row in rows) / PIXEL_SIGMA**2
+        gradient = sum(row @ (weight * residual[:, axis]) for axis, row in enumerate(rows)) / PIXEL_SIGMA
         return _Equations(np.asarray(hessian), np.asarray(gradient), pose @ rigid.invert(self.keyframe.pose))
 
 
 def _matched(
-    keyframe: Keyframe, features: Features, tree: cKDTree, pose: np.ndarray, intrinsics: np.ndarray, radius: float
+    keyframe: Keyframe, features: Features, tree: cKDTree, pose: np.ndarray, intrinsics: np.ndarray
 ) -> _Part | None:
     """Match some of the keyframe's points of known depth that are expected in the image."""
     if not can_search(keyframe.features):
@@ -165,7 +159,7 @@ def _matched(
     index, points, pixels = expected_pixels(keyframe, pose, intrinsics)
     # Key points come strongest first, spread over the image.
     index, points, pixels = index[:MAX_POINTS], points[:MAX_POINTS], pixels[:MAX_POINTS]
-    found = search_near(keyframe.features, index, pixels, features, tree, radius=radius)
+    found = search_near(keyframe.features, index, pixels, features, tree, radius=REPROJECTION_GATE)
     if len(found) < MIN_POINTS:
         return None
     return _Part(keyframe, points[np.searchsorted(index, found.index_i)], found.pixels_j)
@@ -186,8 +180,8 @@ def expected_pixels(
     return known[inside], points[inside], pixels[inside]
 
 
-def _agrees(own: _Equations, known: np.ndarray, bound: Bound) -> bool:
+def _agrees(own: _Equations, known: np.ndarray) -> bool:
     """Return whether these points agree with the known pose within the noise of both."""
-    noise = inverse_information(bound(own.hessian, own.motion)) + inverse_information(known)
+    noise = inverse_information(with_systematic(own.hessian, own.motion)) + inverse_information(known)
     step = own.step()
     return float(step @ np.linalg.solve(noise, step)) < POSE_GATE

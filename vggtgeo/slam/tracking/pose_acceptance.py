@@ -38,8 +38,6 @@ BARE_SURFACE, BARE_OVERLAP, BARE_SIGMA = 0.95, 0.5, 0.03
 the worst direction, metres."""
 MAX_SIGMA = 0.10
 """Largest standard deviation of an accepted pose in its worst direction, metres."""
-STEP_GATE = POSE_GATE
-"""Gate of the squared Mahalanobis distance to the prediction, 6 degrees of freedom."""
 MIN_CORRELATION_RATIO = 0.8
 """Correlation that an old keyframe must have to become the reference again, relative to that of the current one. A
 keyframe taken in a fast turn is sheared by the rolling shutter: frames tracked against it are off by centimetres
@@ -53,30 +51,25 @@ added to each. 99 % of the steps of a fast head-mounted camera are within three 
 class TrackingQuality:
     """Measures of the quality of one frame's pose. NaN = not measured.
 
-    matches, inliers: of key points with known depth. error: median reprojection error of the inliers, pixels.
-    correlation: in [-1, 1], of the brightness at edges, keyframe against frame. edges, surface: share in [0, 1] of
-    brightness samples and of surface points that agree. overlap: share of the keyframe's surface that the frame sees.
-    sigma_translation, sigma_rotation: standard deviation of the pose relative to the keyframe in its worst direction,
-    metres and radians, from the information matrix. chi2: squared Mahalanobis distance from the predicted pose, 6
-    degrees of freedom. agreement: distance between the poses by points and by surface, metres. lines, visible_lines:
-    segments of the keyframe that are matched in agreement with the pose, and those expected in the image. map_points:
-    number of matched key points of other keyframes. metre: length that stands for a metre in a map of free scale, in
-    its unit, see `metre_of`. by_two_view: whether the pose is from key points without known depth, so that its
-    baseline is weakly constrained, see `two_view_motion.py`. recorded: whether it is a recorded pose that no image has
-    measured.
+    matches, inliers: of key points with known depth. correlation: in [-1, 1], of the brightness at edges, keyframe
+    against frame. surface: share in [0, 1] of surface points that agree. overlap: share of the keyframe's surface that
+    the frame sees. sigma_translation, sigma_rotation: standard deviation of the pose relative to the keyframe in its
+    worst direction, metres and radians, from the information matrix. chi2: squared Mahalanobis distance from the
+    predicted pose, 6 degrees of freedom. lines, visible_lines: segments of the keyframe that are matched in agreement
+    with the pose, and those expected in the image. map_points: number of matched key points of other keyframes. metre:
+    length that stands for a metre in a map of free scale, in its unit, see `metre_of`. by_two_view: whether the pose is
+    from key points without known depth, so that its baseline is weakly constrained, see `two_view_motion.py`. recorded:
+    whether it is a recorded pose that no image has measured.
     """
 
     matches: int = 0
     inliers: int = 0
-    error: float = NAN
     correlation: float = NAN
-    edges: float = NAN
     surface: float = NAN
     overlap: float = NAN
     sigma_translation: float = NAN
     sigma_rotation: float = NAN
     chi2: float = NAN
-    agreement: float = NAN
     lines: int = 0
     visible_lines: int = 0
     map_points: int = 0
@@ -93,7 +86,7 @@ class TrackingQuality:
     def plausible(self) -> bool:
         """Whether the step is plausible after the motion so far; true without a prediction."""
         # NaN (no prediction) compares false, so the step is plausible then.
-        return not self.chi2 > STEP_GATE
+        return not self.chi2 > POSE_GATE
 
     @property
     def points_fair(self) -> bool:
@@ -172,15 +165,11 @@ def step_chi2(pose: np.ndarray, predicted: np.ndarray, step: np.ndarray, waited:
     """
     # Translation and rotation are compared by their lengths: the direction of a jerk is as unknown as its size.
     off = tangent(pose @ rigid.invert(predicted))
-    last = tangent(step)
-    sigma = [floor + STEP_GROWTH * np.linalg.norm(last[i : i + 3]) for floor, i in zip(STEP_FLOOR, (0, 3), strict=True)]
-    return float(sum((np.linalg.norm(off[i : i + 3]) / s) ** 2 for s, i in zip(sigma, (0, 3), strict=True))) / (
-        waited + 1
-    )
+    return float(off @ step_information(step) @ off) / (waited + 1)
 
 
 def step_information(step: np.ndarray) -> np.ndarray:
-    """Return the information float64 [6, 6] of a prediction by constant velocity."""
+    """Return the information float64 [6, 6] of a prediction by constant velocity, equal in all directions."""
     last = tangent(step)
     sigma = [floor + STEP_GROWTH * np.linalg.norm(last[i : i + 3]) for floor, i in zip(STEP_FLOOR, (0, 3), strict=True)]
     return np.diag(1.0 / np.repeat(sigma, 3) ** 2)

@@ -23,8 +23,6 @@ SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
 """Standard deviation of errors that samples share (calibration, rolling shutter, clocks): metres, radians, share of the
 motion. Set so that the squared Mahalanobis distance of dense alignments from the ground truth has the median of
 chi-square with 6 degrees of freedom, 5.3 (`benchmarks/alignment.py`)."""
-AGREEMENT_GATE = POSE_GATE
-"""Squared Mahalanobis distance between the poses by points and by dense alignment below which they are fused."""
 MAX_DISAGREEMENT = 0.15
 """Distance between them, metres, above which many inliers are preferred to dense alignment."""
 
@@ -47,7 +45,7 @@ def agreed(by_points: Motion | None, dense: Aligned | None, quality: TrackingQua
     off = tangent(by_points.motion @ rigid.invert(dense.motion))
     # With the errors that samples share: by their own noise alone two right poses would contradict each other.
     noise = [np.linalg.inv(with_systematic(one.information, one.motion)) for one in (by_points, by_picture)]
-    if off @ np.linalg.solve(noise[0] + noise[1], off) < AGREEMENT_GATE:
+    if off @ np.linalg.solve(noise[0] + noise[1], off) < POSE_GATE:
         both = by_points.information + dense.information
         mean = np.linalg.solve(both + REGULARISER * np.eye(6), by_points.information @ off)
         return Motion(exponential(mean) @ dense.motion, both)

@@ -7,13 +7,13 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import POSE_GATE
 from vggtgeo.models.classical import global_descriptor
 from vggtgeo.models.roles import Features
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import Map
 from vggtgeo.slam.tracking.accumulated_odometry import Odometry
 from vggtgeo.slam.tracking.frame_tracking import TrackedFrame, TrackingInput, factor_between, track, view_of
-from vggtgeo.slam.tracking.pose_acceptance import STEP_GATE
 from vggtgeo.slam.tracking.tracking_state import Tracker
 
 CANDIDATES = 5
@@ -67,7 +67,7 @@ def close_loop_while_tracking(
         return None
     # Rooms that look the same pass the check by points; odometry bounds how far drift can have moved the camera.
     odometry = Odometry.of(known.odometry_factors, len(known.keyframes))
-    return None if odometry.distances([factor_between(current, found)])[0] >= STEP_GATE else found
+    return None if odometry.distances([factor_between(current, found)])[0] >= POSE_GATE else found
 
 
 def most_similar(features: Features, keyframes: Sequence[Keyframe]) -> tuple[Keyframe, ...]:

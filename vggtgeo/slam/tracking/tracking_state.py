@@ -110,12 +110,9 @@ def frame_pose(known: Map, record: FramePose) -> np.ndarray:
 def scaled_record(record: FramePose, ratio: float) -> FramePose:
     """Return the record of a frame whose keyframe was scaled, see `scaled_keyframe` in `sparse_map/map.py`."""
     arrival = None if record.arrival is None else (record.arrival[0], longer(record.arrival[1], ratio))
-    second = None if record.second is None else scaled_second(record.second, ratio)
+    second = record.second
+    if second is not None:
+        # Information of a translation is 1 / length^2, so it is scaled too.
+        information = scaled_information(second.information, ratio)
+        second = replace(second, relative=longer(second.relative, ratio), information=information)
     return replace(record, relative=longer(record.relative, ratio), arrival=arrival, second=second)
-
-
-def scaled_second(second: SecondMotion, ratio: float) -> SecondMotion:
-    """Return the motion from a second keyframe that was scaled."""
-    # Information of a translation is 1 / length^2, so it is scaled too.
-    information = scaled_information(second.information, ratio)
-    return replace(second, relative=longer(second.relative, ratio), information=information)

@@ -17,19 +17,22 @@ from vggtgeo.bundle.padding import PaddedSize, SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import rigid
+from vggtgeo.geometry.robust import TINY
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.settings.slam_settings import SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import Directed
-from vggtgeo.slam.sparse_map.keyframe import LINE_SPACING, MAX_DEPTH_ERROR, Keyframe, Slots
+from vggtgeo.slam.sparse_map.keyframe import (
+    LINE_SPACING,
+    MAX_DEPTH_ERROR,
+    MIN_INVERSE_DEPTH,
+    PIXEL_SIGMA,
+    Keyframe,
+    Slots,
+)
 
-MIN_INVERSE_DEPTH = 1e-3
-"""Smallest initial inverse depth, 1/m."""
 LINE_GATE = 12.0
 """Largest distance of a line sample from its matched segment before an adjustment, pixels; the robust kernel handles
 outliers within it."""
-STEP_PIXELS = 2.0
-"""Largest standard deviation of a point's projection after a motion of the same length as its baseline, pixels, for use
-in tracking: that of a match (`PIXEL_SIGMA` in `frame_tracking.py`). It excludes points in the direction of motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +310,7 @@ def supported(points: np.ndarray, pose: np.ndarray, endpoints: np.ndarray, intri
     along = endpoints[:, 1] - endpoints[:, 0]
     length = np.linalg.norm(along, axis=1)
     # Degenerate segments have a length of zero.
-    direction = along / np.maximum(length, 1e-9)[:, None]
+    direction = along / np.maximum(length, TINY)[:, None]
     offset = pixels - endpoints[:, 0]
     place = (offset * direction).sum(1)
     distance = np.abs(offset[:, 0] * direction[:, 1] - offset[:, 1] * direction[:, 0])
@@ -328,13 +331,15 @@ def _initial_depths(
     current, before = points.read(slots, "inverse_depth"), points.read(slots, "estimate_sigma")
     triangulated, information, longest = _triangulated(keyframes, edges, points, intrinsics)
     seen = information > 0
-    estimate_sigma = np.where(seen, 1.0 / np.sqrt(np.maximum(information, 1e-12)), np.nan)
+    estimate_sigma = np.where(seen, 1.0 / np.sqrt(np.maximum(information, TINY)), np.nan)
     determined = seen & (triangulated > MIN_INVERSE_DEPTH) & (estimate_sigma < MAX_DEPTH_ERROR * triangulated)
     # Where a depth camera measures nothing there may be glass or a mirror: do not triangulate there.
     free = seen & ~np.array([np.isfinite(own.prior_mean).any() for own in slots])[points.host]
     # Far points whose depth is not determined still fix rotations, as long as their projection does not depend on
     # depth.
-    steady = free & (estimate_sigma * longest * intrinsics[0] < STEP_PIXELS) & ~(estimate_sigma > before)
+    # Known well enough for tracking: after a motion as long as its baseline, a point's projection is as certain as a
+    # match. This excludes points in the direction of motion.
+    steady = free & (estimate_sigma * longest * intrinsics[0] < PIXEL_SIGMA) & ~(estimate_sigma > before)
     known = np.isfinite(current)
     some = current[known] if known.any() else triangulated[determined]
     typical = np.median(some) if len(some) else 1.0
@@ -357,7 +362,7 @@ def _triangulated(
         np.add.at(information, landmark, weight)
         np.maximum.at(longest, landmark, float(np.linalg.norm(relative[:3, 3])))
     # Mean by information in inverse depth, where the error of a triangulation is nearly Gaussian.
-    return weighted / np.maximum(information, 1e-12), information, longest
+    return weighted / np.maximum(information, TINY), information, longest
 
 
 def _rank(confidence: np.ndarray) -> np.ndarray:

@@ -20,9 +20,9 @@ from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import PairTerm
 from vggtgeo.bundle.terms.reprojection import PointTerm
 from vggtgeo.geometry import lie, rigid
+from vggtgeo.geometry.robust import TINY
 from vggtgeo.slam.sparse_map.map import by_first_member
 
-TINY = float(np.finfo(np.float64).tiny)
 STILL = 1e-6
 """Largest share of a unit direction by which it changes a pose that counts as known."""
 NULL = 1e-10

@@ -19,10 +19,10 @@ import numpy as np
 from scipy.stats import chi2 as chi_square
 
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.robust import TINY
 from vggtgeo.models.classical import line_coefficients
 from vggtgeo.slam.sparse_map.covisibility import Directed
-from vggtgeo.slam.sparse_map.keyframe import Keyframe, along_segments
-from vggtgeo.slam.window.adjustment import MIN_INVERSE_DEPTH
+from vggtgeo.slam.sparse_map.keyframe import MIN_INVERSE_DEPTH, Keyframe, along_segments
 
 MAX_SIGMA = 0.05
 """Largest relative standard deviation of a depth that counts as known."""
@@ -63,7 +63,7 @@ def _triangulated(
         first[edge.line_slots] += weight * value
         second[edge.line_slots] += weight * value**2
         views[edge.line_slots] += weight > 0
-    total = np.maximum(total, 1e-18)
+    total = np.maximum(total, TINY)
     mean, sigma = first / total, 1.0 / np.sqrt(total)
     # Weighted sum of squared residuals about the mean: chi-square with `views - 1` degrees of freedom.
     spread = second - total * mean**2
