@@ -130,11 +130,11 @@ def test_global_adjustment_brings_a_map_back(room: Room, tracked: Slam, surfaces
 
 
 def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
-    """At 30 % of the frames a map of 6 keyframes will have 20, between those shares nothing is foreseen, and without an
-    end the map itself counts; oracle: by hand.
+    """At a quarter of the frames a map of 5 keyframes will have 20, between the checks nothing is foreseen, and without
+    an end the map itself counts; oracle: by hand.
     """
-    assert expected_keyframes(6, 30, 100) == 20
-    assert expected_keyframes(6, 31, 100) is None
+    assert expected_keyframes(5, 25, 100) == 20
+    assert expected_keyframes(5, 26, 100) is None
     assert [expected_keyframes(count, 31, None) for count in (7, 8, 70)] == [None, 8, 70]
 
 

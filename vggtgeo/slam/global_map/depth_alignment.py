@@ -19,6 +19,7 @@ import numpy as np
 
 from vggtgeo.bundle.terms.measured_pose import SurfaceAlignment
 from vggtgeo.geometry import pinhole, rigid
+from vggtgeo.geometry.robust import TUKEY
 from vggtgeo.slam.perception.rgbd_view import surface_normals
 from vggtgeo.slam.sparse_map.factors import surface_term
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
@@ -111,7 +112,7 @@ def align(
     sigma = np.hypot(source.sigma.take(seen), target.rows.sigma.take(cell))
     residual = (n * away).sum(0)
     # Tukey's biweight, wide enough for a pose that is off by a few standard deviations.
-    scale = max(float(np.median(np.abs(residual / sigma))) * 4.7, 3.0)
+    scale = max(float(np.median(np.abs(residual / sigma))) * TUKEY, 3.0)
     weight = np.maximum(1 - (residual / sigma / scale) ** 2, 0.0) ** 2 / sigma**2
     # Neighbouring depths share their errors, so the information of a surface does not grow with its number of pixels.
     weight *= min(effective / len(one), 1.0)

@@ -35,14 +35,14 @@ MORE = 1.2
 """Times as many corners come back without them: then these are bands."""
 ROUND_TRIP = 0.5
 """Pixels of these images: forth and back again must end where it began. LK's own noise is 0.05 to 0.1 pixels."""
-PATCH = (15, 15)
+PATCH = 15
 """Pixels: smaller patches of these images are ambiguous, larger ones cross depth edges."""
 LEVELS, LEVELS_FROM_SHIFT = 4, 2
 """Of the image pyramid, beyond the images themselves: reach of 100 pixels, and of 25 around the translation."""
 REDUCTION = 4
 """Of the images whose translation is searched: it need only be right within half a patch."""
 _FLOW = {
-    "winSize": PATCH,
+    "winSize": (PATCH, PATCH),
     "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),
     "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
 }
@@ -86,7 +86,7 @@ def follow(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[n
     """
     moved, kept = _follow_from(before, after, pixels, np.zeros(2, np.float32), LEVELS)
     shift = translation(before, after)
-    if kept.all() or np.linalg.norm(shift) <= PATCH[0] / 2:
+    if kept.all() or np.linalg.norm(shift) <= PATCH / 2:
         return moved, kept
     others, again = _follow_from(before, after, pixels, shift, LEVELS_FROM_SHIFT)
     return np.where(kept[:, None], moved, others), kept | again
@@ -167,7 +167,7 @@ def small_size(shape: tuple[int, ...]) -> tuple[int, int]:
 def small_mask(mask: np.ndarray) -> np.ndarray:
     """Return a mask, bool [H, W], for the image that corners are followed in, wider by the patch around a corner."""
     small = cv2.resize(mask.astype(np.uint8), small_size(mask.shape), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.dilate(small, np.ones(PATCH, np.uint8)) > 0)
+    return np.asarray(cv2.dilate(small, np.ones((PATCH, PATCH), np.uint8)) > 0)
 
 
 def small_grey(image: np.ndarray) -> np.ndarray:
