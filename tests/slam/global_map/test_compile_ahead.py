@@ -86,7 +86,7 @@ def test_the_program_of_the_end_is_compiled_during_the_run(monkeypatch: pytest.M
     compiled, slam = _compiled(monkeypatch), _with_or_without_depth(metric)
     settings = updated(SETTINGS, {"refinement": {"global_adjustment": True}})
     ahead, count = compile_ahead.CompileAhead(settings), len(slam.frames)
-    ahead.on_begin("a walk", round(count / 0.6))
+    ahead.on_begin("a walk", -(-4 * count // 3))
     for _ in range(2):
         ahead.on_frame(slam, recorded_run().frames[-1])
     ahead.on_adjust(slam)
