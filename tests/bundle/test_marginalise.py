@@ -19,7 +19,7 @@ from vggtgeo.solvers.schur_complement import dense_schur_complement
 import vggtgeo as vg
 from vggtgeo.bundle.analysis.observability import symmetric_eigen
 from vggtgeo.bundle.linearise import linearise
-from vggtgeo.bundle.marginalisation import empty_prior, marginalise_jit, permute_prior, square_root
+from vggtgeo.bundle.marginalisation import _eliminate, empty_prior, marginalise_jit, permute_prior, square_root
 from vggtgeo.bundle.objective import energy, prepared
 from vggtgeo.bundle.problem import Problem, State
 
@@ -50,6 +50,19 @@ def _without(problem: Problem, dropped_edges: jax.Array, dropped_host: int | Non
     for term in (*kept, depth):
         problem = problem.with_term(term)
     return problem
+
+
+def test_a_leaving_pose_is_eliminated_in_any_units() -> None:
+    # Proves that the rank of the leaving pose does not depend on the units of its coordinates, here 1e8 apart. Oracle:
+    # the Schur complement by a plain inverse, of the same matrix with equal units.
+    rng = np.random.default_rng(5)
+    root, pull = rng.normal(size=(30, 16)), rng.normal(size=16)
+    plain, units = root.T @ root, np.repeat([1.0, 1e8, 1.0], [3, 3, 10])
+    inner = np.linalg.inv(plain[:6, :6])
+    given = (jnp.asarray(units[:, None] * plain * units), jnp.asarray(units * pull))
+    quadratic, gradient = _eliminate(*given, 0, jnp.ones(16, bool))
+    np.testing.assert_allclose(quadratic[6:, 6:], plain[6:, 6:] - plain[6:, :6] @ inner @ plain[:6, 6:], rtol=1e-6)
+    np.testing.assert_allclose(gradient[6:], pull[6:] - plain[6:, :6] @ inner @ pull[:6], rtol=1e-6)
 
 
 @pytest.mark.parametrize("leaving", [0, 1])

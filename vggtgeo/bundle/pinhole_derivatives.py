@@ -91,7 +91,7 @@ def row(edge: OneEdge, at: Projection, a: Array, b: Array) -> list[Array]:
     g = jnp.stack([g0, g1, -(g0 * at.x + g1 * at.y) * at.in_front])
     # `G`, `c_0`, `c_1` and `G . t` by one product: XLA would compute `G` again in each column that has it.
     factors = jnp.concatenate([jnp.eye(3, dtype=g.dtype), edge.rotation[:, :2].T, edge.translation[None]])
-    g0, g1, g2, c0, c1, depth = (factors @ g.reshape(3, -1)).reshape(6, *a.shape)
+    g0, g1, g2, c0, c1, depth = lie.matmul(factors, g.reshape(3, -1)).reshape(6, *a.shape)
     y0, y1, y2 = at.point
     return [
         *(g0 * at.depth, g1 * at.depth, g2 * at.depth),

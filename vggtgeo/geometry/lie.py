@@ -38,14 +38,14 @@ ADJOINT = np.zeros((6, 6, 6))
 ADJOINT[3:, :3, :3] = ADJOINT[3:, 3:, 3:] = ADJOINT[:3, :3, 3:] = SKEW
 
 
-# GPUs would multiply single precision by ten bits.
-_matmul = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+matmul = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+"""Matrix product in full precision: GPUs would multiply single precision by ten bits."""
 
 
 def _matrix(tensor: np.ndarray, vector: Float[Array, "*n k"]) -> Float[Array, "*n a b"]:
     """Contract the first axis of a constant [k, a, b]."""
     flat = tensor.reshape(len(tensor), -1).astype(vector.dtype)
-    return _matmul(vector, flat).reshape(*vector.shape[:-1], *tensor.shape[1:])
+    return matmul(vector, flat).reshape(*vector.shape[:-1], *tensor.shape[1:])
 
 
 def skew(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
@@ -54,7 +54,7 @@ def skew(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 
 
 def _times(matrix: Float[Array, "*n a b"], vector: Float[Array, "*n b"]) -> Float[Array, "*n a"]:
-    return _matmul(matrix, vector[..., None])[..., 0]
+    return matmul(matrix, vector[..., None])[..., 0]
 
 
 def _parts(pose: jaxlie.SE3) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 3"]]:
@@ -65,7 +65,7 @@ def _rotation(wxyz: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
     # v -> q v q^-1 with `q = (w, u)`: R = (u u^T + (w + [u])^2) / |q|^2, for quaternions of text files, too.
     axis = wxyz[..., 1:]
     half = skew(axis) + wxyz[..., :1, None] * np.eye(3, dtype=wxyz.dtype)
-    scaled = axis[..., :, None] * axis[..., None, :] + _matmul(half, half)
+    scaled = axis[..., :, None] * axis[..., None, :] + matmul(half, half)
     return scaled / jnp.sum(wxyz * wxyz, -1)[..., None, None]
 
 
@@ -180,8 +180,8 @@ def log_derivative(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 6 6"]:
     second = jnp.where(near, 1 / 12 - squared**2 / 30240, (2 * short) / safe + slope)
     fourth = jnp.where(near, -1 / 720 - squared / 15120 - squared**2 / 403200, (short / safe + slope) / safe)
     adjoint = _matrix(ADJOINT, tangent)
-    square = _matmul(adjoint, adjoint)
-    even = second * square + fourth * _matmul(square, square)
+    square = matmul(adjoint, adjoint)
+    even = second * square + fourth * matmul(square, square)
     return jnp.eye(TANGENT, dtype=tangent.dtype) - adjoint / 2 + even
 
 
@@ -203,6 +203,6 @@ def adjoint(pose: jaxlie.SE3) -> Float[Array, "*n 6 6"]:
     """Return `Ad(T)`: `T exp(x) = exp(Ad(T) x) T`."""
     wxyz, t = _parts(pose)
     rotation = _rotation(wxyz)
-    lever = _matmul(skew(t), rotation)
+    lever = matmul(skew(t), rotation)
     rows = [jnp.concatenate([rotation, lever], -1), jnp.concatenate([jnp.zeros_like(rotation), rotation], -1)]
     return jnp.concatenate(rows, -2)
