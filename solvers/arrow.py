@@ -250,9 +250,9 @@ def _seen_of(shared: Float[Array, " q"], count: int, seen: Int[Array, "t p"] | N
     return jnp.broadcast_to(shared, (count, len(shared))) if seen is None else shared[seen]
 
 
-def add_shared(values: Float[Array, "t p"], seen: Int[Array, "t p"] | None, count: int) -> Float[Array, " q"]:
+def add_shared(values: Float[Array, "t p *k"], seen: Int[Array, "t p"] | None, count: int) -> Float[Array, "q *k"]:
     """Add values by the coordinates `seen` to the `count` shared coordinates."""
-    return values.sum(0) if seen is None else jnp.zeros(count, values.dtype).at[seen].add(values)
+    return values.sum(0) if seen is None else jnp.zeros((count, *values.shape[2:]), values.dtype).at[seen].add(values)
 
 
 def couple(system: ArrowSystem, dense: Float[Array, " c"], gradient: float) -> Float[Array, "h s"]:
@@ -300,20 +300,22 @@ def _factors_times(system: ArrowSystem, factors: NodeFactors, dense: Float[Array
     return _factors_gathered(system, factors, jnp.einsum("mab,mb->ma", factors.hessian, local))
 
 
-def _factors_gathered(system: ArrowSystem, factors: NodeFactors, local: Float[Array, "m l"]) -> Float[Array, " c"]:
+def _factors_gathered(system: ArrowSystem, factors: NodeFactors, local: Float[Array, "m l *k"]) -> Float[Array, "c *k"]:
     return gather_factors(system.graph, factors, local, (system.num_nodes, system.block, system.shared))
 
 
 def gather_factors(
-    graph: EdgeGraph, factors: NodeFactors, local: Float[Array, "m l"], sizes: tuple[int, int, int]
-) -> Float[Array, " c"]:
+    graph: EdgeGraph, factors: NodeFactors, local: Float[Array, "m l *k"], sizes: tuple[int, int, int]
+) -> Float[Array, "c *k"]:
     """Add values in the factors' local coordinates to the nodes and the shared coordinates; sizes: `n`, `b`, `q`."""
     count, block, shared = sizes
-    nodes = jnp.zeros((count + 1, block), local.dtype)
-    nodes = nodes.at[factors.first].add(local[:, :block]).at[factors.second].add(local[:, block : 2 * block])
+    rest = local.shape[2:]
+    of_ends = local[:, : 2 * block].reshape(len(local), 2, block, *rest)
+    ends = jnp.stack([factors.first, factors.second], 1)
+    nodes = jnp.zeros((count + 1, block, *rest), local.dtype).at[ends].add(of_ends)
     own = local[:, 2 * block :]
     seen = graph.seen(factors.first[:, None], own.shape[1])
-    return jnp.concatenate([nodes[:-1].reshape(-1), add_shared(own, seen, shared)])
+    return jnp.concatenate([nodes[:-1].reshape(-1, *rest), add_shared(own, seen, shared)])
 
 
 def seen_by_factors(system: ArrowSystem, factors: NodeFactors) -> Int[Array, "m v"] | None:
@@ -344,32 +346,36 @@ def from_relative(system: ArrowSystem, relative: Float[Array, "h relative"]) -> 
 def dense_gradient(system: ArrowSystem) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """Return the gradient of the dense coordinates and the diagonal of their Hessian (before elimination)."""
     block = system.block
-    eta = system.gram[:, :block, :block]
-    gradients = _gather_at_nodes(system, system.gram[:, :block, -1], system.gram[:, :block, -1])
-    at_target = jnp.diagonal(eta, axis1=1, axis2=2)
-    at_source = jnp.einsum("eba,ebc,eca->ea", system.source_adjoint, eta, system.source_adjoint)
-    nodes = jnp.zeros_like(gradients).at[system.graph.target].add(at_target)
-    nodes = nodes.at[system.graph.source].add(at_source)
+    eta, force = system.gram[:, :block, :block], system.gram[:, :block, -1]
+    # Gradient and diagonal of the Hessian together: XLA compiles each scatter to a loop of its own.
+    at_target = jnp.stack([force, jnp.diagonal(eta, axis1=1, axis2=2)], -1)
+    own = jnp.einsum("eba,ebc,eca->ea", system.source_adjoint, eta, system.source_adjoint)
+    at_source = jnp.stack([-jnp.einsum("eba,eb->ea", system.source_adjoint, force), own], -1)
+    nodes = _add_at_ends(system, at_target, at_source)
     shared = sum_corners(system, system.gram[:, block:, block:], system.graph.seen(system.graph.ends(), system.seen))
-    gradient = jnp.concatenate([gradients.reshape(-1), shared[:-1, -1]]) + system.prior_gradient
-    diagonal = jnp.concatenate([nodes.reshape(-1), jnp.diagonal(shared)[:-1]])
+    both = jnp.concatenate([nodes.reshape(-1, 2), jnp.stack([shared[:-1, -1], jnp.diagonal(shared)[:-1]], -1)])
+    if system.factors is not None:
+        own = jnp.diagonal(system.factors.hessian, axis1=1, axis2=2)
+        both = both + _factors_gathered(system, system.factors, jnp.stack([system.factors.gradient, own], -1))
+    gradient, diagonal = both.T
     diagonal = diagonal.at[-len(system.prior_hessian) :].add(jnp.diagonal(system.prior_hessian))
-    if system.factors is None:
-        return gradient, diagonal
-    own = jnp.diagonal(system.factors.hessian, axis1=1, axis2=2)
-    return (
-        gradient + _factors_gathered(system, system.factors, system.factors.gradient),
-        diagonal + _factors_gathered(system, system.factors, own),
-    )
+    return gradient + system.prior_gradient, diagonal
 
 
 def _gather_at_nodes(
     system: ArrowSystem, at_target: Float[Array, "e b"], at_source: Float[Array, "e b"]
 ) -> Float[Array, "n b"]:
     """Sum forces on relative coordinates at the nodes: `at_target` at targets, `-A' at_source` at sources."""
-    nodes = jnp.zeros((system.num_nodes, at_target.shape[1]), at_target.dtype)
-    carried = jnp.einsum("eba,eb->ea", system.source_adjoint, at_source)
-    return nodes.at[system.graph.target].add(at_target).at[system.graph.source].add(-carried)
+    return _add_at_ends(system, at_target, -jnp.einsum("eba,eb->ea", system.source_adjoint, at_source))
+
+
+def _add_at_ends(
+    system: ArrowSystem, at_target: Float[Array, "e b *k"], at_source: Float[Array, "e b *k"]
+) -> Float[Array, "n b *k"]:
+    """Sum values of the ends of edges at the nodes."""
+    ends = jnp.stack([system.graph.target, system.graph.source], 1)
+    nodes = jnp.zeros((system.num_nodes, *at_target.shape[1:]), at_target.dtype)
+    return nodes.at[ends].add(jnp.stack([at_target, at_source], 1))
 
 
 def padded_transports(system: ArrowSystem) -> Float[Array, "h k b b"]:

@@ -230,37 +230,45 @@ def assemble_edges(system: ArrowSystem, layout: AbstractLayout) -> Blocks:
     own = jnp.einsum("eba,ebc,ecd->ead", system.source_adjoint, eta, system.source_adjoint)
     # The curvature of `eta` is a product of `x_j` and `x_i`, so the blocks on the diagonal do not have it.
     mixed = -jnp.einsum("eab,ebc->eac", eta + system.lie_curvature, system.source_adjoint)
-    blocks = layout.empty(count, block, eta.dtype)
     # Both triangles; a layout that stores one of them drops the other.
-    blocks = layout.add(layout.add(blocks, target, target, eta), source, source, own)
-    blocks = layout.add(blocks, target, source, mixed)
-    blocks = layout.add(blocks, source, target, jnp.swapaxes(mixed, 1, 2))
+    parts = [(target, target, eta), (source, source, own), (target, source, mixed)]
+    parts.append((source, target, jnp.swapaxes(mixed, 1, 2)))
     seen = system.graph.seen(system.graph.ends(), system.seen)
-    borders = _add_border(jnp.zeros((count, block, system.shared + 1), eta.dtype), target, border, seen)
     at_source = -jnp.einsum("eba,ebc->eac", system.source_adjoint, border)
-    borders = _add_border(borders, source, at_source, seen)
-    whole = Blocks(blocks, borders, sum_corners(system, system.gram[:, block:, block:], seen))
-    return whole if system.factors is None else _add_factors(system, whole, system.factors, layout)
+    borders = jnp.zeros((count + 1, block, system.shared + 1), eta.dtype)
+    borders = _add_border(borders, jnp.stack([target, source], 1), jnp.stack([border, at_source], 1), seen)
+    corner = sum_corners(system, system.gram[:, block:, block:], seen)
+    if system.factors is not None:
+        parts += _blocks_of_factors(system.factors, count, block)
+        borders, corner = _add_factor_borders(system, borders, corner, system.factors)
+    # One scatter of all: XLA compiles each to a loop of its own.
+    row, column, value = (jnp.concatenate(each) for each in zip(*parts, strict=True))
+    return Blocks(layout.add(layout.empty(count, block, eta.dtype), row, column, value), borders[:-1], corner)
 
 
-def _add_factors(system: ArrowSystem, whole: Blocks, factors: NodeFactors, layout: AbstractLayout) -> Blocks:
-    count, block = whole.border.shape[:2]
-    ends = first, second = factors.first, factors.second
-    cut = lambda a, b: factors.hessian[:, a * block : (a + 1) * block, b * block : (b + 1) * block]
-    nodes = whole.nodes
+def _blocks_of_factors(factors: NodeFactors, count: int, block: int) -> list[tuple[Array, Array, Array]]:
+    """Return row, column and value of the blocks of the factors' Hessians; index `count`: no block."""
+    ends = factors.first, factors.second
+    found = []
     for a, b in ((0, 0), (1, 1), (0, 1), (1, 0)):
         # A block with a missing second node must not be added to the first node's row either.
         absent = (ends[a] == count) | (ends[b] == count)
-        nodes = layout.add(nodes, jnp.where(absent, count, ends[a]), jnp.where(absent, count, ends[b]), cut(a, b))
+        value = factors.hessian[:, a * block : (a + 1) * block, b * block : (b + 1) * block]
+        found.append((jnp.where(absent, count, ends[a]), jnp.where(absent, count, ends[b]), value))
+    return found
+
+
+def _add_factor_borders(
+    system: ArrowSystem, borders: Float[Array, "m b o"], corner: Float[Array, "o o"], factors: NodeFactors
+) -> tuple[Float[Array, "m b o"], Float[Array, "o o"]]:
+    block = borders.shape[1]
     tail = jnp.concatenate([factors.hessian[:, :, 2 * block :], factors.gradient[..., None]], 2)
-    borders = jnp.concatenate([whole.border, jnp.zeros_like(whole.border[:1])])
     seen = seen_by_factors(system, factors)
-    borders = _add_border(borders, first, tail[:, :block], seen)
-    borders = _add_border(borders, second, tail[:, block : 2 * block], seen)[:-1]
+    of_ends = tail[:, : 2 * block].reshape(len(tail), 2, block, -1)
+    borders = _add_border(borders, jnp.stack([factors.first, factors.second], 1), of_ends, seen)
     own = jnp.pad(tail[:, 2 * block :], ((0, 0), (0, 1), (0, 0)))
     own = sum_corners(system, own, seen)[:-1]
-    corner = whole.corner.at[:-1].add(own).at[-1, :-1].add(own[:, -1])
-    return Blocks(nodes, borders, corner)
+    return borders, corner.at[:-1].add(own).at[-1, :-1].add(own[:, -1])
 
 
 def add_prior_blocks(blocks: Blocks, system: ArrowSystem, layout: AbstractLayout) -> Blocks:

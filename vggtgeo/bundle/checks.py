@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Array
 
 from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.padding import COUNTED, PaddedSize
@@ -82,13 +84,19 @@ def check_dtype(dtype: Any) -> None:
         raise InputError(f"`dtype` must be float32 or float64, got {dtype!r:.60}")
 
 
+@eqx.filter_jit
+def _at_zero(kernel: AbstractKernel) -> tuple[Array, Array]:
+    """Return `rho(0)` and `rho'(0)`."""
+    zero = jnp.zeros(1)
+    return kernel.rho(zero)[0], kernel.weight(zero)[0]
+
+
 def check_kernel(name: str, kernel: Any) -> None:
     """Check that a kernel has `rho(0) = 0` and `rho'(0) = 1`, so that padding has no energy."""
     check_kind(name, kernel, AbstractKernel, "a kernel, such as `vggtgeo.kernels.Huber(1.5)`")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(kernel)):
         return
-    zero = jnp.zeros(1)
-    value, slope = float(kernel.rho(zero)[0]), float(kernel.weight(zero)[0])
+    value, slope = map(float, _at_zero(kernel))
     if not np.allclose((value, slope), (0, 1), atol=UNIT):
         raise InputError(
             f"`{name}` of type `{type(kernel).__name__}` must have rho(0) = 0 and rho'(0) = 1, got {value}, {slope}: "

@@ -19,6 +19,7 @@ poses.
 from __future__ import annotations
 
 from dataclasses import replace
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -38,7 +39,7 @@ from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import DenseTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
-from vggtgeo.compilation.program_cache import CachedProgram
+from vggtgeo.compilation.program_cache import CachedProgram, to_device
 from vggtgeo.geometry import lie
 from vggtgeo.io.argument_checks import check_kind, check_whole, real_numbers
 from vggtgeo.io.errors import InputError
@@ -63,11 +64,11 @@ def empty_prior(keyframes: int, dtype: np.dtype | type = np.float64, parameters:
     size = lie.TANGENT * keyframes + parameters
     identity = np.tile(np.array([1.0, 0, 0, 0, 0, 0, 0], dtype), (keyframes, 1))
     return MarginalPrior(
-        root=jnp.zeros((size, size), dtype),
-        offset=jnp.zeros(size, dtype),
-        poses=jaxlie.SE3(jnp.asarray(identity)),
-        intrinsics=jnp.zeros(parameters, dtype),
-        weight=jnp.ones((), dtype),
+        root=to_device(np.zeros((size, size), dtype)),
+        offset=to_device(np.zeros(size, dtype)),
+        poses=jaxlie.SE3(to_device(identity)),
+        intrinsics=to_device(np.zeros(parameters, dtype)),
+        weight=to_device(np.ones((), dtype)),
     )
 
 
@@ -120,17 +121,26 @@ def permute_prior(prior: MarginalPrior, order: np.ndarray | Array) -> MarginalPr
     """
     check_kind("prior", prior, MarginalPrior, "a prior, such as the result of `vggtgeo.marginalise`")
     order = _order_of(order, len(prior.poses.wxyz_xyz))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((prior, order))):
+        return _permuted(prior, jnp.asarray(order), jnp)
+    # NumPy has no program to compile: during a first run it would wait for those of the solver.
+    permuted: MarginalPrior = jax.tree.map(to_device, _permuted(jax.tree.map(np.asarray, prior), order, np))
+    return permuted
+
+
+def _permuted(prior: MarginalPrior, order: Int[Array, " n"] | np.ndarray, xp: ModuleType) -> MarginalPrior:
+    """Permute by the functions of `xp`, NumPy or JAX's."""
     known, tail = order >= 0, len(prior.intrinsics)
-    place = jnp.maximum(order, 0)
-    columns = (lie.TANGENT * place[:, None] + jnp.arange(lie.TANGENT)).reshape(-1)
-    by_pose = jnp.where(jnp.repeat(known, lie.TANGENT), prior.root[:, columns], 0.0)
-    identity = jnp.asarray([1.0, 0, 0, 0, 0, 0, 0], prior.root.dtype)
-    poses = jnp.where(known[:, None], prior.poses.wxyz_xyz[place], identity)
-    root = jnp.concatenate([by_pose, prior.root[:, prior.root.shape[1] - tail :]], 1)
+    place = xp.maximum(order, 0)
+    columns = (lie.TANGENT * place[:, None] + xp.arange(lie.TANGENT)).reshape(-1)
+    by_pose = xp.where(xp.repeat(known, lie.TANGENT), prior.root[:, columns], 0.0)
+    identity = xp.asarray([1.0, 0, 0, 0, 0, 0, 0], prior.root.dtype)
+    poses = xp.where(known[:, None], prior.poses.wxyz_xyz[place], identity)
+    root = xp.concatenate([by_pose, prior.root[:, prior.root.shape[1] - tail :]], 1)
     return eqx.tree_at(lambda term: (term.root, term.poses.wxyz_xyz), prior, (root, poses))
 
 
-def _order_of(given: Any, count: int) -> Int[Array, " n"]:
+def _order_of(given: Any, count: int) -> Int[Array, " n"] | np.ndarray:
     if isinstance(given, jax.core.Tracer):
         return given
     order = real_numbers("order", given)
@@ -138,7 +148,7 @@ def _order_of(given: Any, count: int) -> Int[Array, " n"]:
     distinct = len(np.unique(known)) == len(known)
     if order.ndim != 1 or order.dtype.kind not in "iu" or not distinct or known.max(initial=0) >= count:
         raise InputError(f"`order` must have distinct whole numbers below {count}, or -1, got {order.tolist()}")
-    return jnp.asarray(order)
+    return order
 
 
 def _linearisation_point(prior: MarginalPrior, state: State) -> State:

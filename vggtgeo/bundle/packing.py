@@ -48,6 +48,7 @@ from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.node import DenseTerm, IntrinsicsPrior
 from vggtgeo.bundle.terms.reprojection import LineTerm, PointTerm
 from vggtgeo.bundle.terms.term import AbstractTerm, check_padded
+from vggtgeo.compilation.program_cache import to_device
 from vggtgeo.geometry.line_segments import fractions, straightened
 from vggtgeo.io.argument_checks import check_kind, real_numbers
 from vggtgeo.io.errors import InputError
@@ -115,9 +116,9 @@ def pack(
         pixels=_per_slot(index, observations.pixel, 0.0, dtype),
         edges=graph,
         terms=(*seen, _intrinsics_prior(cameras, dtype), *(_padded(term, index, size, dtype) for term in terms)),
-        fixed_pose=jnp.asarray(np.concatenate([fixed, np.ones(padding, bool)])),
-        fixed_intrinsics=jnp.asarray(cameras.fixed),
-        camera_of=None if camera_of is None else jnp.asarray(np.pad(camera_of, (0, padding)), jnp.int32),
+        fixed_pose=to_device(np.concatenate([fixed, np.ones(padding, bool)])),
+        fixed_intrinsics=to_device(cameras.fixed),
+        camera_of=None if camera_of is None else to_device(np.pad(camera_of, (0, padding)), np.int32),
         host=host,
         camera=cameras.model,
     )
@@ -132,9 +133,9 @@ def pack(
         problem, depths = _with_segments(problem, depths, present, size)
     # Padding keyframes are fixed and unobserved, but a quaternion of length zero would be NaN when normalised.
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (padding, 1))
-    start = jaxlie.SE3(jnp.asarray(np.concatenate([poses, identity]), dtype))
+    start = jaxlie.SE3(to_device(np.concatenate([poses, identity]), dtype))
     offset = jnp.zeros((index.shape[0], size.points, 2), dtype) if problem.pixel_terms else None
-    return problem, State(start, jnp.asarray(cameras.values, dtype), depths, offset), index
+    return problem, State(start, to_device(cameras.values, dtype), depths, offset), index
 
 
 def _as_arrays(observations: Observations) -> Observations:
@@ -165,7 +166,7 @@ def _layout(
     place = np.argsort(order)  # of each edge among the sorted ones
     if size.rows is None:
         return size, stored, None, SlotIndex(row, slot, position[place], shape)
-    host = jnp.asarray(np.repeat(np.arange(size.keyframes), rows), jnp.int32)
+    host = to_device(np.repeat(np.arange(size.keyframes), rows), np.int32)
     return size, stored, host, SlotIndex(row, slot, position[place], shape, part, step[place])
 
 
@@ -176,7 +177,7 @@ def _terms_of_observations(
     seen, every = observations, np.arange(len(observations.host))
     kernel = seen.kernel
     if kernel is None:
-        kernel = Cauchy(jnp.asarray(1.5, dtype))
+        kernel = Cauchy(to_device(1.5, dtype))
     else:
         check_kernel("kernel", kernel)
     points = {"target": seen.point_target.astype(float), "weight": seen.point_weight, "kernel": kernel}
@@ -200,7 +201,9 @@ def _intrinsics_prior(cameras: Intrinsics, dtype: DTypeLike) -> IntrinsicsPrior:
     mean = np.asarray(cameras.prior_mean)
     weight = np.broadcast_to(_weight_of(np.asarray(cameras.prior_sigma)), mean.shape)
     return IntrinsicsPrior(
-        index=jnp.arange(mean.size), mean=jnp.asarray(mean.ravel(), dtype), weight=jnp.asarray(weight.ravel(), dtype)
+        index=to_device(np.arange(mean.size)),
+        mean=to_device(mean.ravel(), dtype),
+        weight=to_device(weight.ravel(), dtype),
     )
 
 
@@ -219,7 +222,7 @@ def _depth_prior(observations: Observations, kernel: AbstractKernel, dtype: DTyp
         "mean": fill(observations.depth_mean, 1.0),
         "sigma": sigma,
         "weight": fill(observations.depth_weight, 1.0 if given else 0.0),
-        "alpha": jnp.asarray(observations.alpha, dtype),
+        "alpha": to_device(observations.alpha, dtype),
         "kernel": kernel,
     }
 
@@ -228,7 +231,7 @@ def _per_slot(index: SlotIndex, values: np.ndarray, empty: float, dtype: DTypeLi
     rows, _, slots = index.shape
     array = np.full((rows, slots, *np.shape(values)[1:]), empty, dtype)
     array[index.host, index.slot] = values
-    return jnp.asarray(array)
+    return to_device(array)
 
 
 def _with_segments(problem: Problem, depths: Array, present: Array, size: PaddedSize) -> tuple[Problem, Array]:
@@ -278,7 +281,7 @@ def _placed(term: FlatTerm, index: SlotIndex, slots: tuple[int, int], dtype: DTy
         real = np.issubdtype(values.dtype, np.floating)
         whole = np.full((outer, end - first, *values.shape[1:]), empty if real else 0, dtype if real else values.dtype)
         whole[at] = values
-        return jnp.asarray(whole)
+        return to_device(whole)
 
     given = term.rows()
     weight = scatter(np.asarray(given.pop("weight"), float), 0.0)

@@ -22,6 +22,7 @@ from vggtgeo.bundle.observations import FlatTerm, Observations
 from vggtgeo.bundle.problem import Edges
 from vggtgeo.bundle.terms.node import CameraTerm, PairTerm, PoseTerm
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.compilation.program_cache import to_device
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.line_segments import numbered, segment_slots
 from vggtgeo.io.errors import InputError
@@ -338,6 +339,6 @@ def pad_edges(edges: np.ndarray, size: PaddedSize, rows: np.ndarray) -> tuple[Ed
         ends[(position + part * step)[there]] = target[there]
     of_host = np.full((len(host), size.degree), len(row))
     of_host[row, index] = np.arange(len(row))
-    arrays = (jnp.asarray(array, jnp.int32) for array in (host[row], ends, index, of_host))
-    own = None if size.rows is None else jnp.asarray(row, jnp.int32)
+    arrays = (to_device(array, np.int32) for array in (host[row], ends, index, of_host))
+    own = None if size.rows is None else to_device(row, np.int32)
     return replace(Edges(*arrays), row_of=own), position, step

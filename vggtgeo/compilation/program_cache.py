@@ -26,6 +26,7 @@ import equinox as eqx
 import jax
 import jax.export
 import numpy as np
+from jax.typing import DTypeLike
 
 from vggtgeo.io.files import atomic_open
 from vggtgeo.io.process import return_freed_memory
@@ -73,7 +74,7 @@ class CachedProgram(Generic[_Result]):
         if folder is None or named is None:
             return None
         arrays = [leaf for leaf in jax.tree.leaves(args) if _is_array(leaf)]
-        result = jax.tree.structure(self._result(*args))
+        result = jax.tree.structure(eqx.filter_eval_shape(self._result, *args))
         path = folder / f"{self._function.__name__}-{_digest(named)}.stablehlo"
         exported = _read(path)
         if exported is None:
@@ -114,6 +115,12 @@ class CachedProgram(Generic[_Result]):
         except OSError:  # a full disk costs only time
             return None
         return _read(path)
+
+
+def to_device(values: Any, dtype: DTypeLike | None = None) -> jax.Array:
+    """Return values of NumPy as an array of JAX, without the program that `jnp.asarray` compiles for each shape."""
+    found: jax.Array = jax.device_put(np.asarray(values, dtype))
+    return found
 
 
 class _Program:

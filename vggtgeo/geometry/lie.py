@@ -23,8 +23,6 @@ TANGENT = 6
 """Coordinates of a tangent."""
 NEAR = 4e-3
 """Squared angles below which series replace closed forms that cancel, rad^2; neither errs by more than 1e-14."""
-
-
 SKEW = rigid.skew(np.eye(3))
 """[3, 3, 3]: `w` contracted with the first axis is the matrix of `w x`."""
 PRODUCT = np.zeros((4, 4, 4))
@@ -33,6 +31,11 @@ PRODUCT[0] = np.eye(4)
 PRODUCT[1:, 1:, 1:] = SKEW
 PRODUCT[[1, 2, 3], 0, [1, 2, 3]] = -1.0
 PRODUCT[[1, 2, 3], [1, 2, 3], 0] = 1.0
+_SCALED = np.concatenate([np.eye(3)[None], SKEW])  # w + [u], linear in the quaternion (w, u)
+_AXIS = np.eye(4)[:, 1:]
+ROTATION = np.einsum("ka,lb->klab", _AXIS, _AXIS) + np.einsum("kac,lcb->klab", _SCALED, _SCALED)
+"""[4, 4, 3, 3]: the products of a quaternion's entries contracted with the first axes are its rotation matrix times
+its squared norm, `u u^T + (w + [u])^2`."""
 ADJOINT = np.zeros((6, 6, 6))
 """[6, 6, 6]: a tangent contracted with the first axis is its adjoint `ad`, the commutator with it."""
 ADJOINT[3:, :3, :3] = ADJOINT[3:, 3:, 3:] = ADJOINT[:3, :3, 3:] = SKEW
@@ -62,11 +65,9 @@ def _parts(pose: jaxlie.SE3) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 3"]
 
 
 def _rotation(wxyz: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    # v -> q v q^-1 with `q = (w, u)`: R = (u u^T + (w + [u])^2) / |q|^2, for quaternions of text files, too.
-    axis = wxyz[..., 1:]
-    half = skew(axis) + wxyz[..., :1, None] * np.eye(3, dtype=wxyz.dtype)
-    scaled = axis[..., :, None] * axis[..., None, :] + matmul(half, half)
-    return scaled / jnp.sum(wxyz * wxyz, -1)[..., None, None]
+    # Of `q v q^-1`, so that quaternions of text files need no norm of one.
+    entries = (wxyz[..., :, None] * wxyz[..., None, :]).reshape(*wxyz.shape[:-1], 16)
+    return _matrix(ROTATION.reshape(16, 3, 3), entries) / jnp.sum(wxyz * wxyz, -1)[..., None, None]
 
 
 def _compose(left: jaxlie.SE3, right: jaxlie.SE3) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 3"]]:
@@ -143,26 +144,21 @@ def log(pose: jaxlie.SE3) -> Float[Array, "*n 6"]:
     wxyz = jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
     cosine, axis = wxyz[..., :1], wxyz[..., 1:]
     squared = jnp.sum(axis * axis, -1, keepdims=True)
-    tiny = squared < 1e-3
+    tiny = squared < NEAR / 4  # of half the angle
     sine = jnp.sqrt(jnp.where(tiny, 1.0, squared))
+    half = jnp.arctan2(sine, cosine)
     # atan(x) / x as a series, x = sin / cos of half the angle.
     ratio = jnp.where(tiny, squared, 0.0) / cosine**2
     series = 1 - ratio / 3 + ratio**2 / 5 - ratio**3 / 7 + ratio**4 / 9
-    w = 2 * axis * jnp.where(tiny, series / jnp.where(tiny, cosine, 1.0), jnp.arctan2(sine, cosine) / sine)
-    angle2 = jnp.sum(w * w, -1, keepdims=True)
+    w = 2 * axis * jnp.where(tiny, series / jnp.where(tiny, cosine, 1.0), half / sine)
     # V^-1 = I - [w] / 2 + c [w]^2 with c = (1 - a / 2 cot(a / 2)) / a^2 (Barfoot, State Estimation, 7.1).
+    angle2 = jnp.sum(w * w, -1, keepdims=True)
     near = 1 / 12 + angle2 / 720 + angle2**2 / 30240 + angle2**3 / 1209600
-    safe = jnp.where(angle2 < NEAR, 1.0, angle2)
-    factor = jnp.where(angle2 < NEAR, near, (1 - _half_cotangent(safe)) / safe)
+    factor = jnp.where(tiny, near, (1 - half * cosine / sine) / (2 * half) ** 2)
     across = skew(w)
     turned = _times(across, t)
     v = t - turned / 2 + factor * _times(across, turned)
     return jnp.concatenate([v, w], -1)
-
-
-def _half_cotangent(squared_angle: Array) -> Array:
-    half = jnp.sqrt(squared_angle) / 2
-    return half / jnp.tan(half)
 
 
 def log_derivative(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 6 6"]:
@@ -174,7 +170,8 @@ def log_derivative(tangent: Float[Array, "*n 6"]) -> Float[Array, "*n 6 6"]:
     squared = jnp.sum(tangent[..., 3:] ** 2, -1)[..., None, None]
     near = squared < NEAR
     safe = jnp.where(near, 1.0, squared)
-    short = 1 - _half_cotangent(safe)
+    half = jnp.sqrt(safe) / 2
+    short = 1 - half / jnp.tan(half)
     # `a / 2 cot(a / 2)` differentiated by the squared angle.
     slope = (1 - short) * short / (2 * safe) - 1 / 8
     second = jnp.where(near, 1 / 12 - squared**2 / 30240, (2 * short) / safe + slope)

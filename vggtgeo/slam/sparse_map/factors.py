@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
 from vggtgeo.bundle.terms.measured_pose import BaselinePrior, RelativePose, RotationPrior, SurfaceAlignment, quadratic
 from vggtgeo.bundle.terms.term import AbstractTerm
+from vggtgeo.compilation.program_cache import to_device
 from vggtgeo.geometry import rigid
 from vggtgeo.solvers.kernels import Cauchy
 
@@ -128,17 +128,17 @@ def surface_term(
     Their normal equations `[m, 6, 6]`, `[m, 6]` are over the left tangent of the relative poses `[m, 4, 4]`, for pairs
     of rows of the problem. A zero Hessian is a pair that was not aligned.
     """
-    at = jnp.asarray(rigid.to_quaternion(relative))
-    measured, root = _quadratic_jit(at, jnp.asarray(hessians), jnp.asarray(gradients))
+    at = to_device(rigid.to_quaternion(relative))
+    measured, root = _quadratic_jit(at, to_device(hessians), to_device(gradients))
     first, second = np.asarray(pairs, int).reshape(-1, 2).T
     # A zero Hessian has no minimum: its `measured` pose is a placeholder.
     aligned = np.any(hessians != 0, (1, 2)).astype(np.float64)
     return SurfaceAlignment(
-        first=jnp.asarray(first, jnp.int32),
-        second=jnp.asarray(second, jnp.int32),
+        first=to_device(first, np.int32),
+        second=to_device(second, np.int32),
         measured=measured,
         root=root,
-        weight=jnp.asarray(aligned),
+        weight=to_device(aligned),
     )
 
 
@@ -148,14 +148,14 @@ def _rotations(own: Sequence[MeasuredRotation], places: Mapping[int, int], room:
         measured[row] = Rotation.from_matrix(factor.rotation).as_quat(scalar_first=True)
     return RotationPrior(
         keyframe=_padded([places[factor.keyframe] for factor in own], room),
-        measured=jnp.asarray(measured),
+        measured=to_device(measured),
         root=_roots([factor.information for factor in own], 3, room),
         weight=_present(own, room),
     )
 
 
 def _baselines(own: Sequence[MeasuredBaseline], places: Mapping[int, int], room: int) -> BaselinePrior:
-    read = lambda name: jnp.asarray([*(getattr(factor, name) for factor in own), *[1.0] * (room - len(own))])
+    read = lambda name: to_device([*(getattr(factor, name) for factor in own), *[1.0] * (room - len(own))])
     return BaselinePrior(
         first=_padded([places[factor.first] for factor in own], room),
         second=_padded([places[factor.second] for factor in own], room),
@@ -167,7 +167,7 @@ def _baselines(own: Sequence[MeasuredBaseline], places: Mapping[int, int], room:
 
 def _relative_poses(own: Sequence[MeasuredRelativePose], places: Mapping[int, int], room: int) -> RelativePose:
     placed = [replace(factor, first=places[factor.first], second=places[factor.second]) for factor in own]
-    return RelativePose(**relative_pose_rows(placed, room), kernel=Cauchy(jnp.asarray(FACTOR_WIDTH)))
+    return RelativePose(**relative_pose_rows(placed, room), kernel=Cauchy(to_device(FACTOR_WIDTH)))
 
 
 def relative_pose_rows(own: Sequence[MeasuredRelativePose], room: int | None = None) -> dict[str, Any]:
@@ -179,18 +179,18 @@ def relative_pose_rows(own: Sequence[MeasuredRelativePose], room: int | None = N
     return {
         "first": _padded([factor.first for factor in own], room),
         "second": _padded([factor.second for factor in own], room),
-        "measured": jnp.asarray(rigid.to_quaternion(poses)),
+        "measured": to_device(rigid.to_quaternion(poses)),
         "root": _roots([factor.information for factor in own], 6, room),
         "weight": _present(own, room),
     }
 
 
 def _padded(rows: list[int], room: int) -> Array:
-    return jnp.asarray([*rows, *[0] * (room - len(rows))], jnp.int32)
+    return to_device([*rows, *[0] * (room - len(rows))], np.int32)
 
 
 def _present(own: Sequence[Factor], room: int) -> Array:
-    return jnp.asarray((np.arange(room) < len(own)).astype(np.float64))
+    return to_device((np.arange(room) < len(own)).astype(np.float64))
 
 
 def _roots(information: Sequence[np.ndarray], size: int, room: int) -> Array:
@@ -200,4 +200,4 @@ def _roots(information: Sequence[np.ndarray], size: int, room: int) -> Array:
         # Not Cholesky: the information of a motion may be singular.
         values, vectors = np.linalg.eigh(np.asarray(information))
         whole[: len(information)] = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
-    return jnp.asarray(whole)
+    return to_device(whole)
