@@ -12,6 +12,7 @@ from vggtgeo.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from vggtgeo.benchmark.rows import Row
+    from vggtgeo.benchmark.runner import BenchReport
 
 
 def bench(
@@ -55,7 +56,6 @@ def bench(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from vggtgeo.benchmark.cluster import Cluster
-    from vggtgeo.benchmark.runner import OUTPUTS
     from vggtgeo.benchmark.runner import bench as run_suite  # brings JAX, which --help does without
     from vggtgeo.benchmark.suite import load_suite, shipped
 
@@ -92,11 +92,18 @@ def bench(
             progress=advance,
             cluster=Cluster(address, cpus, gpus) if engine == "ray" else None,
         )
+    _print(report, folder, quiet=quiet, as_json=as_json)
+    if not any(row["status"] == "ok" for row in report.rows):
+        raise typer.Exit(1)
+
+
+def _print(report: BenchReport, folder: Path, *, quiet: bool, as_json: bool) -> None:
+    """Print the tables of a suite, or its rows as JSON, and which files it wrote."""
+    from vggtgeo.benchmark.runner import OUTPUTS
+
     typer.echo(json.dumps(report.to_dict()) if as_json else report.markdown())
     if not (quiet or as_json):
         typer.echo(f"in {folder}: {' '.join(name for name in OUTPUTS if (folder / name).is_file())}", err=True)
-    if not any(row["status"] == "ok" for row in report.rows):
-        raise typer.Exit(1)
 
 
 def _line(row: Row) -> str:

@@ -102,6 +102,11 @@ def run_and_write(
         raise InputError(f"{unsaved}; all other results are in `{output}`")
     if wanted.rerun == "serve":
         serve_until_interrupted(url, silent)
+    _exit_unless_complete(result)
+
+
+def _exit_unless_complete(result: Result) -> None:
+    """Exit with the code of an interrupted or a failed run."""
     if result.summary["interrupted"]:
         raise typer.Exit(EXIT_INTERRUPTED)
     if result.verdict.level == "failed":

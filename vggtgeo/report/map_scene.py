@@ -131,12 +131,8 @@ def map_scene(
     aligned = _aligned(truth, trajectory, metric and truth_in_metres)
     if aligned is not None:
         arrays["truth"] = _thinned(place(aligned.positions))
-    sigma = _sigma_at(uncertainty, keyframes)
     poses = np.array([keyframe.pose for keyframe in keyframes]).reshape(-1, 4, 4)
-    arrays["cameras"] = place(_frustums(poses, intrinsics, _FRUSTUM * extent)).astype(np.float32)
-    images = [keyframe.image or b"" for keyframe in keyframes]
-    arrays["image_ends"] = np.cumsum([0, *map(len, images)]).astype(np.uint32)
-    arrays["images"] = np.frombuffer(b"".join(images), np.uint8)
+    _add_cameras(arrays, keyframes, place(_frustums(poses, intrinsics, _FRUSTUM * extent)))
     header: dict[str, object] = {
         "unit": "m" if metric else "",
         "points": len(shown),
@@ -147,16 +143,31 @@ def map_scene(
         "extent": extent,
         "middle": (0.5 * (low + high)).tolist(),
         "cut": float(path[:, 2].max() + _HEADROOM * extent),
-        "keyframes": [
-            {
-                "name": keyframe.name,
-                "time": round(keyframe.timestamp, 3),
-                "sigma": None if np.isnan(own) else float(own),
-            }
-            for keyframe, own in zip(keyframes, sigma, strict=True)
-        ],
+        "keyframes": _named(keyframes, uncertainty),
     }
     return _packed(header, arrays)
+
+
+def _add_cameras(
+    arrays: dict[str, np.ndarray], keyframes: Sequence[Pictured], frustums: Float[np.ndarray, "k 5 3"]
+) -> None:
+    """Add the cameras of the keyframes, and their images in one array with the end of each."""
+    arrays["cameras"] = frustums.astype(np.float32)
+    images = [keyframe.image or b"" for keyframe in keyframes]
+    arrays["image_ends"] = np.cumsum([0, *map(len, images)]).astype(np.uint32)
+    arrays["images"] = np.frombuffer(b"".join(images), np.uint8)
+
+
+def _named(keyframes: Sequence[Pictured], uncertainty: PoseUncertainty | None) -> list[dict[str, object]]:
+    """Return what the view writes about each keyframe."""
+    return [
+        {
+            "name": keyframe.name,
+            "time": round(keyframe.timestamp, 3),
+            "sigma": None if np.isnan(own) else float(own),
+        }
+        for keyframe, own in zip(keyframes, _sigma_at(uncertainty, keyframes), strict=True)
+    ]
 
 
 def _packed(header: dict[str, object], arrays: dict[str, np.ndarray]) -> MapScene:

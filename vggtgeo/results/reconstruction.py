@@ -189,16 +189,20 @@ def reconstruct(
             hooks.each("on_adjust", slam)
             if not interrupted:
                 slam, interrupted = _finish(slam, perception.roles, settings, hooks, stop)
-        summary_facts = {
-            **perception.facts(),
-            **options.facts,
-            "frames_per_second": round(rate, 2),
-            "interrupted": interrupted,
-            **reduction_summary(source, slam),
-            **prior_summary(slam, perception.roles),
-            **({} if overlay.found is None else {"static_overlay": round(overlay.found.share, 4)}),
-        }
-        return _conclude(slam, loop, options, summary_facts, (windows, evidence, overlay))
+        run = {"frames_per_second": round(rate, 2), "interrupted": interrupted}
+        facts = {**perception.facts(), **options.facts, **run, **_facts_of_input(source, slam, perception, overlay)}
+        return _conclude(slam, loop, options, facts, (windows, evidence, overlay))
+
+
+def _facts_of_input(
+    source: Source, slam: Slam, perception: Perception, overlay: StaticOverlaySearch
+) -> Mapping[str, Any]:
+    """Return the entries of the summary about reduced images, recorded poses, and a static overlay."""
+    return {
+        **reduction_summary(source, slam),
+        **prior_summary(slam, perception.roles),
+        **({} if overlay.found is None else {"static_overlay": round(overlay.found.share, 4)}),
+    }
 
 
 def _conclude(

@@ -145,9 +145,9 @@ def simulate_window(
         SimulatedWindow(3 keyframes, 60 point and 24 line observations, 6 of them wrong, noise 0.5 px)
 
     """
-    for name, value, least in (("keyframes", keyframes, 2), ("points", points, 0), ("lines", lines, 0)):
+    whole = (("keyframes", keyframes, 2), ("points", points, 0), ("lines", lines, 0), ("seed", seed, 0))
+    for name, value, least in whole:
         check_whole(name, value, least)
-    check_whole("seed", seed)
     for name, error in (("noise", noise), ("depth_error", depth_error), ("start_error", start_error)):
         check_within(name, error, 0, _MAX_ERROR)
     check_within("outliers", outliers, 0, 1)
@@ -161,10 +161,8 @@ def simulate_window(
     point_edge, point_landmark = _seen(edges, host)
     target = project_between(poses, edges[point_edge], pixel[point_landmark], depth[point_landmark])
     target = target + rng.normal(0, noise, target.shape)
-    outlier = np.zeros(len(target), bool)
-    outlier[rng.permutation(len(target))[: round(outliers * len(target))]] = True
-    angle, size = rng.uniform(0, 2 * np.pi, len(target)), rng.uniform(10, 30, len(target))
-    target[outlier] += (size[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1))[outlier]
+    outlier, wrong = _outliers(len(target), outliers, rng)
+    target[outlier] += wrong[outlier]
     line_edge, line_landmark = _seen(edges, line_host)
     coefficients = _lines(poses, edges[line_edge], line_pixel, line_depth, line_landmark)
     segment = line_edge * (line_landmark.max(initial=0) + 1) + line_landmark // _SAMPLES
@@ -191,8 +189,15 @@ def simulate_window(
         alpha=2.0,
         pixel_sigma=1.0 if host_noise else None,
     )
-    true = np.concatenate([pixel, line_pixel])
-    return SimulatedWindow(observations, poses, inverse, start, outlier, noise, true)
+    return SimulatedWindow(observations, poses, inverse, start, outlier, noise, np.concatenate([pixel, line_pixel]))
+
+
+def _outliers(count: int, share: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return which of `count` matches are wrong, bool [count], and errors of 10 to 30 pixels, [count, 2]."""
+    outlier = np.zeros(count, bool)
+    outlier[rng.permutation(count)[: round(share * count)]] = True
+    angle, size = rng.uniform(0, 2 * np.pi, count), rng.uniform(10, 30, count)
+    return outlier, size[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 def centres_of(poses: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 3"]:

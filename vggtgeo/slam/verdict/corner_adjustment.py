@@ -121,18 +121,26 @@ def linearise(tracks: Tracks, unknowns: Unknowns, noise: Noise, columns: np.ndar
     by_point[:, 2, 2] -= z / (inverse * depth)
     by_pose = np.concatenate([by_scaled * inverse[:, None, None], by_scaled @ -rigid.skew(scaled)], 2)
 
-    measured = np.column_stack([tracks.pixels, np.log(tracks.depth)])
-    known = np.isfinite(measured) & ~behind[:, None]
-    # The error of a measured depth is common to its track.
-    sigma = np.column_stack([np.full((count, 2), noise.pixel), noise.depth * np.sqrt(tracks.depths)])
-    whiten = np.where(known, 1.0 / sigma, 0.0)
-    residual = (predicted - np.where(known, measured, 0.0)) * whiten
+    measured, whiten = _measured(tracks, noise, behind)
+    residual = (predicted - measured) * whiten
     square = np.column_stack([np.sum(residual[:, :2] ** 2, 1), residual[:, 2] ** 2]) / KERNEL**2
     square[behind, 0] = (BEHIND / KERNEL) ** 2
     weight = (1.0 / (1.0 + square))[:, [0, 0, 1]]
     loss = KERNEL**2 * np.log1p(square).sum(1)
     by_pose, by_point, by_theta = (whiten[:, :, None] * by for by in (by_pose, by_point, by_theta))
     return Fit(tracks, noise, unknowns, columns, residual, weight, by_pose, by_point, by_theta, loss)
+
+
+def _measured(tracks: Tracks, noise: Noise, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels and logarithm of the depth of each corner [m, 3], and one over their standard deviations [m, 3].
+
+    Both are zero where nothing was measured, and for points `behind` a camera, bool [m].
+    """
+    measured = np.column_stack([tracks.pixels, np.log(tracks.depth)])
+    known = np.isfinite(measured) & ~behind[:, None]
+    # The error of a measured depth is common to its track.
+    sigma = np.column_stack([np.full((len(measured), 2), noise.pixel), noise.depth * np.sqrt(tracks.depths)])
+    return np.where(known, measured, 0.0), np.where(known, 1.0 / sigma, 0.0)
 
 
 def reduce(fit: Fit, columns: np.ndarray, poses_free: bool, damping: float) -> SchurComplement:
