@@ -17,6 +17,11 @@ POSE_GATE = float(chi2.isf(RARE, 6))
 """Gate of a squared Mahalanobis distance between poses, 6 degrees of freedom: one right pose in 10,000 is rejected."""
 TINY = float(np.finfo(np.float32).tiny)
 """Smallest normal number in single precision: bounds a divisor whose numerator is zero where it acts."""
+ROUNDING = 1e-12
+"""Largest rounding errors of a balanced information matrix, as a share of its largest eigenvalue: some thousand
+roundings in double precision."""
+FEW = 20
+"""Fewest samples that a median or a share is taken of: their standard errors are a quarter of the deviation and 0.1."""
 REGULARISER = 1e-9
 """Information, 1/m^2 and 1/rad^2, that makes a singular matrix invertible: a standard deviation of 30 km."""
 

@@ -33,7 +33,7 @@ MAX_SHIFT = 1.0
 """Pixels by which errors of the keyframe's depths may move its points in the image: the noise of a match. Beyond it
 the map, not the image, limits the pose."""
 THIRD_VIEW = 0.25
-"""Share of these limits at which a map gets its third keyframe."""
+"""Share of these limits at which a map gets its third keyframe: early, since nothing checks the depths of two."""
 
 
 def becomes_keyframe(slam: Slam, found: TrackedFrame, settings: KeyframeSettings) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 
 from vggtgeo.compilation.process_settings import in_double_precision
 from vggtgeo.geometry.camera import Camera
+from vggtgeo.geometry.robust import FEW
 from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.persistence import Format, by_name
@@ -30,8 +31,6 @@ MAP = Format("map", VERSION, by_name(STATE_CLASSES))
 MIN_REDESCRIBED = 0.2
 """Minimum share of a keyframe's key points matched by a new description of its stored image. The same descriptors give
 0.7 or more, others nearly none."""
-FEW = 20
-"""Number of key points below which this is not checked."""
 SAME_CAMERA = 2 * FOCAL_SIGMA
 """Largest relative difference of focal lengths and principal point between calibrations of one camera."""
 

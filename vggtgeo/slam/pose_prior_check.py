@@ -38,7 +38,8 @@ SIGNIFICANT = -float(np.log(RARE))
 FOLLOWING = 0.5
 """Share of the tracked motions that follow the recording, if it is of these images."""
 MAX_OTHERS = 32
-"""Recorded motions of other times that each motion is compared with, spread over the record."""
+"""Recorded motions of other times that each motion is compared with, spread over the record: three that fit best
+of so many are already significant."""
 
 
 @dataclass(frozen=True)

@@ -26,17 +26,18 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.state import Slam
 
 CALIBRATION_FRAMES = 150
-"""Frames that a run calibrates an unknown camera on. Where frames cannot be read twice (a live camera, a stream), it is
-estimated while tracking."""
-FRAMES_PER_PASS = 50
-"""Frames, evenly spread over these, that are enough to link the keyframes, which are what determines the camera. If
-tracking is lost between them, all are tracked."""
+"""Frames that a run calibrates an unknown camera on: five seconds of a video. Where frames cannot be read twice (a live
+camera, a stream), it is estimated while tracking."""
+FRAMES_PER_PASS = CALIBRATION_FRAMES // 3
+"""Every third of these frames: enough to link the keyframes, which are what determines the camera. If tracking is lost
+between them, all are tracked."""
 MIN_KEYFRAMES = 10
 """Keyframes that self-calibration without depth needs; as many as a window has: a smaller map is adjusted as a whole
 while tracking, and its few keyframes have little parallax. With depth, as many as the last adjustment needs."""
 MAX_PASSES, CONVERGED = 3, 0.03
 """Passes over the calibration frames, and the relative change of the focal length that ends them. A lens with strong
-distortion needs more than one pass: the first finds a focal length without the lens."""
+distortion needs more than one pass: the first finds a focal length without the lens. The run's last adjustment corrects
+what is left."""
 MIN_TRACKED = 0.5
 """Share of the calibration frames that must be tracked; otherwise their camera estimate is not used."""
 

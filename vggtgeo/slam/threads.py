@@ -18,6 +18,9 @@ _Result = TypeVar("_Result")
 
 MAX_THREADS = 4
 """More wait for Python's lock: the pieces here are some milliseconds long."""
+BATCH = 128
+"""Pairs of keyframes that one call works on, of some hundred matches each: 10 MB, where all at once would take
+gigabytes."""
 PATIENCE = 5.0
 """Seconds that whoever stops early waits for what is being made."""
 

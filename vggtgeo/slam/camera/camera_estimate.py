@@ -18,9 +18,7 @@ GUESSED_FOCAL_SIGMA = 0.3
 (`Camera.guess`), and one standard deviation spans 48 to 79."""
 GUESSED_CENTRE_SIGMA = 0.02
 """Standard deviation of a guessed principal point, in image widths and heights: the published calibrations of TUM
-RGB-D, EuRoC, KITTI and ICL-NUIM are 0.014 off the middle (root mean square)."""
-GUESSED = 0.1
-"""Relative standard deviation of the focal length above which a prior belongs to a guessed camera."""
+RGB-D, EuRoC, KITTI and ICL-NUIM are 0.014 off the middle (root mean square); more, as these are few cameras."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,8 @@ class CameraEstimate:
     @property
     def calibrated(self) -> bool:
         """Whether the camera was given, not guessed. The `sigma` of a self-calibrated one may be small, too."""
-        return bool(not self.self_calibrated and self.sigma[0] < GUESSED * self.given[0])
+        # A prior is that of a known camera or of a guess, which is a million times wider.
+        return bool(not self.self_calibrated and self.sigma[0] < GUESSED_FOCAL_SIGMA / 2 * self.given[0])
 
     def window_sigma(self, keyframes: int) -> np.ndarray:
         """Return the prior standard deviation of the intrinsics in a window, float64 [4], pixels.

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.stats import chi2 as chi_square
 
 from vggtgeo.bundle.problem import Problem, State
-from vggtgeo.geometry import rigid
+from vggtgeo.geometry import lie, rigid
 from vggtgeo.geometry.robust import TINY
 from vggtgeo.slam.camera.camera_comparison import CHANCE, gain
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate
@@ -41,12 +41,12 @@ from vggtgeo.slam.sparse_map.map import Map
 FOCAL_SIGMA = 0.01
 """Standard deviation of a given focal length, relative to it: that of manufacturers and calibration tools."""
 CENTRE = 0.002
-"""The same of the principal point, in focal lengths. It is smaller because a shift is nearly a rotation, which the
-images hardly tell from it."""
+"""The same of the principal point, in focal lengths: a pixel at a focal length of 500. It is smaller because a shift is
+nearly a rotation, which the images hardly tell from it."""
 SHARE = 0.5
 """Largest variance of a direction by the pairs, relative to the prior's, for which the direction is changed."""
 HELD_OUT = 0.2
-"""Share of the matches that is held out."""
+"""Share of the matches that is held out: enough for a test, and the map of the others is hardly less certain."""
 MIN_SEEN = 2
 """Minimum number of matches that each key point keeps."""
 SEED = 0
@@ -54,8 +54,8 @@ SEED = 0
 MAX_PAIRS = 1000
 """Maximum number of pairs, evenly spaced over all edges: bounds memory and time. Too few make the result depend on the
 seed (`benchmarks/seeds.py`)."""
-MIN_MATCHES = 15
-"""Minimum number of matches of a pair: three for each of the five parameters of its relative pose."""
+MIN_MATCHES = 3 * (lie.TANGENT - 1)
+"""Minimum number of matches of a pair: three for each parameter of its relative pose without scale."""
 MIN_FLOW = 3.0
 """Minimum median flow of a pair's matches, pixels: without motion the intrinsics are not observable."""
 BLOCK = 3

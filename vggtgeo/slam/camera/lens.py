@@ -44,8 +44,8 @@ RADIAL = 0.3
 MIN_WARP = 0.5
 """Largest displacement by the lens, pixels, for which it is removed: the noise of a match."""
 FIRST_WARP, PROBE = 1.0, 0.02
-"""Displacements of a corner by a coefficient, pixels: of the adjustments for second derivatives, and of the finite
-differences for first ones."""
+"""Displacements of a corner by a coefficient, pixels: of the adjustments for second derivatives, larger than what one
+leaves unconverged; of the finite differences for first ones, small against the noise of a match."""
 MAX_STEP = 10.0
 """Displacement of a corner by a step, pixels."""
 PROMISE = 0.05
@@ -217,6 +217,7 @@ def largest_shift(camera: Camera) -> float:
     sides = max(cx, camera.width - cx) / fx, max(cy, camera.height - cy) / fy
     side, corner = max(sides), np.hypot(*sides)
     # Undistorted radii up to 1.5 times a corner's: barrel distortion draws corners inwards.
+    # 300 are a pixel or two apart.
     radius = np.linspace(0.0, 1.5 * corner, 300)
     drawn = radius * (1 + k1 * radius**2 + k2 * radius**4)
     folds = np.append(np.diff(drawn) <= 0, True)
@@ -229,8 +230,8 @@ def largest_shift(camera: Camera) -> float:
 def composed(first: Camera, second: Camera) -> Camera:
     """Return the camera of both lenses in a row: `second` is that of images that were undistorted by `first`.
 
-    Its distortion (k1, k2, p1, p2) is the least-squares fit to both over the image; p1 and p2 are of the principal
-    point, which the second may have elsewhere.
+    Its distortion (k1, k2, p1, p2) is the least-squares fit to both at a grid of 400 pixels; p1 and p2 are of the
+    principal point, which the second may have elsewhere.
     """
     across, down = np.meshgrid(*(np.linspace(0, side - 1, 20) for side in (second.width, second.height)))
     ideal = np.column_stack([across.ravel(), down.ravel()])

@@ -23,7 +23,7 @@ import numpy as np
 
 from vggtgeo.geometry import rigid
 from vggtgeo.geometry.robust import inverse_information
-from vggtgeo.slam.threads import map_in_threads
+from vggtgeo.slam.threads import BATCH, map_in_threads
 
 MIN_PAIRS = 8
 """Half of the minimum number of pairs: each half determines the parameters, with two pairs for each of them."""
@@ -33,16 +33,16 @@ MIN_BLOCKS = PARAMETERS + 2
 """Minimum number of blocks: the covariance between them needs degrees of freedom beyond the parameters."""
 ITERATIONS, CONVERGED = 20, 0.002
 """Iteration limit, and the step, as a share of the longest one, that ends the iteration. Half the focal length is seven
-of the longest steps away."""
-BATCH = 200
-"""Pairs per batch, of some hundred points each: 20 MB."""
+of the longest steps away, and the step that ends it, 0.02 % of the focal length, is far below its noise."""
 HUBER = 1.0
 """Width of the kernel, pixels: the noise of a match."""
 MAX_RESIDUAL = 30.0
-"""Pixels: larger residuals are outliers and have no weight."""
-LONGEST_STEP = np.array([0.1, MAX_RESIDUAL, MAX_RESIDUAL, 0.1])
-"""Longest step of an iteration, in which the linearisation holds: 10 % of the focal length, 0.1 of k1, and pixels: a
-longer one would make outliers of all matches."""
+"""Pixels: larger residuals are outliers and have no weight. A guess that is 30 % off moves a match that has moved by
+100 pixels this far."""
+LONGEST_CHANGE = 0.1
+"""Longest step of an iteration, in which the linearisation holds: of the logarithm of the focal length, and of k1."""
+LONGEST_STEP = np.array([LONGEST_CHANGE, MAX_RESIDUAL, MAX_RESIDUAL, LONGEST_CHANGE])
+"""The same of all parameters; a longer step in pixels would make outliers of all matches."""
 PRIOR = 10 * LONGEST_STEP
 """Standard deviations: so weak that they only keep the problem solvable."""
 

@@ -33,24 +33,24 @@ from vggtgeo.slam.camera.camera_comparison import (
     shifted_problem,
 )
 from vggtgeo.slam.camera.camera_estimate import Readout
-from vggtgeo.slam.threads import map_in_threads
+from vggtgeo.slam.threads import BATCH, map_in_threads
 
 FIRST_SHIFT, CONVERGED = 1.0, 0.05
-"""Median displacement of matches, pixels: the first step of the search, and the step that ends it."""
+"""Median displacement of matches, pixels: the first step of the search, and the step that ends it, a tenth of the noise
+of a key point."""
 FASTEST = 1e6
 """Pixels a second: larger velocities come from landmarks at the camera's centre."""
 PROBE = CONVERGED
 """Step of the finite difference, in the same unit."""
 SOLVES = 6
 """Largest number of adjustments, in which a secant method finds the readout time."""
-BATCH = 128
-"""Edges per batch and thread: 15,000 at once would take gigabytes."""
 LONGEST = 2.0
 """Largest step relative to the previous one."""
 WORTH_A_TRIAL = 0.05
-"""Significance level of the slope (Student's t over keyframes) below which no search is made, which takes seconds."""
+"""Significance level of the slope (Student's t over keyframes) below which no search is made: one in twenty is in vain,
+and takes seconds."""
 USUAL_LARGEST = 90
-"""Percentile of the displacements that is reported."""
+"""Percentile of the displacements that is reported: the largest but for outliers and the nearest points."""
 
 Solve = Callable[[Problem, State], State]
 

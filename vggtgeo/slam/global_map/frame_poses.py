@@ -16,27 +16,25 @@ import numpy as np
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.gauss_newton import damped_step
-from vggtgeo.geometry.robust import sigma_by_median
+from vggtgeo.geometry.robust import FEW, sigma_by_median
 from vggtgeo.slam.camera.rolling_shutter import to_global_shutter
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.global_map.propagated_poses import camera_motions, frame_motions, propagated_poses
 from vggtgeo.slam.global_map.smooth_motion import smoothed
-from vggtgeo.slam.perception.rgbd_alignment import MIN_DEPTH
+from vggtgeo.slam.perception.rgbd_alignment import CONVERGED, MIN_DEPTH
 from vggtgeo.slam.sparse_map.map import submap_of
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.frame_refinement import tracked_information
 from vggtgeo.slam.tracking.pose_acceptance import tangent
 
-MIN_POINTS = 20
-"""With fewer points the pose stays as tracked."""
 WIDTH, MAX_WIDTH = 1.0, 8.0
 """Width of the Geman-McClure kernel, pixels: final and initial, halved in each step. A redescending kernel, because
 matches may be off by as much as the gate of tracking, some pixels (`benchmarks/between_keyframes.py`)."""
-STEPS, CONVERGED = 15, 1e-5
-"""Iteration limit; step, metres and radians, that ends the iteration: far below the noise of a pose."""
+STEPS = 15
+"""Iteration limit: three until the width is final, the others to converge."""
 MIN_NOISE = 0.01
-"""Smallest noise of a match, pixels: of their rounding."""
+"""Smallest noise of a match, pixels, below that of any image: a simulation has none, and its information is finite."""
 
 _FOUND: WeakKeyDictionary[Slam, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
 """Poses by the state that they are of, which never changes: the outputs of a run ask for them again and again, and each
@@ -124,7 +122,7 @@ def _resected(
 
     Robust; `pose` itself if there are few points, or the energy does not fall.
     """
-    if len(points) < MIN_POINTS:
+    if len(points) < FEW:
         return _Resected(pose)
     current, before = pose, _energy(points, pixels, pose, intrinsics)
     information, off = np.zeros((6, 6)), np.zeros((0, 2))
@@ -133,7 +131,7 @@ def _resected(
         width = max(MAX_WIDTH / 2**number, WIDTH)
         local = points @ current[:3, :3].T + current[:3, 3]
         front = local[:, 2] > MIN_DEPTH
-        if np.count_nonzero(front) < MIN_POINTS:
+        if np.count_nonzero(front) < FEW:
             return _Resected(pose)
         off = pinhole.project(local[front], intrinsics) - pixels[front]
         weight = 1.0 / (1.0 + (off**2).sum(1) / width**2) ** 2

@@ -13,6 +13,7 @@ from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.slam.camera.camera_estimate import KNOWN_SIGMA, MIN_KEYFRAMES_FOR_CAMERA
 from vggtgeo.slam.camera.given_camera import (
+    FOCAL_SIGMA,
     RefinedCamera,
     calibration_sigma,
     estimate_with_map,
@@ -40,8 +41,6 @@ from vggtgeo.slam.window.sliding_window import solve_jit, window_edges
 ROUNDS = 3
 """Adjustments of the whole map: each relinearises the dense depth between keyframes, which was aligned at the poses of
 the round before."""
-REPORTED_CHANGE = 0.01
-"""Relative change of the camera above which the user is informed."""
 MAX_NAMED = 4
 """Stretches of frames that a note names."""
 
@@ -263,7 +262,7 @@ def _apply_refined_camera(done: _Solved, found: RefinedCamera | None, settings: 
     if found is None or found.state is None or not (found.is_significant or always):
         return done.slam
     slam = _Solved.of(done.slam, done.adjustment, found.state).slam
-    if found.change <= REPORTED_CHANGE:
+    if found.change <= FOCAL_SIGMA:  # no more than calibrations differ
         return slam
     before, after = (", ".join(f"{value:.1f}" for value in camera) for camera in (found.given, found.wanted))
     change = 100 * found.change

@@ -22,7 +22,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.factors import MeasuredBaseline, MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import (
-    MAX_SCALE_ERROR,
+    RATIO_SIGMA,
     longer,
     measured_ratio,
     scaled_factor,
@@ -60,7 +60,7 @@ def join_submaps(slam: Slam, data: FrameData, roles: Roles, settings: SlamSettin
         matches = roles.points.match(old.features, new.features)
         both = matches.select(matches.index_j >= 0)
         ratio, error = measured_ratio(old, new, both, place.relative, slam.intrinsics)
-        if error >= MAX_SCALE_ERROR:
+        if error >= RATIO_SIGMA:
             return slam
         # Two fixed keyframes fix the scale.
         slam, fixed = scale_submap(slam, ratio, numbers), slam.window.members[:2]
@@ -126,7 +126,7 @@ def join_at_end(slam: Slam, roles: Roles) -> Slam:
 def _joined_by_loops(slam: Slam, main: tuple[int, ...], other: tuple[int, ...], roles: Roles) -> Slam | None:
     """Move the submap `other` to its place in `main`, and return the state; None if that place is unknown."""
     found = verified_loops(slam, _look_alike(slam.keyframes, main, other), roles)
-    loops = [loop for loop in found if loop.scale is not None and loop.scale.error < MAX_SCALE_ERROR]
+    loops = [loop for loop in found if loop.scale is not None and loop.scale.error < RATIO_SIGMA]
     best = slam
     agreeing: list[Loop] = []
     for loop in loops:

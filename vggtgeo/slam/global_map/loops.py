@@ -13,6 +13,7 @@ from vggtgeo.models.classical import can_search, pose_information
 from vggtgeo.models.roles import GeometryResult, PoseQuery
 from vggtgeo.slam.global_map.drift_correction import Loop, correct_drift
 from vggtgeo.slam.global_map.pose_graph import ScaleRatio
+from vggtgeo.slam.settings.groups import KeyframeSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.sparse_map.covisibility import NO_LINES, Pair, overlap, some_points
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -22,17 +23,19 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.threads import map_in_threads
 
 MIN_VISIBLE, MAX_TURN = 0.4, np.deg2rad(40)
-"""Share of one keyframe's points inside the other's image, and angle between them, for a pair to be proposed."""
+"""Share of one keyframe's points inside the other's image, and angle between them, for a pair to be proposed: with
+less, or farther apart, descriptors hardly give `MIN_INLIERS`, and verifying a pair costs as much as tracking a
+frame."""
 MAX_CANDIDATES = 3
 """Pairs that each keyframe proposes by the estimated poses."""
-MIN_INLIERS = 50
-"""Minimum number of PnP inliers of a loop (exclusive): keyframes far apart in time have no predicted pose for a check.
-"""
+MIN_INLIERS = KeyframeSettings.min_inliers
+"""Minimum number of PnP inliers of a loop (exclusive): as many as a frame needs that is tracked well by a keyframe.
+Keyframes far apart in time have no predicted pose for a check."""
 MAX_RATIO_ERROR = 0.3
 """Largest standard error of the logarithm of a measured scale ratio: larger ones are not normally distributed."""
 FLOOR = (0.02, np.deg2rad(0.5))
 """Systematic error of a verified pose, metres and radians: all its depths are those of one keyframe and share its
-error."""
+error, 1 % at 2 m."""
 
 
 def close_loops(slam: Slam, roles: Roles, settings: SlamSettings) -> Slam:

@@ -22,7 +22,7 @@ from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
 from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 SMALL = (16, 64)
-"""Keyframes of the smallest shapes; larger ones: 96, 128, 192, 256, ..."""
+"""Keyframes of the smallest shapes, compiled for any run: a short clip, and a room. Larger: 96, 128, 192, 256, ..."""
 MAX_PADDING = 2.0
 """Stored edges for each real one; a larger map with few edges keeps its own shape."""
 FACTORS, PAIRS = 2, 12
@@ -36,7 +36,7 @@ MAX_DENSE = 256
 half as fast as a band (docs/results/solver.md). But its program depends on the shape alone, not on the graph: it is
 compiled during the run, and serves other maps."""
 MAX_ITERATIONS = 40
-"""Iterations of an adjustment of the whole map, which mostly converges after fewer."""
+"""Iterations of an adjustment of the whole map, which mostly converges after fewer: bounds the time of the others."""
 
 
 class PaddedShape(NamedTuple):

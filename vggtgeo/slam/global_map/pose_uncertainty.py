@@ -22,6 +22,7 @@ from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.solver_choice import choose_reduced_solver
 from vggtgeo.compilation.program_cache import CachedProgram
 from vggtgeo.geometry import lie, rigid
+from vggtgeo.geometry.robust import ROUNDING
 from vggtgeo.slam.camera.given_camera import FOCAL_SIGMA
 from vggtgeo.slam.state import Slam, submaps_by_size
 from vggtgeo.solvers.arrow import ArrowSystem, moving_landmarks
@@ -50,9 +51,6 @@ FREE_SCALE = 0.02
 (`benchmarks/honest.py --whole --rgb-only`)."""
 SPREAD = 64
 """Number of keyframes, evenly spaced, that represent the others on graphs without a band: six sparse solves each."""
-
-FLOOR = 1e-12
-"""Regulariser of an information matrix with unit diagonal: above rounding errors, far below what a map constrains."""
 
 
 class PoseUncertainty(NamedTuple):
@@ -169,11 +167,11 @@ def sparse_worst(problem: Problem, state: State, asked: np.ndarray) -> tuple[np.
         return np.full((len(asked), 2), np.nan), 1.0
     free = np.flatnonzero(np.asarray(system.free))
     diagonal = information.diagonal()[free]
-    # Balanced to a unit diagonal, so that `FLOOR` is relative to each coordinate.
+    # Balanced to a unit diagonal, so that `ROUNDING`, far below what a map constrains, is relative to each coordinate.
     unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scale = sp.diags_array(unit)
     # What nothing determines comes out as very uncertain, where the factor of a singular matrix would be an error.
-    inverse = definite_factor(scale @ information[free][:, free] @ scale + FLOOR * sp.eye_array(len(free)))
+    inverse = definite_factor(scale @ information[free][:, free] @ scale + ROUNDING * sp.eye_array(len(free)))
     worst = np.zeros((len(asked), 2))
     for row, keyframe in enumerate(asked):
         at = np.flatnonzero(free // lie.TANGENT == keyframe)

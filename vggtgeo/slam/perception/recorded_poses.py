@@ -19,7 +19,8 @@ FLOOR = (0.005, np.deg2rad(0.2))
 """Standard deviation of a recorded motion however short, metres and radians: clocks and the place of the camera in the
 device."""
 LONGEST_GAP = 2.5
-"""Usual intervals between two recorded poses beyond which nothing is known between them."""
+"""Usual intervals between two recorded poses beyond which nothing is known between them: one may be missing, not
+two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,9 @@ class RecordedPoses:
 
     Fields:
         trajectory: Camera -> world at times of the frames' clock; any world.
-        drift: Standard deviation of a translation, as a share of it.
-        turn: Standard deviation of a rotation, radians a second.
+        drift: Standard deviation of a translation, as a share of it: generous, so that a true recording is
+            not taken for another.
+        turn: Standard deviation of a rotation, radians a second: a degree a minute, generous too.
         metres: Whether its lengths are metres.
 
     """

@@ -11,7 +11,7 @@ from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.robust import TINY
 
 WIDTH = 300
-"""Images are reduced by a whole factor to about this width for the brightness, pixels."""
+"""Images are reduced by a whole factor to about this width for the brightness, pixels: about half of VGA."""
 LEVELS = 3
 """Of the image pyramid: the coarsest has 1/16 of the pixels."""
 BACKGROUND = 6.0
@@ -20,15 +20,18 @@ exposure and shading."""
 BLOCK = 2
 """Side of a depth cell, reduced pixels: the mean is less noisy than one pixel."""
 MAX_STEP = 0.1
-"""Relative difference of depth between the neighbours of a cell above which they are on different surfaces."""
+"""Relative difference of depth between the neighbours of a cell above which they are on different surfaces: a floor
+that is seen at a flat angle stays below it."""
 EDGE_CELL = 4
 """Side of a cell for edge samples, reduced pixels: the pixel with the strongest gradient is used."""
 FAINT = 1.5
 """Minimum gradient, grey levels a pixel; weaker ones are image noise."""
 MAX_POINTS, MAX_EDGES = 2400, 3600
 """Surface and edge points of the source; more cost time and change nothing, since they share their errors."""
-PIXELS_AT_ONCE, CELLS_AT_ONCE = 16384, 4096
-"""Tables are padded to a multiple of so many rows: the alignment is compiled for few image sizes."""
+PIXELS_AT_ONCE = 16384
+CELLS_AT_ONCE = PIXELS_AT_ONCE // BLOCK**2
+"""Tables are padded to a multiple of so many rows, of pixels a fifth of VGA's: the alignment is compiled for few image
+sizes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +123,7 @@ def _pyramid(gray: np.ndarray) -> tuple[np.ndarray, ...]:
         image = _shrink(gray, 2**level)
         # A high-pass filter, since exposure and shading change the mean.
         value = image - cv2.GaussianBlur(image, (0, 0), BACKGROUND)
+        # The weights of Scharr's kernel, times their distances, sum to 32.
         dx, dy = (cv2.Scharr(value, cv2.CV_32F, axis, 1 - axis, scale=1 / 32) for axis in (1, 0))
         levels.append(cv2.merge([value, dx, dy]))
     return tuple(levels)
@@ -142,8 +146,9 @@ def _cell_means(depth: np.ndarray, sigma: np.ndarray, factor: int) -> tuple[np.n
     safe = np.maximum(share, TINY)
     mean, square = mean / safe, square / safe
     spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
-    # A block across a depth jump has a mean on neither surface.
-    good = (share >= 0.5) & (spread < 0.05 * mean)
+    # A block across a depth jump has a mean on neither surface. Half of it on either side: the standard deviation is
+    # half of the step.
+    good = (share >= 0.5) & (spread < MAX_STEP / 2 * mean)
     cells = np.where(good, 1.0 / np.maximum(mean, TINY), np.nan).astype(np.float32)
     noise = _zero_where(~known, np.array(sigma[:height, :width], np.float32))
     return cells, cells * cv2.resize(noise, size, interpolation=cv2.INTER_AREA) / safe

@@ -25,7 +25,8 @@ from vggtgeo.geometry.robust import TINY
 from vggtgeo.models.roles import Features, Segments
 
 WIDTH = 480
-"""Longer side of the reduced images that are compared, pixels."""
+"""Longer side of the reduced images that are compared, pixels: the smallest overlay (`MIN_AREA`) is
+still 9 pixels wide."""
 MIN_GRADIENT = 4.0
 """Grey levels a pixel, after a blur by one pixel: twice that of white noise of 10 grey levels."""
 COHERENCE = 0.95
@@ -35,16 +36,21 @@ MAX_DEVIATION = 12.0
 """Largest deviation of a static pixel from its median brightness in nine of ten images, grey levels: that of a letter
 that covers three quarters of the pixel."""
 MIN_SEEN = 0.8
-"""Minimum share of the images in which a pixel has a gradient."""
-MIN_AREA, SURE_AREA, MAX_AREA = 5e-4, 0.35, 0.7
-"""Share of static pixels, with gaps and margins. Below the first there is no overlay. Above the second the mask is used
-with a warning, because a fixed camera in front of a passing train looks the same. Above the third too little is
-left."""
+"""Minimum share of the images in which a pixel has a gradient: an overlay has it in all, except on a similar
+background."""
+MIN_AREA, MAX_AREA = 5e-4, 0.7
+SURE_AREA = MAX_AREA / 2
+"""Share of static pixels, with gaps and margins. Below the first there is no overlay: 0.0005 is a square of 9 pixels.
+Above the second too little is left for tracking. Above half of that the mask is used with a warning, because a fixed
+camera in front of a passing train looks the same."""
 MIN_REPORTED = 0.1
-"""Share of static pixels that cannot be masked above which a warning is given."""
-CELL, MIN_CELL_SHARE = 24, 0.03
-"""Side of a cell, pixels, and the minimum share of its pixels with a gradient for it to count. Each cell counts once,
-so that a detailed moving object does not outweigh a plain static room."""
+"""Share of static pixels that cannot be masked above which a warning is given: with fewer, tracking has enough
+others."""
+CELL = 24
+"""Side of a cell, pixels, a twentieth of the image. Each cell counts once, so that a detailed moving object does not
+outweigh a plain static room."""
+EMPTY = 0.03
+"""Share of pixels with a gradient up to which a cell, or a row of a bar, is empty: noise and blocks of compression."""
 STATIC_CELL, MAX_STATIC_CELLS = 0.6, 0.24
 """Mean coherence above which a cell is static, and the largest share of such cells for which the camera is moving: 0 to
 0.2 if it moves, 0.3 to 0.8 if it stands (`benchmarks/static_overlay.py`)."""
@@ -56,10 +62,9 @@ MIN_IMAGES = 12
 """Minimum number of images: gradients of 12 random directions have a coherence of 0.95 with a chance below 1e-4."""
 MAX_IMAGES, STRIDE = 20, 12
 """Maximum number of images, and frames between them: eight seconds."""
-_EMPTY, _EDGE, _THICK = 0.02, 0.4, 4
-"""A bar: rows or columns from the border of the image with at most this share of pixels with a gradient, followed
-within so many pixels by its edge, of which this share is static: along dark parts of the image the edge is not visible.
-"""
+_EDGE, _THICK = 0.4, 4
+"""A bar: empty rows or columns from the border of the image, followed within so many pixels by its edge, of which this
+share is static: along dark parts of the image the edge is not visible."""
 _GAP, _REACH = 6, 6
 """Pixels of the reduced images: gaps between letters of a text that are closed, and the margin within which a patch
 still contains the overlay."""
@@ -172,7 +177,7 @@ def _static_cells(coherence: np.ndarray, rest: np.ndarray) -> float:
     rows, columns = rest.shape[0] // CELL, rest.shape[1] // CELL
     sums = lambda image: image[: rows * CELL, : columns * CELL].reshape(rows, CELL, columns, CELL).sum(axis=(1, 3))
     count = sums(rest.astype(np.float32))
-    enough = count > MIN_CELL_SHARE * CELL**2
+    enough = count > EMPTY * CELL**2
     mean = sums(np.where(rest, coherence, 0.0))[enough] / count[enough]
     return float(np.mean(mean > STATIC_CELL)) if enough.any() else 1.0
 
@@ -191,6 +196,7 @@ def _changed(gradients: list[np.ndarray], lengths: list[np.ndarray], where: np.n
 def _gradient(grey: np.ndarray) -> np.ndarray:
     """Return the gradient by x and y, grey levels a pixel, float32 [2, h, w]."""
     # Derivatives amplify the noise of single pixels.
+    # The weights of Sobel's kernel, times their distances, sum to 8.
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
     return np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1 - axis, axis, ksize=3, scale=0.125) for axis in (0, 1)])
 
@@ -208,7 +214,7 @@ def _filled(still: np.ndarray, structured: np.ndarray) -> np.ndarray:
 
 def _bar(still: np.ndarray, structured: np.ndarray) -> int:
     """Return the rows of a bar at the upper border, including its edge; 0 without one."""
-    full = np.flatnonzero(structured.mean(axis=1) > _EMPTY)
+    full = np.flatnonzero(structured.mean(axis=1) > EMPTY)
     if not len(full) or full[0] < _THICK:
         return 0
     edge = still[full[0] : full[0] + _THICK].any(axis=0)

@@ -17,6 +17,10 @@ import numpy as np
 from vggtgeo.io.errors import InputError
 from vggtgeo.solvers.kernels import AbstractKernel, Cauchy
 
+MIN_CONFIDENCE = 0.1
+"""Smallest weight of a match or a depth by its confidence, so that all of them together determine a pose where none is
+sure of itself."""
+
 
 class Expected(NamedTuple):
     """Valid values of a setting: in words, for the error, and as a test."""
@@ -30,8 +34,8 @@ def switch(default: bool) -> Any:
     return _field(default, Expected("true or false", lambda value: isinstance(value, bool)))
 
 
-def whole(default: int, at_least: int, at_most: int = 1_000_000) -> Any:
-    """Declare an integer setting. at_most: arrays have such sizes, and JAX counts in 32 bits."""
+def whole(default: int, at_least: int, at_most: int = np.iinfo(np.int32).max) -> Any:
+    """Declare an integer setting. at_most: JAX counts in 32 bits."""
     holds = lambda value: _is_whole(value) and at_least <= value <= at_most
     return _field(default, Expected(f"a whole number from {at_least} to {at_most}", holds))
 
@@ -106,7 +110,9 @@ class KeyframeSettings(CheckedSettings):
     """
 
     group: ClassVar[str] = "keyframes"
+    # With so few a pose is still certain, which takes 30 (`pose_acceptance.py`).
     min_inliers: int = whole(50, at_least=1)
+    # At 2.5 m 3.4 degrees between the rays to a point; see `benchmarks/keyframe_spacing.py`.
     keyframe_distance: float = positive(0.15)
     keyframe_angle: float = positive(math.radians(5.0), at_most=math.pi)
     localise_only: bool = switch(False)
@@ -158,6 +164,7 @@ class DepthSettings(CheckedSettings):
     group: ClassVar[str] = "depth_terms"
     depth_weight: float = not_negative(2.0)
     depth_trust: str = one_of("own", "saliency", "complement")
+    # As many as there are key points: surfaces weigh as much as texture.
     surface_points: float = not_negative(300.0)
 
 
@@ -181,7 +188,7 @@ class WeightSettings(CheckedSettings):
 
     def weight(self, confidence: Any) -> Any:
         """Return the weight of matches of this confidence."""
-        gain, floor = {"measured": (1.0, 0.1), "paper": (4.0, 0.5), "none": (0.0, 1.0)}[self.confidence]
+        gain, floor = {"measured": (1.0, MIN_CONFIDENCE), "paper": (4.0, 0.5), "none": (0.0, 1.0)}[self.confidence]
         return gain * confidence + floor
 
 
@@ -208,7 +215,8 @@ class CameraSettings(CheckedSettings):
     """
 
     group: ClassVar[str] = "camera"
-    max_pixels: int = whole(500_000, at_least=0, at_most=100_000_000)
+    # 1.3 times the sides of VGA, on which most thresholds in pixels were measured.
+    max_pixels: int = whole(500_000, at_least=0)
     static_overlay: bool = switch(True)
     refine_intrinsics: str = one_of("auto", "always", "never")
 
@@ -240,6 +248,7 @@ class WindowSettings(CheckedSettings):
 
     group: ClassVar[str] = "window"
     size: int = whole(10, at_least=3)
+    # Sizes of arrays, and so time and memory; the best of more are taken.
     point_slots: int = whole(320, at_least=1)
     line_slots: int = whole(192, at_least=1)
     kernel: AbstractKernel = field(

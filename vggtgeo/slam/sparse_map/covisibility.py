@@ -19,9 +19,10 @@ are not adjusted yet. Outliers within it are left to the robust kernel."""
 EPIPOLAR_GATE = 4.0
 """The same for the epipolar distance, where depth is unknown; narrower, because it checks one direction only."""
 MIN_OVERLAP = 0.25
-"""Share of a keyframe's points inside another's image required for matching."""
+"""Share of a keyframe's points inside another's image required for matching: of 300 points a quarter, of which a fifth
+matches, gives `MIN_MATCHES`."""
 SAMPLES = 64
-"""Key points, spread over the image, that an overlap is measured on."""
+"""Key points, spread over the image, that an overlap is measured on: its standard error is at most 0.06."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,8 +85,8 @@ FREE_LENGTH = 0.1
 one keyframe to the next, 0.01 to 0.09 on real clips. A smaller one would count the current scale as measured repeatedly
 and preserve its drift; a much larger one leaves the scale unconstrained in pure rotation."""
 FACTOR_WIDTH = 12.6**0.5
-"""Mahalanobis distance at which a relative-pose factor has half its weight, so that a false loop is rejected: the 95 %
-level of 6 degrees of freedom."""
+"""Mahalanobis distance at which a relative-pose factor has half its weight, so that a false loop is rejected: one true
+factor in twenty is farther off (chi-square, 6 degrees of freedom)."""
 
 _quadratic_jit = jax.jit(quadratic)
 """Compiled as one function: its operations one by one take four times as long to compile."""

@@ -31,9 +31,13 @@ PIXEL_SIGMA = 2.0
 """Standard deviation of a match, pixels: 0.5 px of the key point, the rest from the keyframe's depth at that one pixel.
 """
 MAX_DEPTH_ERROR = 0.2
-"""Largest relative standard deviation of a depth that is used as a depth."""
-JPEG = (".jpg", (cv2.IMWRITE_JPEG_QUALITY, 95))
-"""Its loss is below the noise of a camera."""
+"""Largest relative standard deviation of a depth that is used as a depth: five from infinity, so that it is surely
+finite."""
+LINE_SIGMA, LINE_CONFIDENCE = 0.02, 0.3
+"""Smallest relative standard deviation and confidence of a depth on a fitted line: its samples share the errors of the
+fit, and at a depth edge, where single pixels are not trusted, a line of many still is."""
+JPEG = (".jpg", ())
+"""OpenCV's own quality, 95: its loss is below the noise of a camera."""
 PNG = (".png", (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP))
 """One filter for all rows: choosing it row by row takes a third of the time and makes these files no smaller."""
 
@@ -281,6 +285,6 @@ def _with_line_depth(samples: Slots, on_line: np.ndarray) -> Slots:
         samples,
         inverse_depth=inverse,
         prior_mean=inverse,
-        prior_sigma=np.where(known, np.fmax(np.nan_to_num(samples.prior_sigma), 0.02 * on_line), np.nan),
-        prior_confidence=np.where(known, np.maximum(samples.prior_confidence, 0.3), 0.0),
+        prior_sigma=np.where(known, np.fmax(np.nan_to_num(samples.prior_sigma), LINE_SIGMA * on_line), np.nan),
+        prior_confidence=np.where(known, np.maximum(samples.prior_confidence, LINE_CONFIDENCE), 0.0),
     )

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from vggtgeo.geometry import rigid
-from vggtgeo.geometry.robust import sigma_by_median
+from vggtgeo.geometry.robust import FEW, sigma_by_median
 from vggtgeo.models.roles import PointMatches
 from vggtgeo.slam.sparse_map.covisibility import Pair
 from vggtgeo.slam.sparse_map.factors import Factor, MeasuredRelativePose, MeasuredRotation
@@ -20,10 +20,9 @@ from vggtgeo.slam.sparse_map.keyframe import Keyframe, Slots
 
 NOMINAL_DEPTH = 2.5
 """Median depth of the first map in its own unit: about metres indoors, so that thresholds in metres stay sensible."""
-MIN_SHARED = 20
-"""Minimum number of key points with a depth in both keyframes for their scale ratio."""
-MAX_SCALE_ERROR = 0.03
-"""Largest standard error of that ratio; at 3 m it moves the joined part by 9 cm, which the adjustment corrects."""
+RATIO_SIGMA = 0.03
+"""Standard deviation of the logarithm of a scale ratio by errors that its points have in common, and largest standard
+error of a ratio that joins submaps: at 3 m it moves the joined part by 9 cm, which the adjustment corrects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +116,7 @@ def measured_ratio(
     depth = local @ relative[2, :3] + relative[2, 3]
     # A point behind the new camera has no depth there: its match is wrong.
     ahead = depth > 0
-    if np.count_nonzero(ahead) < MIN_SHARED:
+    if np.count_nonzero(ahead) < FEW:
         return 1.0, np.inf
     # Ratios are symmetric in the logarithm: exchanging the keyframes changes the sign only.
     logs = np.log(depth[ahead] * after[ahead])

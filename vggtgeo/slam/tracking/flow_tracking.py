@@ -15,15 +15,15 @@ import numpy as np
 from vggtgeo.geometry import rigid
 from vggtgeo.models.classical import PatchFlow
 from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches, PoseGuess, PoseQuery
+from vggtgeo.slam.settings.groups import MIN_CONFIDENCE
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.tracking.tracking_state import SeenPoints
 
 MAX_POINTS = 300
 """Largest number of key points of a keyframe that are used, spread over its image: more cost time, share the keyframe's
 error and do not improve a pose."""
-TRUSTED, MIN_TRUST = 0.5, 0.1
-"""Confidence of a key point's depth: points below the first are used only if there are no others. The second is the
-smallest weight, so that maps without measured depth can be tracked."""
+TRUSTED = 0.5
+"""Confidence of a key point's depth: points below it are used only if there are no others."""
 MIN_FOLLOWED = 0.4
 """Minimum share of the points in view that optical flow must follow; from a bad guess it still follows 0.4 or more."""
 MIN_INLIER_SHARE = 0.7
@@ -97,7 +97,9 @@ def located_by_flow(
     # Followed points are not key points of the frame.
     nowhere = np.full(len(arrived), -1)
     # A point is as good as the worse known of its two ends: the match in the image, and the depth in the keyframe.
-    trust = np.clip(alike[arrived], 0.0, 1.0) * np.maximum(keyframe.points.prior_confidence[asked[arrived]], MIN_TRUST)
+    trust = np.clip(alike[arrived], 0.0, 1.0) * np.maximum(
+        keyframe.points.prior_confidence[asked[arrived]], MIN_CONFIDENCE
+    )
     matches = PointMatches(asked[arrived], nowhere, pixels[arrived], moved[arrived], trust)
     points = points[arrived]
     guess = geometry.locate(PoseQuery(image, intrinsics, points, matches.pixels_j, matches.confidence, predicted))

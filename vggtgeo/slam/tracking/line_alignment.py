@@ -25,21 +25,19 @@ import numpy as np
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.gauss_newton import damped_step
 from vggtgeo.geometry.rigid import exponential
-from vggtgeo.geometry.robust import TUKEY, sigma_by_median
-from vggtgeo.models.classical import line_coefficients
+from vggtgeo.geometry.robust import ROUNDING, TUKEY, sigma_by_median
+from vggtgeo.models.classical import ManhattanEstimator, line_coefficients
 from vggtgeo.models.roles import LineFeatures, LineMatcher, RelativeView
 from vggtgeo.slam.perception.rgbd_alignment import CONVERGED, MIN_DEPTH
 from vggtgeo.slam.sparse_map.keyframe import MIN_INVERSE_DEPTH, Keyframe
-from vggtgeo.slam.tracking.pose_acceptance import tangent, worst_sigma
+from vggtgeo.slam.tracking.pose_acceptance import SYSTEMATIC, tangent, worst_sigma
 
-END_SIGMA = 0.7
+END_SIGMA = ManhattanEstimator.end_error
 """Standard deviation of a segment's end across it, pixels."""
 MIN_LINES = 3
 """Three lines in general position determine a pose."""
 ITERATIONS, ROUNDS = 8, 3
 """Steps after each matching, and matchings: each starts from the better pose."""
-SMALL = 2e-3
-"""Metres and radians; below this change of the pose the segments are not matched again."""
 MAX_MISS = 80.0
 """Largest search radius of matching, pixels: beyond it wrong segments are as near as the right one."""
 
@@ -137,7 +135,7 @@ def align_lines(
                 break
         rows = _rows(segments, own, theirs, motion, intrinsics)
         believed = known + _normal(rows.jacobian, _weights(rows.residual))
-        if np.abs(tangent(motion @ rigid.invert(before))).max() < SMALL:
+        if np.abs(tangent(motion @ rigid.invert(before))).max() < SYSTEMATIC[0]:  # the same segments would match
             break
     assert rows is not None
     weight = _weights(rows.residual)
@@ -200,7 +198,7 @@ def _without_chance(hessian: np.ndarray, by_chance: np.ndarray) -> np.ndarray:
     Otherwise parallel lines, each slightly rotated by noise, would appear to constrain the motion along them.
     """
     # Relative to the information of all lines, so that a direction is judged by its share of chance, whatever its unit.
-    root = np.linalg.cholesky(hessian + 1e-12 * np.trace(hessian) * np.eye(6))
+    root = np.linalg.cholesky(hessian + ROUNDING * np.trace(hessian) * np.eye(6))
     half = np.linalg.solve(root, by_chance)
     share, basis = np.linalg.eigh(np.linalg.solve(root, half.T))
     left = root @ basis

@@ -25,26 +25,37 @@ from vggtgeo.geometry.robust import POSE_GATE, inverse_information
 NAN = float("nan")
 MIN_INLIERS, STRONG_INLIERS = 12, 30
 """Number of points that are inliers."""
-MIN_SHARE, STRONG_SHARE = 0.4, 0.5
-"""Share of the matches, of points or of lines, that are inliers."""
+FAIR = 0.4
+"""Share of the matches, of points or of lines, that are inliers, and correlation of the brightness at edges, of
+evidence that needs another kind beside it."""
+STRONG_SHARE = 0.5
+"""Share of the matches of evidence that suffices alone."""
 MIN_LINES, STRONG_LINES = 8, 12
 """Number of segments that are matched in agreement with the pose."""
-MIN_CORRELATION, STRONG_CORRELATION, CONTRADICTION = 0.4, 0.6, 0.1
-"""Correlation of the brightness at edges; below the last one it contradicts the pose, whatever else agrees."""
+SURE = 0.6
+"""Correlation that suffices alone, and share of the matches at a place that was found by its appearance."""
+CONTRADICTION = 0.1
+"""Correlation below which the image contradicts the pose, whatever else agrees: that of wrong poses."""
 MIN_SURFACE, MIN_OVERLAP = 0.85, 0.2
-"""Share of the surface that agrees, and overlap, beside a correlation."""
+"""Share of the surface that agrees, and overlap, beside a correlation: 15 % may be hidden, moved or noise, and the rest
+must be seen on a fifth of the image."""
 BARE_SURFACE, BARE_OVERLAP, BARE_SIGMA = 0.95, 0.5, 0.03
 """Evidence of surfaces alone, for images without texture: share that agrees, overlap, and largest standard deviation in
-the worst direction, metres."""
-MAX_SIGMA = 0.10
-"""Largest standard deviation of an accepted pose in its worst direction, metres."""
+the worst direction, metres. Stricter, since a plane agrees with any motion along it."""
 MIN_CORRELATION_RATIO = 0.8
-"""Correlation that an old keyframe must have to become the reference again, relative to that of the current one. A
-keyframe taken in a fast turn is sheared by the rolling shutter: frames tracked against it are off by centimetres
-although they have many inliers."""
+"""Correlation that an old keyframe must have to become the reference again, relative to that of the current one: a
+fifth less may be due to the view alone. A keyframe taken in a fast turn is sheared by the rolling shutter: frames
+tracked against it are off by centimetres although they have many inliers."""
 STEP_FLOOR, STEP_GROWTH = (0.10, np.deg2rad(6.0)), 0.7
 """Standard deviation of a prediction by constant velocity: metres, radians, and the share of the last step that is
 added to each. 99 % of the steps of a fast head-mounted camera are within three of these."""
+MAX_SIGMA = STEP_FLOOR[0]
+"""Largest standard deviation of an accepted pose in its worst direction, metres: a measurement that is less certain
+than the prediction says nothing."""
+SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
+"""Standard deviation of errors that samples share (calibration, rolling shutter, clocks): metres, radians, share of the
+motion. Set so that the squared Mahalanobis distance of dense alignments from the ground truth has the median of
+chi-square with 6 degrees of freedom, 5.3 (`benchmarks/alignment.py`)."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +101,7 @@ class TrackingQuality:
 
     @property
     def points_fair(self) -> bool:
-        return self.inliers >= MIN_INLIERS and self.share >= MIN_SHARE
+        return self.inliers >= MIN_INLIERS and self.share >= FAIR
 
     @property
     def points_strong(self) -> bool:
@@ -107,7 +118,7 @@ class TrackingQuality:
 
     @property
     def lines_fair(self) -> bool:
-        return self.lines >= MIN_LINES and self.line_share >= MIN_SHARE
+        return self.lines >= MIN_LINES and self.line_share >= FAIR
 
     @property
     def lines_strong(self) -> bool:
@@ -118,13 +129,13 @@ class TrackingQuality:
     def dense_fair(self) -> bool:
         """Whether image and surface agree with the pose; a comparison with NaN is false."""
         surface = not self.surface < MIN_SURFACE
-        return self.correlation >= MIN_CORRELATION and self.overlap >= MIN_OVERLAP and surface
+        return self.correlation >= FAIR and self.overlap >= MIN_OVERLAP and surface
 
     @property
     def dense_strong(self) -> bool:
         """Whether image, or image and surface together, suffice alone."""
         surfaces = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP
-        return self.dense_fair and (self.correlation >= STRONG_CORRELATION or surfaces)
+        return self.dense_fair and (self.correlation >= SURE or surfaces)
 
     @property
     def bare_surface(self) -> bool:
@@ -145,16 +156,16 @@ class TrackingQuality:
             # confirm it.
             return self.points_strong and self.dense_fair
         # A NaN correlation (nothing to compare) does not contradict.
-        fair = self.points_fair and not self.correlation < MIN_CORRELATION
+        fair = self.points_fair and not self.correlation < FAIR
         by_lines = self.lines_strong or (self.lines_fair and self.dense_fair)
         return self.points_strong or fair or self.dense_strong or self.bare_surface or by_lines
 
     @property
     def certain(self) -> bool:
         """Whether the pose is accepted without a prediction, among all places of the map (relocalization)."""
-        known_place = self.inliers >= STRONG_INLIERS and self.share >= 0.6
+        known_place = self.inliers >= STRONG_INLIERS and self.share >= SURE
         measured = self.sigma_translation <= MAX_SIGMA * self.metre
-        return measured and known_place and not self.correlation < MIN_CORRELATION
+        return measured and known_place and not self.correlation < FAIR
 
 
 def step_chi2(pose: np.ndarray, predicted: np.ndarray, step: np.ndarray, waited: int = 0) -> float:

@@ -13,18 +13,11 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.rigid import exponential
 from vggtgeo.geometry.robust import POSE_GATE, REGULARISER, inverse_information
 from vggtgeo.models.roles import LineFeatures, LineMatcher
-from vggtgeo.slam.perception.rgbd_alignment import Aligned
+from vggtgeo.slam.perception.rgbd_alignment import MAX_DISTANCE, Aligned
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 from vggtgeo.slam.sparse_map.map import NOMINAL_DEPTH
 from vggtgeo.slam.tracking.line_alignment import align_lines
-from vggtgeo.slam.tracking.pose_acceptance import TrackingQuality, tangent
-
-SYSTEMATIC = (0.002, np.deg2rad(0.05), 0.01)
-"""Standard deviation of errors that samples share (calibration, rolling shutter, clocks): metres, radians, share of the
-motion. Set so that the squared Mahalanobis distance of dense alignments from the ground truth has the median of
-chi-square with 6 degrees of freedom, 5.3 (`benchmarks/alignment.py`)."""
-MAX_DISAGREEMENT = 0.15
-"""Distance between them, metres, above which many inliers are preferred to dense alignment."""
+from vggtgeo.slam.tracking.pose_acceptance import SYSTEMATIC, TrackingQuality, tangent
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +43,8 @@ def agreed(by_points: Motion | None, dense: Aligned | None, quality: TrackingQua
         mean = np.linalg.solve(both + REGULARISER * np.eye(6), by_points.information @ off)
         return Motion(exponential(mean) @ dense.motion, both)
     # Points that lie on one plane, or few of them, are often some centimetres off: the picture mends that.
-    near = np.linalg.norm(off[:3]) < MAX_DISAGREEMENT or not quality.points_strong
+    # Farther away it was aligned to other surfaces than those that many inliers lie on.
+    near = np.linalg.norm(off[:3]) < MAX_DISTANCE or not quality.points_strong
     return by_picture if quality.dense_fair and near else by_points
 
 

@@ -367,4 +367,5 @@ def _triangulated(
 
 def _rank(confidence: np.ndarray) -> np.ndarray:
     """Return what an observation adds to the rank of its landmark: confidence decides between equal numbers of them."""
+    # Less than one observation, as long as there are no more than ten.
     return 1 + 0.1 * confidence

@@ -20,14 +20,15 @@ from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.node import PairTerm
 from vggtgeo.bundle.terms.reprojection import PointTerm
 from vggtgeo.geometry import lie, rigid
-from vggtgeo.geometry.robust import TINY
+from vggtgeo.geometry.robust import ROUNDING, TINY
 from vggtgeo.slam.sparse_map.map import by_first_member
 
 STILL = 1e-6
-"""Largest share of a unit direction by which it changes a pose that counts as known."""
-NULL = 1e-10
-"""Share of the largest eigenvalue of a balanced information matrix below which a direction is unconstrained. The
-rounding errors that marginalisation cuts off are 1e-12 of it."""
+"""Largest share of a unit direction by which it changes a pose that counts as known: above rounding, and far below the
+share of any pose that takes part, one over the root of their number."""
+NULL = 100 * ROUNDING
+"""Share of the largest eigenvalue of a balanced information matrix below which a direction is unconstrained. Far
+above the rounding errors that marginalisation cuts off."""
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,13 @@ from vggtgeo.slam.sparse_map.covisibility import Directed
 from vggtgeo.slam.sparse_map.keyframe import MIN_INVERSE_DEPTH, Keyframe, along_segments
 
 MAX_SIGMA = 0.05
-"""Largest relative standard deviation of a depth that counts as known."""
+"""Largest relative standard deviation of a depth that counts as known: a quarter of that of
+points (`MAX_DEPTH_ERROR`), since one wrong view of two is hardly noticed."""
 MIN_VIEWS = 2
 """The second view confirms the depth of the first."""
 CHANCE = 0.99
-"""Quantile of the chi-square distribution up to which views agree on a depth."""
+"""Quantile of the chi-square distribution up to which views agree on a depth: one right
+segment in a hundred is lost."""
 
 
 def with_segment_depths(
@@ -84,10 +86,10 @@ def _intersected(
     normal = lines @ pinhole.matrix(intrinsics)
     lever = normal @ relative[:3, 3]
     # A ray parallel to the plane: an infinite lever gives inverse depth 0, and its weight is zero.
-    safe = np.where(np.abs(lever) > 1e-9, lever, np.inf)[:, None]
+    safe = np.where(lever != 0, lever, np.inf)[:, None]
     value = -(turned * normal[:, None]).sum(2) / safe
     z = turned[..., 2] + value * relative[2, 3]
-    ahead = z > 0.05
+    ahead = z > 0
     weight = np.where(ahead & (value > 0), (lever[:, None] / np.where(ahead, z, 1.0)) ** 2, 0.0)
     return value, weight
 
