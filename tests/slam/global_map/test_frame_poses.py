@@ -11,10 +11,11 @@ from vggtgeo.models.roles import GeometryResult, PoseGuess
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.rigid import exponential
+from vggtgeo.geometry.robust import FEW
 from vggtgeo.slam.camera.camera_estimate import CameraEstimate, Readout
 from vggtgeo.slam.camera.rolling_shutter import image_shift
 from vggtgeo.slam.global_map import frame_poses as module
-from vggtgeo.slam.global_map.frame_poses import MIN_POINTS, frame_poses
+from vggtgeo.slam.global_map.frame_poses import frame_poses
 from vggtgeo.slam.global_map.pose_uncertainty import SHARED_ERRORS
 from vggtgeo.slam.global_map.propagated_poses import frame_motions, propagated_poses
 from vggtgeo.slam.sparse_map.keyframe import Slots
@@ -110,10 +111,10 @@ def test_without_enough_points_a_pose_stays() -> None:
     """One point too few, points whose depth is gone, or that came to lie behind the camera, a frame without a pose, a
     map that is not finished; and nothing known of its tracking: as it was carried, to the bit.
     """
-    slam = with_second(walked(np.random.default_rng(2), MIN_POINTS)[0], quality=TrackingQuality())
+    slam = with_second(walked(np.random.default_rng(2), FEW)[0], quality=TrackingQuality())
     few = slam.frames[1].seen
     first = slam.keyframes[0]
-    gone = replace(first, points=replace(first.points, inverse_depth=np.full(MIN_POINTS, np.nan)))
+    gone = replace(first, points=replace(first.points, inverse_depth=np.full(FEW, np.nan)))
     for wrong in (
         with_second(slam, seen=SeenPoints(few.slots[1:], few.pixels[1:])),
         slam.with_map(keyframes=(gone,)),

@@ -97,6 +97,8 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
     hessian, largest = (hessian + hessian.T) / 2, MAX_STEP
     if not np.isfinite(hessian).all():
         return None
+    # Not `gauss_newton`: the energy of an adjusted map is no sum of squares in two unknowns. Each evaluation is an
+    # adjustment, so second derivatives are updated instead.
     for _ in range(MAX_STEPS):
         step = _step(hessian, gradient, largest)
         if -gradient @ step / 2 < PROMISE:

@@ -95,6 +95,7 @@ def _solved(points: _Points, intrinsics: np.ndarray) -> tuple[np.ndarray, _Reduc
     """Return the intrinsics, and the normal equations of the last step."""
     value, poses = np.zeros(4), points.given
     reduced = _reduce(points, poses, value, intrinsics)
+    # Not `gauss_newton`: bounded steps need no energy, which would take another 0.04 s beside 0.12 s for 500 pairs.
     for _ in range(ITERATIONS):
         normal = reduced.normal.sum(0) + np.diag(1 / PRIOR**2)
         step = np.clip(-np.linalg.solve(normal, reduced.gradient.sum(0)), -LONGEST_STEP, LONGEST_STEP)

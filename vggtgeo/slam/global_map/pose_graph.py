@@ -151,6 +151,7 @@ def solve_scales(keyframes: int, motions: Sequence[MeasuredRelativePose], ratios
     rows = np.repeat(np.arange(len(first)), 2)
     shape = (len(first), keyframes)
     logs, weight = np.zeros(keyframes), np.ones(len(first))
+    # Not `gauss_newton`: linear, so each width is one sparse solve, with neither a step to halve nor an energy to test.
     for width in WIDTHS:
         values = np.tile([-1.0, 1.0], len(first)) * np.repeat(np.sqrt(weight) / sigma, 2)
         design = coo_array((values, (rows, np.stack([first, second], 1).ravel())), shape).tocsc()

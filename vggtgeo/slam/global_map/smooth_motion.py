@@ -57,6 +57,7 @@ def smoothed(
     places = turned.mT @ (known[:, :3, :3] - known[:, :3, 3:] @ follows) @ turned
     moved, fits, bends = np.zeros((len(times), 3)), np.ones(len(rows)), np.ones(motion.shape[0])
     own, diagonal = motion[:, rows], (np.arange(len(rows)), np.arange(len(rows) + 1))
+    # Not `gauss_newton`: linear, so each round is one sparse solve; its dense steps would take the cube of the frames.
     for _ in range(ROUNDS):
         weighted = own.T @ sp.diags_array(bends / sigma**2)
         hessian = sp.kron(weighted @ own, np.eye(3)) + sp.bsr_array((fits[:, None, None] * places, *diagonal))

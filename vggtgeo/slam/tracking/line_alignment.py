@@ -127,6 +127,7 @@ def align_lines(
             return None
         own, theirs = place[found.index_i[has_depth]], seen.segments.endpoints[found.index_j[has_depth]]
         before = motion
+        # Not `gauss_newton`: the weights follow the scale of the residuals, so that there is no energy that must fall.
         for _ in range(ITERATIONS):
             rows = _rows(segments, own, theirs, motion, intrinsics)
             step = _step(rows, motion, start, known)

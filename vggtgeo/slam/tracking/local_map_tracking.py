@@ -70,6 +70,8 @@ def refine_by_map(
         if part is not None and _agrees(part.equations(pose, intrinsics), known):
             parts.append(part)
     current, information = pose, np.zeros((6, 6))
+    # Not `gauss_newton`: each keyframe's information is limited anew at each pose, so that there is no energy that must
+    # fall.
     for _ in range(STEPS if parts else 0):
         equations = [part.equations(current, intrinsics) for part in parts]
         limited = [with_systematic(own.hessian, own.motion) for own in equations]
