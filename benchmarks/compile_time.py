@@ -67,7 +67,7 @@ def _window(name: str) -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
     )
 
     def loss(weight: jax.Array) -> jax.Array:
-        state = vg.solve(problem.with_term(problem.points.reweighted(weight)), initial).state
+        state = vg.solve(problem.with_term(problem.terms["points"].reweighted(weight)), initial).state
         return jnp.sum((state.poses.inverse().translation() - window.centres) ** 2)
 
     gradient = jax.grad(loss)
@@ -76,7 +76,7 @@ def _window(name: str) -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
         "gradient": gradient,
         "Hessian product": lambda weight: jax.jvp(gradient, (weight,), (jnp.ones_like(weight),))[1],
     }
-    return functions[name], problem.points.weight
+    return functions[name], problem.terms["points"].weight
 
 
 def _chain() -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
@@ -97,11 +97,11 @@ def _chain() -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
             state = vg.solve(*window).state
             return vg.slide(window[0], state, *coming), state.poses.inverse().translation()[-1]
 
-        reweighted = first.with_term(first.points.reweighted(weight))
+        reweighted = first.with_term(first.terms["points"].reweighted(weight))
         newest = jax.lax.scan(step, (reweighted, start), following)[1]
         return jnp.sum((newest[-1] - long.centres[-1]) ** 2)
 
-    return jax.grad(loss), first.points.weight
+    return jax.grad(loss), first.terms["points"].weight
 
 
 if __name__ == "__main__":

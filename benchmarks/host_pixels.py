@@ -139,7 +139,7 @@ def _time(options: argparse.Namespace) -> None:
     problem, initial, _ = vg.load_problem(options.time)
     exact = problem, initial
     of_host = problem.edges.source == jnp.arange(problem.num_keyframes)[:, None]
-    present = jnp.any(of_host[..., None] & (problem.points.weight > 0), 1)
+    present = jnp.any(of_host[..., None] & (problem.terms["points"].weight > 0), 1)
     problem = problem.with_term(HostPixel(weight=jnp.where(present, 1.0, 0.0)))
     initial = replace(initial, pixel_offset=jnp.zeros((*present.shape, 2)))
     solver = vg.SchurLevenbergMarquardt(rtol=0.0, atol=0.0, max_iterations=20)

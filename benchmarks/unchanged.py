@@ -139,7 +139,7 @@ def _window() -> Numbers:
     )
 
     def error(weight: jax.Array) -> jax.Array:
-        state = vg.solve(problem.with_term(problem.points.reweighted(weight)), initial).state
+        state = vg.solve(problem.with_term(problem.terms["points"].reweighted(weight)), initial).state
         return jnp.sum((state.poses.inverse().translation() - window.centres) ** 2)
 
     solution = jax.jit(vg.solve)(problem, initial)
@@ -149,7 +149,7 @@ def _window() -> Numbers:
         "poses": solution.state.poses.wxyz_xyz,
         "inverse depths": solution.state.inverse_depth,
         "energy": solution.energy,
-        "gradient": jax.jit(jax.grad(error))(problem.points.weight),
+        "gradient": jax.jit(jax.grad(error))(problem.terms["points"].weight),
         "covariances": known.poses,
         "prior": prior.root.T @ prior.root,
     }

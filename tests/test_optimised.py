@@ -32,8 +32,8 @@ def test_a_gradient_through_the_optimum() -> None:
     # Proves the derivative of the optimum by the matches on a problem that compiles quickly. Oracle: central
     # differences of the polished optimum (tests/bundle/test_gradients.py has every leaf).
     problem, initial, _ = make_scene(2, 5, 0, noise=0.5, depth_error=0.05, seed=4).pack(fixed=True)
-    problem = problem.with_terms((problem.points, problem.depth))
-    get = lambda p: p.points.target
+    problem = problem.with_terms((problem.terms["points"], problem.terms["depth"]))
+    get = lambda p: p.terms["points"].target
 
     def loss(target: jax.Array) -> jax.Array:
         moved: Problem = eqx.tree_at(get, problem, target)

@@ -30,8 +30,10 @@ Function = Callable[[jax.Array], jax.Array]
 
 def weighted(share: jax.Array) -> vg.Problem:
     """The problem with its points weighted otherwise, one by one."""
-    factor = share ** jnp.linspace(0.5, 2.0, PROBLEM.points.weight.size).reshape(PROBLEM.points.weight.shape)
-    return PROBLEM.with_term(PROBLEM.points.reweighted(factor * PROBLEM.points.weight))
+    factor = share ** jnp.linspace(0.5, 2.0, PROBLEM.terms["points"].weight.size).reshape(
+        PROBLEM.terms["points"].weight.shape
+    )
+    return PROBLEM.with_term(PROBLEM.terms["points"].reweighted(factor * PROBLEM.terms["points"].weight))
 
 
 def prior_left(share: jax.Array) -> jax.Array:
@@ -55,7 +57,7 @@ def state_and_energy(share: jax.Array) -> jax.Array:
 
 
 def reordered(share: jax.Array) -> jax.Array:
-    prior = vg.terms.MarginalPrior(**{**vars(PROBLEM.marginal), "root": share * jnp.eye(16)})
+    prior = vg.terms.MarginalPrior(**{**vars(PROBLEM.terms["marginal"]), "root": share * jnp.eye(16)})
     return jnp.sum(vg.permute_prior(prior, np.array([1, -1])).root ** 2)
 
 
@@ -69,7 +71,7 @@ FUNCTIONS: dict[str, Function] = {
     "`marginalise(...).root`": prior_left,
     "`permute_prior(...).root`": reordered,
     "`SlotIndex.scatter_points`": lambda x: jnp.sum(
-        INDEX.scatter_points(x * MATCHES, WINDOW.observations, PROBLEM.points.weight) ** 2
+        INDEX.scatter_points(x * MATCHES, WINDOW.observations, PROBLEM.terms["points"].weight) ** 2
     ),
     "`SlotIndex.gather`": lambda x: jnp.sum(jnp.asarray(INDEX.gather(x**2 * STATE.inverse_depth))),
     BOTH: state_and_energy,

@@ -79,10 +79,10 @@ def gradient(problem: Problem, run: Callable[[Problem], Solution]) -> tuple[jax.
     """Derivative of a number made of the poses by the weights of matches, and the energies."""
 
     def loss(weight: jax.Array) -> tuple[jax.Array, jax.Array]:
-        solution = run(eqx.tree_at(lambda p: p.points.weight, problem, weight))
+        solution = run(eqx.tree_at(lambda p: p.terms["points"].weight, problem, weight))
         return jnp.sum(solution.state.poses.wxyz_xyz**3), solution.energy
 
-    return jax.grad(loss, has_aux=True)(problem.points.weight)
+    return jax.grad(loss, has_aux=True)(problem.terms["points"].weight)
 
 
 @eqx.filter_jit

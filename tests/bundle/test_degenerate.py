@@ -116,7 +116,7 @@ def test_a_match_at_the_epipole_ends_at_the_bound(solved: Solve) -> None:
     problem, start = packed(without(WELL, "depth"), **ALL_HELD)
     x, y, z = np.asarray(relative_poses(problem, start).translation())[4]
     fx, fy, cx, cy = start.intrinsics.reshape(-1)
-    points, matches = problem.points, lambda p: (p.points.target, p.points.weight)
+    points, matches = problem.terms["points"], lambda p: (p.terms["points"].target, p.terms["points"].weight)
     weight, epipole = points.weight.at[5, 0].set(0.0), jnp.stack([fx * x / z + cx, fy * y / z + cy])
     found = solved(eqx.tree_at(matches, problem, (points.target.at[4, 0].set(epipole), weight)), start)
     without_it = solved(eqx.tree_at(matches, problem, (points.target, weight.at[4, 0].set(0.0))), start)

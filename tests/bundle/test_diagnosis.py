@@ -88,9 +88,9 @@ def infinite(problem: Problem) -> Problem:
     return problem.with_term(
         Range(
             keyframe=[0, 1, 2],
-            anchor=problem.range.anchor,
-            distance=problem.range.distance.at[1].set(jnp.inf),
-            weight=problem.range.weight,
+            anchor=problem.terms["range"].anchor,
+            distance=problem.terms["range"].distance.at[1].set(jnp.inf),
+            weight=problem.terms["range"].weight,
         ),
         replace=True,
     )
@@ -102,10 +102,12 @@ def test_a_gradient_at_a_failed_solve_is_not_finite() -> None:
     bad = ranges(CENTRES[0])
 
     def loss(distance: jax.Array) -> jax.Array:
-        term = Range(keyframe=[0, 1, 2], anchor=bad.range.anchor, distance=distance, weight=bad.range.weight)
+        term = Range(
+            keyframe=[0, 1, 2], anchor=bad.terms["range"].anchor, distance=distance, weight=bad.terms["range"].weight
+        )
         return jnp.sum(vg.solve(bad.with_term(term, replace=True), START).state.poses.translation() ** 2)
 
-    assert np.isnan(jax.jit(jax.grad(loss))(bad.range.distance)).any()
+    assert np.isnan(jax.jit(jax.grad(loss))(bad.terms["range"].distance)).any()
 
 
 def test_a_term_that_its_kernel_rejects_is_named() -> None:

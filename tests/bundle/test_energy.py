@@ -120,20 +120,25 @@ def test_absent_observations_may_hold_anything() -> None:
     problem, state, _ = NOISY.pack(size=PaddedSize(3, 9, 5, 3))
     nan_where = lambda values, weight: jnp.where(weight > 0, values, jnp.nan)
     spoilt = eqx.tree_at(
-        lambda p: (p.points.target, p.lines.coefficients, p.depth.mean, p.depth.sigma),
+        lambda p: (
+            p.terms["points"].target,
+            p.terms["lines"].coefficients,
+            p.terms["depth"].mean,
+            p.terms["depth"].sigma,
+        ),
         problem,
         (
-            nan_where(problem.points.target, problem.points.weight[..., None]),
-            nan_where(problem.lines.coefficients, problem.lines.weight[..., None]),
-            nan_where(problem.depth.mean, problem.depth.weight),
-            nan_where(problem.depth.sigma, problem.depth.weight),
+            nan_where(problem.terms["points"].target, problem.terms["points"].weight[..., None]),
+            nan_where(problem.terms["lines"].coefficients, problem.terms["lines"].weight[..., None]),
+            nan_where(problem.terms["depth"].mean, problem.terms["depth"].weight),
+            nan_where(problem.terms["depth"].sigma, problem.terms["depth"].weight),
         ),
     )
     total = lambda problem, depth: energy(problem, State(state.poses, state.intrinsics, depth))
     both = jax.jit(jax.value_and_grad(total, argnums=1))
     clean_value, clean_gradient = both(problem, state.inverse_depth)
     value, gradient = both(spoilt, state.inverse_depth)
-    assert bool(jnp.any(jnp.isnan(spoilt.depth.mean)))
+    assert bool(jnp.any(jnp.isnan(spoilt.terms["depth"].mean)))
     assert float(value) == float(clean_value)
     np.testing.assert_array_equal(gradient, clean_gradient)
 

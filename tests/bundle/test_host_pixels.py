@@ -169,7 +169,7 @@ def test_gradient_through_the_optimum():
     problem, initial, _ = vg.simulate_window(KEYFRAMES, POINTS, 1, host_noise=True).pack()
 
     def loss(scale, shift):
-        term = problem.host_pixels
+        term = problem.terms["host_pixels"]
         moved = problem.with_term(term.reweighted(term.weight * scale))
         moved = replace(moved, pixels=moved.pixels.at[0, 0, 0].add(shift))
         return jnp.sum(vg.solve(moved, initial).state.poses.translation() ** 2)
@@ -217,9 +217,9 @@ def test_marginalisation_takes_the_pixels_along(least_squares):
         tuple(
             term.reweighted(jnp.where(mask, term.weight, 0.0))
             for term, mask in (
-                (problem.points, of_host[:, None]),
-                (problem.depth, (jnp.arange(KEYFRAMES) == 1)[:, None]),
-                (problem.host_pixels, (jnp.arange(KEYFRAMES) == 1)[:, None]),
+                (problem.terms["points"], of_host[:, None]),
+                (problem.terms["depth"], (jnp.arange(KEYFRAMES) == 1)[:, None]),
+                (problem.terms["host_pixels"], (jnp.arange(KEYFRAMES) == 1)[:, None]),
             )
         )
     )

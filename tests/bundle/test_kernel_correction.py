@@ -114,11 +114,11 @@ def test_graduation_has_the_derivative_of_the_optimum() -> None:
     solver = SchurLevenbergMarquardt(max_iterations=60)
 
     def loss(weight: jax.Array, start: State, graduation: Graduation | None) -> jax.Array:
-        changed = eqx.tree_at(lambda p: p.points.weight, problem, weight)
+        changed = eqx.tree_at(lambda p: p.terms["points"].weight, problem, weight)
         return jnp.sum(solve(changed, start, solver=solver, graduation=graduation).state.poses.wxyz_xyz[1:] ** 3)
 
     grad = eqx.filter_jit(jax.grad(loss, argnums=(0, 1)))
-    with_it, without = (grad(problem.points.weight, state, each) for each in (Graduation(), None))
+    with_it, without = (grad(problem.terms["points"].weight, state, each) for each in (Graduation(), None))
     for found, expected in zip(jax.tree.leaves(with_it), jax.tree.leaves(without), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-6 * max(1e-9, float(jnp.abs(expected).max())))
 

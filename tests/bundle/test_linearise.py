@@ -37,7 +37,7 @@ def test_gradient_and_hessian_are_those_of_the_columns() -> None:
     # included. Oracle: J' J and J' r with J from forward-mode differentiation of the residuals.
     problem, state, _ = SCENE.pack()
     state = State(state.poses, state.intrinsics, state.inverse_depth.at[0, 0].set(60.0))  # behind other cameras
-    seen = (problem.edges.source == 0) & (problem.points.weight[:, 0] > 0)
+    seen = (problem.edges.source == 0) & (problem.terms["points"].weight[:, 0] > 0)
     assert float(jnp.min(oracle.seen_from(problem, state)[:, 0, 2], where=seen, initial=jnp.inf)) < oracle.LEAST_DEPTH
     matrix, found, jacobian, residual = linearise_both(problem, state)
     hessian, gradient = np.asarray(jacobian.T @ jacobian), jacobian.T @ residual
@@ -85,8 +85,8 @@ def test_hessian_is_that_of_automatic_differentiation(strength: float, depth: fl
     # Proves the exact Hessian: points, lines, outliers on Huber's linear branch, curvature of the poses, intrinsics,
     # the marginalisation prior, and a point behind its target. Oracle: `jax.hessian` of the energy after a retraction.
     problem, state, _ = BENT.pack()
-    offset = (state.inverse_depth - problem.depth.mean) / problem.depth.sigma
-    squared = problem.depth.alpha * problem.depth.weight * offset**2
+    offset = (state.inverse_depth - problem.terms["depth"].mean) / problem.terms["depth"].sigma
+    squared = problem.terms["depth"].alpha * problem.terms["depth"].weight * offset**2
     assert 0 < int(jnp.sum(squared > 1.5**2)) < squared.size  # on both branches of Huber's kernel
     problem = problem.with_term(prior_on(state, strength))
     if depth is not None:

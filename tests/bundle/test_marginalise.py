@@ -44,7 +44,7 @@ def _gauss_newton_step(problem: Problem, state: State) -> ArrowVector:
 
 
 def _without(problem: Problem, dropped_edges: jax.Array, dropped_host: int | None) -> Problem:
-    depth = problem.depth
+    depth = problem.terms["depth"]
     depth = depth if dropped_host is None else depth.reweighted(depth.weight.at[dropped_host].set(0.0))
     kept = [term.restricted(~dropped_edges) for term in problem.edge_terms]
     for term in (*kept, depth):
@@ -196,7 +196,7 @@ def window() -> tuple[Problem, State]:
     scene = make_scene(KEYFRAMES, 6, 1, noise=0.5, depth_error=0.02)
     problem, initial, _ = scene.pack(terms=[vg.empty_prior(KEYFRAMES)])
     apart = (problem.edges.source == ALONE) | (problem.edges.target == ALONE)
-    for term in (problem.points, problem.lines):
+    for term in (problem.terms["points"], problem.terms["lines"]):
         problem = problem.with_term(term.reweighted(jnp.where(apart[:, None], 0.0, term.weight).at[0, :2].set(0.0)))
     return problem, initial
 
@@ -229,7 +229,7 @@ def test_prior_has_its_gradient_by_weights(window: tuple[Problem, State]) -> Non
     elsewhere = make_scene(KEYFRAMES, 6, 1, noise=0.5, depth_error=0.02).at_truth()[1]
 
     def energy(weight: jax.Array) -> jax.Array:
-        seen = problem.with_term(problem.points.reweighted(weight))
+        seen = problem.with_term(problem.terms["points"].reweighted(weight))
 
         def leave(prior: vg.terms.MarginalPrior, number: jax.Array) -> tuple[vg.terms.MarginalPrior, None]:
             return vg.marginalise(seen.with_term(prior), state, number), None
@@ -239,7 +239,7 @@ def test_prior_has_its_gradient_by_weights(window: tuple[Problem, State]) -> Non
         poses = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, 0), elsewhere.poses)
         return jnp.sum(moved.residual(poses, elsewhere.parameters) ** 2) / 2
 
-    check_by_weight(energy, problem.points.weight)
+    check_by_weight(energy, problem.terms["points"].weight)
 
 
 def test_covariances_have_their_gradient_where_a_keyframe_is_undetermined(window: tuple[Problem, State]) -> None:
@@ -247,12 +247,12 @@ def test_covariances_have_their_gradient_where_a_keyframe_is_undetermined(window
     problem, state = window
 
     def total(weight: jax.Array) -> jax.Array:
-        found = vg.covariances(problem.with_term(problem.points.reweighted(weight)), state)
+        found = vg.covariances(problem.with_term(problem.terms["points"].reweighted(weight)), state)
         assert found.poses.shape == (KEYFRAMES, 6, 6)
         finite = [jnp.where(jnp.isfinite(leaf), leaf, 0.0).sum() for leaf in jax.tree.leaves(found)]
         return sum(finite, jnp.zeros(()))
 
-    check_by_weight(total, problem.points.weight)
+    check_by_weight(total, problem.terms["points"].weight)
 
 
 def test_spectra_have_their_gradient_where_directions_are_undetermined(window: tuple[Problem, State]) -> None:
@@ -260,9 +260,9 @@ def test_spectra_have_their_gradient_where_directions_are_undetermined(window: t
     problem, state = window
 
     def total(weight: jax.Array) -> jax.Array:
-        found = vg.observability(problem.with_term(problem.points.reweighted(weight)), state)
+        found = vg.observability(problem.with_term(problem.terms["points"].reweighted(weight)), state)
         known = jnp.isfinite(found.whole.values[0]) & (found.whole.values[0] > 1e-9)
         shares = (found.whole.vectors[0] ** 2).T @ jnp.arange(found.free.size)
         return jnp.sum(jnp.where(known, shares + jnp.where(known, found.whole.values[0], 0.0), 0.0))
 
-    check_by_weight(total, problem.points.weight)
+    check_by_weight(total, problem.terms["points"].weight)

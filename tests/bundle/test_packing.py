@@ -44,9 +44,13 @@ def test_the_precision_is_that_of_jax_unless_it_is_given(double: bool) -> None:
 
 def observed(problem: Problem) -> set[tuple[float, ...]]:
     """Every point observation as (host pixel, match, weight, host, target): what there is, whatever its place."""
-    edge, slot = np.nonzero(problem.points.weight > 0)
+    edge, slot = np.nonzero(problem.terms["points"].weight > 0)
     source, target = np.asarray(problem.edges.source)[edge], np.asarray(problem.edges.target)[edge]
-    rows = [problem.pixels[source, slot], problem.points.target[edge, slot], problem.points.weight[edge, slot][:, None]]
+    rows = [
+        problem.pixels[source, slot],
+        problem.terms["points"].target[edge, slot],
+        problem.terms["points"].weight[edge, slot][:, None],
+    ]
     return {
         (*map(float, row), int(i), int(j)) for row, i, j in zip(np.concatenate(rows, 1), source, target, strict=True)
     }
@@ -63,8 +67,8 @@ def test_every_observation_is_packed_once(size: PaddedSize | None) -> None:
     rows = [seen.pixel[seen.point_landmark], seen.point_target, seen.point_weight[:, None]]
     expected = {(*map(float, row), int(i), int(j)) for row, (i, j) in zip(np.concatenate(rows, 1), edges, strict=True)}
     assert observed(problem) == expected
-    assert int(jnp.sum(problem.lines.weight > 0)) == len(seen.line_edge)
-    assert float(jnp.sum(problem.depth.weight)) == pytest.approx(seen.depth_weight.sum())
+    assert int(jnp.sum(problem.terms["lines"].weight > 0)) == len(seen.line_edge)
+    assert float(jnp.sum(problem.terms["depth"].weight)) == pytest.approx(seen.depth_weight.sum())
 
 
 def test_padding_is_harmless_and_held() -> None:
@@ -73,7 +77,7 @@ def test_padding_is_harmless_and_held() -> None:
     assert bool(jnp.all(problem.fixed_pose[3:]))
     assert list(problem.fixed_pose[:3]) == [True, False, False]
     assert bool(jnp.all(state.inverse_depth > 0))
-    assert bool(jnp.all(problem.depth.sigma > 0))
+    assert bool(jnp.all(problem.terms["depth"].sigma > 0))
     np.testing.assert_array_equal(jnp.linalg.norm(state.poses.wxyz_xyz[:, :4], axis=1).round(12), 1.0)
 
 
@@ -162,7 +166,7 @@ def test_lists_and_poses_are_taken_as_they_come() -> None:
     seen = SCENE.observations
     start = (jaxlie.SE3(jnp.asarray(SCENE.start_poses)), list(SCENE.start_intrinsics), SCENE.start_inverse_depth)
     problem, same, _ = UNCHECKED(seen, *start)
-    assert bool(jnp.all(problem.points.target == expected.points.target))
+    assert bool(jnp.all(problem.terms["points"].target == expected.terms["points"].target))
     assert bool(jnp.all(same.poses.wxyz_xyz == state.poses.wxyz_xyz))
 
 
@@ -225,28 +229,30 @@ def test_scattered_weights_are_those_that_pack_places(packed: Packed) -> None:
     @jax.jit
     def weights(points: jax.Array, lines: jax.Array, depths: jax.Array) -> tuple[jax.Array, ...]:
         return (
-            index.scatter_points(points, seen, empty.points.weight),
-            index.scatter_lines(lines, seen, empty.lines.weight),
-            index.scatter(depths, empty.depth.weight),
+            index.scatter_points(points, seen, empty.terms["points"].weight),
+            index.scatter_lines(lines, seen, empty.terms["lines"].weight),
+            index.scatter(depths, empty.terms["depth"].weight),
         )
 
     found = weights(*map(jnp.asarray, (seen.point_weight, seen.line_weight, seen.depth_weight)))
-    for array, term in zip(found, (problem.points, problem.lines, problem.depth), strict=True):
+    for array, term in zip(
+        found, (problem.terms["points"], problem.terms["lines"], problem.terms["depth"]), strict=True
+    ):
         np.testing.assert_array_equal(array, term.weight)
-    target = index.scatter_points(seen.point_target, seen, jnp.ones_like(problem.points.target))
-    np.testing.assert_array_equal(target, problem.points.target)
+    target = index.scatter_points(seen.point_target, seen, jnp.ones_like(problem.terms["points"].target))
+    np.testing.assert_array_equal(target, problem.terms["points"].target)
     back = index.gather(index.scatter(np.arange(len(seen.host)), initial.inverse_depth))
     np.testing.assert_array_equal(back, np.arange(len(seen.host)))
 
 
 def test_the_gradient_by_flat_weights_is_that_by_the_padded_ones(packed: Packed) -> None:
     """The derivative of the energy by one number a match is that by the padded weight at its place. Oracle: the
-    derivative by `problem.points.weight`, read by `gather_points`.
+    derivative by `problem.terms["points"].weight`, read by `gather_points`.
     """
     seen, problem, initial, index, _ = packed
-    energy = lambda weight: vg.energy(problem.with_term(problem.points.reweighted(weight)), initial)
-    flat = lambda values: energy(index.scatter_points(values, seen, problem.points.weight))
+    energy = lambda weight: vg.energy(problem.with_term(problem.terms["points"].reweighted(weight)), initial)
+    flat = lambda values: energy(index.scatter_points(values, seen, problem.terms["points"].weight))
     found = jax.jit(jax.grad(flat))(jnp.asarray(seen.point_weight))
-    expected = index.gather_points(jax.jit(jax.grad(energy))(problem.points.weight), seen)
+    expected = index.gather_points(jax.jit(jax.grad(energy))(problem.terms["points"].weight), seen)
     assert float(np.abs(expected).max()) > 0
     np.testing.assert_allclose(found, expected, rtol=1e-12)

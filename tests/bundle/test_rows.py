@@ -81,7 +81,9 @@ def test_matches_are_found_again() -> None:
     # Proves that `gather_points` finds each match in an edge of its landmark's row. Oracle: the observations.
     seen = SCENE.observations
     for problem, _, index in (WHOLE, ROWS):
-        np.testing.assert_allclose(index.gather_points(problem.points.target, seen), seen.point_target, rtol=1e-12)
+        np.testing.assert_allclose(
+            index.gather_points(problem.terms["points"].target, seen), seen.point_target, rtol=1e-12
+        )
         ends = np.stack([problem.edges.source, problem.edges.target], 1)
         np.testing.assert_array_equal(
             ends[index.stored_edge(seen.point_edge, seen.point_landmark)], seen.edges[seen.point_edge]
@@ -130,8 +132,8 @@ def test_derivatives_do_not_depend_on_the_rows() -> None:
         centre = solved(problem.with_term(_with_target(problem, target)), start).state.poses.translation()[1]
         return jnp.sum(jnp.sin(3 * centre))
 
-    evaluate, target = jax.jit(jax.value_and_grad(loss)), problem.points.target
-    present = (np.asarray(problem.points.weight) > 0)[..., None]
+    evaluate, target = jax.jit(jax.value_and_grad(loss)), problem.terms["points"].target
+    present = (np.asarray(problem.terms["points"].weight) > 0)[..., None]
     along = present * np.random.default_rng(0).normal(size=target.shape)
     change = lambda size: float(evaluate(target + size * along)[0] - evaluate(target - size * along)[0])
     gradient = np.asarray(evaluate(target)[1])
@@ -144,7 +146,7 @@ def test_derivatives_do_not_depend_on_the_rows() -> None:
 
 
 def _with_target(problem: Problem, target: jax.Array) -> vg.terms.PointTerm:
-    points = problem.points
+    points = problem.terms["points"]
     return vg.terms.PointTerm(target=target, weight=points.weight, kernel=points.kernel, first_slot=points.first_slot)
 
 

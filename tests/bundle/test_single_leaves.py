@@ -23,7 +23,10 @@ SCENE = make_scene(2, 6, 0, noise=0.5, depth_error=0.05, seed=4)
 SOLVER = SchurLevenbergMarquardt(rtol=1e-9, max_iterations=40)
 Leaf = Callable[[Problem], Any]
 
-LEAVES: dict[str, Leaf] = {"alpha": lambda p: p.depth.alpha, "marginal root": lambda p: p.marginal.root}
+LEAVES: dict[str, Leaf] = {
+    "alpha": lambda p: p.terms["depth"].alpha,
+    "marginal root": lambda p: p.terms["marginal"].root,
+}
 """A leaf that touches landmarks only, and one of poses and camera only."""
 
 
@@ -78,13 +81,13 @@ def test_a_landmark_at_its_bound_is_held() -> None:
     # Karush, Kuhn and Tucker, and gives the others their right derivative. Oracle: finite differences of the solve.
     scene = make_scene(2, 6, 0, noise=0.3, seed=4)
     problem, state, _ = scene.pack(fixed=True)
-    problem = eqx.tree_at(lambda p: p.depth.weight, problem, problem.depth.weight.at[0].set(0.0))
+    problem = eqx.tree_at(lambda p: p.terms["depth"].weight, problem, problem.terms["depth"].weight.at[0].set(0.0))
     # A match 40 pixels on the far side of infinity: along the epipolar line, against the parallax.
-    off = problem.points.target.at[0, 0].add(jnp.asarray([40.0, 0.0]))
-    problem = eqx.tree_at(lambda p: p.points.target, problem, off)
+    off = problem.terms["points"].target.at[0, 0].add(jnp.asarray([40.0, 0.0]))
+    problem = eqx.tree_at(lambda p: p.terms["points"].target, problem, off)
     tight = SchurLevenbergMarquardt(rtol=1e-14, max_iterations=60)
 
-    get = lambda p: p.points.target
+    get = lambda p: p.terms["points"].target
 
     def value(target: jax.Array) -> tuple[jax.Array, Solution]:
         solution = solve(eqx.tree_at(get, problem, target), state, solver=tight)
@@ -115,7 +118,7 @@ def test_the_solution_says_that_it_was_polished() -> None:
         solution = solve(moved, state, solver=short, **options)
         return jnp.sum(solution.state.poses.wxyz_xyz[1]), solution
 
-    alpha = problem.depth.alpha
+    alpha = problem.terms["depth"].alpha
     (_, told), _ = jax.jit(jax.value_and_grad(value, has_aux=True))(alpha)
     assert bool(told.polished)
     assert not bool(solve(problem, state, solver=short).polished)
@@ -133,7 +136,7 @@ def distance() -> Callable[..., jax.Array]:
     problem, initial, _ = vg.simulate_window(2, points=8, lines=0, host_noise=False).pack(kernel=vg.kernels.Square())
 
     def value(share: jax.Array, **options: optx.AbstractAdjoint) -> jax.Array:
-        points = problem.points.reweighted(share * problem.points.weight)
+        points = problem.terms["points"].reweighted(share * problem.terms["points"].weight)
         state = vg.solve(problem.with_term(points), initial, solver=LOOPED, **options).state
         return jnp.sum(state.poses.inverse().translation() ** 2)
 

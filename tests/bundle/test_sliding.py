@@ -70,13 +70,15 @@ def test_a_step_moves_everything_to_its_new_place(leaving: int) -> None:
     staying = [place for place in range(KEYFRAMES) if place != leaving]
     expected = vg.permute_prior(jax.jit(vg.marginalise)(problem, state, leaving), np.array([*staying, -1]))
     curved = lambda prior: np.asarray(prior.root.T @ prior.root)
-    np.testing.assert_allclose(curved(found.marginal), curved(expected), rtol=1e-9, atol=1e-9 * curved(expected).max())
+    np.testing.assert_allclose(
+        curved(found.terms["marginal"]), curved(expected), rtol=1e-9, atol=1e-9 * curved(expected).max()
+    )
     np.testing.assert_array_equal(found.fixed_pose, [leaving != 0, False, False, False])
     np.testing.assert_array_equal(initial.poses.wxyz_xyz[:-1], state.poses.wxyz_xyz[np.array(staying)])
     np.testing.assert_array_equal(initial.poses.wxyz_xyz[-1], following[1].poses.wxyz_xyz[-1])
     np.testing.assert_array_equal(initial.intrinsics, state.intrinsics)
     np.testing.assert_array_equal(initial.inverse_depth, following[1].inverse_depth)
-    np.testing.assert_array_equal(found.points.target, following[0].points.target)
+    np.testing.assert_array_equal(found.terms["points"].target, following[0].terms["points"].target)
     assert jax.tree.structure((found, initial)) == jax.tree.structure((problem, state))
 
 
@@ -135,15 +137,15 @@ def test_the_gradient_through_five_windows_is_the_finite_difference() -> None:
 
     def loss(weight: jax.Array, windows: Windows) -> jax.Array:
         first, start = pick(windows, 0)
-        states = slid(first.with_term(first.points.reweighted(weight)), start, rolled(windows), solver)
+        states = slid(first.with_term(first.terms["points"].reweighted(weight)), start, rolled(windows), solver)
         return jnp.sum(jnp.sin(3 * states.poses.wxyz_xyz[-1, -1]))
 
     evaluate, rng = jax.jit(jax.value_and_grad(loss)), np.random.default_rng(0)
     for share in (0.0, 0.05):
         windows = stacked(long_window(lines=0, outliers=share))
         first, _ = pick(windows, 0)
-        apart = (first.edges.target == 1)[:, None] & (jnp.arange(first.points.weight.shape[-1]) > 0)
-        weight = jnp.where(apart, 0.0, first.points.weight)
+        apart = (first.edges.target == 1)[:, None] & (jnp.arange(first.terms["points"].weight.shape[-1]) > 0)
+        weight = jnp.where(apart, 0.0, first.terms["points"].weight)
         along = jnp.asarray(rng.normal(size=weight.shape)) * (weight > 0)
         gradient = evaluate(weight, windows)[1]
         change = lambda size, w=weight, a=along, s=windows: evaluate(w + size * a, s)[0] - evaluate(w - size * a, s)[0]

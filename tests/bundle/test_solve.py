@@ -100,7 +100,7 @@ def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
     # Proves that NaN anywhere in use ends at once, with the code that says so and the initial state untouched.
     problem, start, _ = NOISY.pack(**OPTIONS)
     nan = lambda tree, where: eqx.tree_at(where, tree, replace_fn=lambda leaf: leaf.at[(0,) * leaf.ndim].set(jnp.nan))
-    seen = tuple(np.argwhere(problem.points.weight > 0)[0])
+    seen = tuple(np.argwhere(problem.terms["points"].weight > 0)[0])
     if spoil == "pose":
         start = State(jaxlie.SE3(start.poses.wxyz_xyz.at[1, 4].set(jnp.nan)), start.intrinsics, start.inverse_depth)
     elif spoil == "depth":
@@ -108,10 +108,14 @@ def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
     elif spoil == "pixel":
         problem = nan(problem, lambda p: p.pixels)
     elif spoil == "target":
-        problem = eqx.tree_at(lambda p: p.points.target, problem, replace_fn=lambda leaf: leaf.at[seen].set(jnp.nan))
+        problem = eqx.tree_at(
+            lambda p: p.terms["points"].target, problem, replace_fn=lambda leaf: leaf.at[seen].set(jnp.nan)
+        )
     else:
         value = {"weight": jnp.inf, "no weight": jnp.nan, "negative weight": -1.0}[spoil]
-        problem = eqx.tree_at(lambda p: p.points.weight, problem, replace_fn=lambda leaf: leaf.at[seen].set(value))
+        problem = eqx.tree_at(
+            lambda p: p.terms["points"].weight, problem, replace_fn=lambda leaf: leaf.at[seen].set(value)
+        )
     solution = solved(problem, start)
     assert solution.result == "nonfinite_input"
     assert int(solution.iterations) == 0
@@ -123,8 +127,10 @@ def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
 def test_a_step_that_is_not_finite(solved: Solve) -> None:
     # Proves that equations beyond the range of numbers end as a failure, not as convergence, with a finite state.
     problem, start, _ = NOISY.pack(**OPTIONS)
-    problem = eqx.tree_at(lambda p: p.depth.mean, problem, start.inverse_depth)
-    solution = solved(eqx.tree_at(lambda p: p.depth.sigma, problem, replace_fn=lambda leaf: leaf * 1e-200), start)
+    problem = eqx.tree_at(lambda p: p.terms["depth"].mean, problem, start.inverse_depth)
+    solution = solved(
+        eqx.tree_at(lambda p: p.terms["depth"].sigma, problem, replace_fn=lambda leaf: leaf * 1e-200), start
+    )
     assert solution.result == "nonfinite_step"
     assert not bool(solution.converged)
     assert finite(solution)
@@ -138,7 +144,9 @@ def test_without_depth_the_scale_is_held(solved: Solve) -> None:
     solution = solved(problem, start)
     scale = float(jnp.linalg.norm(solution.state.poses.translation()) / jnp.linalg.norm(truth.poses.translation()))
     size = float(jnp.linalg.norm(start.poses.translation()) / jnp.linalg.norm(truth.poses.translation()))
-    seen = jnp.any((jnp.concatenate([problem.points.weight, problem.lines.weight], 1) > 0).reshape(3, 2, -1), 1)
+    seen = jnp.any(
+        (jnp.concatenate([problem.terms["points"].weight, problem.terms["lines"].weight], 1) > 0).reshape(3, 2, -1), 1
+    )
     rescaled = State(
         jaxlie.SE3(solution.state.poses.wxyz_xyz.at[:, 4:].divide(scale)),
         solution.state.intrinsics,
@@ -155,7 +163,7 @@ def test_two_keyframes_that_start_at_the_same_place(solved: Solve) -> None:
     # Oracle: the truth.
     problem, start, truth = exact_problem()
     together = jaxlie.SE3(jnp.broadcast_to(start.poses.wxyz_xyz[:1], start.poses.wxyz_xyz.shape))
-    no_depth = eqx.tree_at(lambda p: p.depth.weight, problem, replace_fn=jnp.zeros_like)
+    no_depth = eqx.tree_at(lambda p: p.terms["depth"].weight, problem, replace_fn=jnp.zeros_like)
     solution = solved(no_depth, State(together, start.intrinsics, truth.inverse_depth))
     assert int(solution.iterations) > 1, solution.message
     assert float(solution.energy) < 1e-3 * float(solution.history[0])
@@ -180,8 +188,8 @@ def test_a_jitted_function_may_close_over_the_problem(solved: Solve) -> None:
     problem, start, truth = exact_problem()
     found = jax.jit(lambda state: solve(problem, state))(start)
     assert distance(found.state, truth) < 1e-8
-    weightless = jax.tree.map(jnp.zeros_like, problem.points.weight)
-    nothing = problem.with_terms((replace(problem.points, weight=weightless),))
+    weightless = jax.tree.map(jnp.zeros_like, problem.terms["points"].weight)
+    nothing = problem.with_terms((replace(problem.terms["points"], weight=weightless),))
     with raises("`problem`", "weights"):
         jax.jit(lambda state: solve(nothing, state))(start)
 

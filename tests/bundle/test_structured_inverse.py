@@ -126,10 +126,10 @@ def changed(name: str) -> Problem:
     """The loop as it is, without anything metric, or with one keyframe cut out of it."""
     none = lambda term: term.reweighted(jnp.zeros_like(term.weight))
     if name == "free scale":
-        return PROBLEM.with_term(none(PROBLEM.depth)).with_term(none(PROBLEM.surfaces), replace=True)
+        return PROBLEM.with_term(none(PROBLEM.terms["depth"])).with_term(none(PROBLEM.terms["surfaces"]), replace=True)
     if name == "cut":
         edges = (PROBLEM.edges.source == 7) | (PROBLEM.edges.target == 7)
-        points = PROBLEM.points.reweighted(jnp.where(edges[:, None], 0.0, PROBLEM.points.weight))
+        points = PROBLEM.terms["points"].reweighted(jnp.where(edges[:, None], 0.0, PROBLEM.terms["points"].weight))
         pairs = (SURFACES.first == 7) | (SURFACES.second == 7)
         return PROBLEM.with_term(points).with_term(
             SURFACES.reweighted(jnp.where(pairs, 0.0, SURFACES.weight)), replace=True
@@ -158,13 +158,13 @@ def test_covariances_column_by_column(name: str, solved: State) -> None:
 
 def loss(moving: tuple[jax.Array, jax.Array], solver: AbstractReducedSolver, start: State) -> jax.Array:
     """A number that depends on all that is estimated, as a function of the surfaces and the depth priors."""
-    problem = eqx.tree_at(lambda p: (p.surfaces.measured, p.depth.mean), PROBLEM, moving)
+    problem = eqx.tree_at(lambda p: (p.terms["surfaces"].measured, p.terms["depth"].mean), PROBLEM, moving)
     iteration = SchurLevenbergMarquardt(rtol=1e-12, max_iterations=10, reduced_solver=solver)
     state = solve(problem, start, solver=iteration).state
     return jnp.sum(jnp.sin(state.poses.wxyz_xyz)) + jnp.sum(state.inverse_depth**2) + jnp.sum(state.intrinsics)
 
 
-MOVING = (SURFACES.measured, PROBLEM.depth.mean)
+MOVING = (SURFACES.measured, PROBLEM.terms["depth"].mean)
 
 
 @pytest.fixture(scope="module")

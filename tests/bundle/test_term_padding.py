@@ -43,8 +43,8 @@ def test_a_small_weight_has_the_derivative_that_a_weight_of_0_lacks() -> None:
     """
     window = vg.simulate_window(2, points=3, lines=0)
     problem, initial, _ = window.pack(kernel=vg.kernels.Square())
-    energy = jax.jit(lambda weight: vg.energy(problem.with_term(problem.points.reweighted(weight)), initial))
-    absent = problem.points.weight.at[0, 0].set(0.0)
+    energy = jax.jit(lambda weight: vg.energy(problem.with_term(problem.terms["points"].reweighted(weight)), initial))
+    absent = problem.terms["points"].weight.at[0, 0].set(0.0)
     slope = float((energy(absent.at[0, 0].set(1e-3)) - energy(absent)) / 1e-3)
     derivative = jax.jit(jax.grad(energy))
     assert slope > 1e-3
@@ -61,10 +61,10 @@ def test_padding_changes_neither_energy_nor_gradient(packed) -> None:
     prior = eqx.tree_at(lambda t: (t.root, t.offset), prior, (rng.normal(size=(22, 22)), rng.normal(size=22)))
     terms = [*own_terms(), prior]
     (tight, start, index), (roomy, larger, other) = SCENE.pack(terms=terms), SCENE.pack(terms=terms, size=LARGER)
-    assert roomy.position_fix.weight.shape == (4,)
-    assert roomy.step_of_wheels.measured.shape == (3, 3)
-    assert roomy.point_to_plane.normal.shape == (20, 12, 3)
-    assert roomy.marginal.root.shape == (34, 34)
+    assert roomy.terms["position_fix"].weight.shape == (4,)
+    assert roomy.terms["step_of_wheels"].measured.shape == (3, 3)
+    assert roomy.terms["point_to_plane"].normal.shape == (20, 12, 3)
+    assert roomy.terms["marginal"].root.shape == (34, 34)
     assert set(energy_terms(tight, start)) == set(energy_terms(roomy, larger))
     for name, value in energy_terms(tight, start).items():
         assert float(value) > 0 or name == "intrinsics_prior", name
@@ -77,7 +77,7 @@ def test_padding_changes_neither_energy_nor_gradient(packed) -> None:
     np.testing.assert_allclose(more_poses[3:], 0.0, atol=0)
     np.testing.assert_allclose(same_camera, camera, atol=1e-12 * size)
     np.testing.assert_allclose(other.gather(more_landmarks), index.gather(landmarks), rtol=1e-9, atol=1e-12 * size)
-    fix = roomy.position_fix
+    fix = roomy.terms["position_fix"]
     missing = roomy.with_term(fix.reweighted(fix.weight.at[1].set(0.0)), replace=True)
     assert float(energy_terms(missing, larger)["position_fix"]) < float(energy_terms(roomy, larger)["position_fix"])
 
@@ -128,7 +128,7 @@ def test_a_batch_of_windows_with_different_terms(packed) -> None:
     window = (SCENE.observations, SCENE.start_poses, intrinsics, SCENE.start_inverse_depth)
     lists = [[fix, wheels, planes], [one, some], []]
     problems, states, _ = vg.batches.pack_batch([(*window, terms) for terms in lists])
-    assert problems.position_fix.weight.shape == (3, 2)
+    assert problems.terms["position_fix"].weight.shape == (3, 2)
     found, gradients = jax.vmap(energy_and_gradient)(problems, states)
     for number, terms in enumerate(lists):
         energy, gradient = energy_and_gradient(*SCENE.pack(terms=terms)[:2])

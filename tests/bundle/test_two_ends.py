@@ -38,7 +38,7 @@ def affine(problem: Problem) -> np.ndarray:
     """`B`, from the two ends of every segment (and the points) to all slots, as a dense matrix."""
     fraction = np.asarray(problem.fraction)
     hosts, segments, samples = fraction.shape
-    points = problem.lines.first_slot
+    points = problem.terms["lines"].first_slot
     matrix = np.zeros((hosts, points + segments * samples, points + 2 * segments))
     matrix[:, np.arange(points), np.arange(points)] = 1
     for segment in range(segments):
@@ -139,12 +139,12 @@ def test_gradients_are_those_of_central_differences() -> None:
     target = jnp.asarray(rng.normal(size=state.inverse_depth.shape))
 
     def loss(leaves: tuple[jax.Array, ...]) -> jax.Array:
-        changed = eqx.tree_at(lambda p: (p.lines.weight, p.depth.mean, p.fraction), problem, leaves)
+        changed = eqx.tree_at(lambda p: (p.terms["lines"].weight, p.terms["depth"].mean, p.fraction), problem, leaves)
         solved = solve(changed, state, solver=SOLVER).state
         return jnp.sum(solved.inverse_depth * target) + jnp.sum(solved.poses.wxyz_xyz**3)
 
     both = jax.jit(jax.value_and_grad(loss))  # its value is that of the polished optimum
-    at = (problem.lines.weight, problem.depth.mean, problem.fraction)
+    at = (problem.terms["lines"].weight, problem.terms["depth"].mean, problem.fraction)
     value, (_, found) = lambda leaves: both(leaves)[0], both(at)
     for number in range(3):
         direction = jnp.asarray(rng.normal(size=at[number].shape)) * (at[number] > 0)

@@ -111,10 +111,12 @@ def test_a_landmark_that_only_an_undetermined_keyframe_sees(estimated: Estimate)
     whole, _ = packed(WELL, at_truth=True, **OPTIONS)
     source, target = problem.edges.source[:, None], problem.edges.target[:, None]
     at_slot = (source == 1) & (jnp.arange(lacking.POINTS) == 0)
-    weight = jnp.where(at_slot & (target == 2), whole.points.weight, jnp.where(at_slot, 0.0, problem.points.weight))
+    weight = jnp.where(
+        at_slot & (target == 2), whole.terms["points"].weight, jnp.where(at_slot, 0.0, problem.terms["points"].weight)
+    )
     assert float(weight.sum(1)[(problem.edges.source == 1) & (problem.edges.target == 2)][0]) > 0
-    only_seen_there = (weight, problem.depth.weight.at[1, 0].set(0.0))
-    problem = eqx.tree_at(lambda p: (p.points.weight, p.depth.weight), problem, only_seen_there)
+    only_seen_there = (weight, problem.terms["depth"].weight.at[1, 0].set(0.0))
+    problem = eqx.tree_at(lambda p: (p.terms["points"].weight, p.terms["depth"].weight), problem, only_seen_there)
     lost = np.argwhere(np.isinf(estimated(problem, truth).inverse_depth))
     np.testing.assert_array_equal(lost, [[1, 0]])
 
@@ -123,7 +125,12 @@ def test_scaled_by_the_variance_factor(estimated: Estimate) -> None:
     # Proves that only ratios of weights matter after scaling. Oracle: invariance under all weights times 4.
     problem, truth = packed(WELL, at_truth=True, kernel=Huber(jnp.asarray(1e6, float)), **OPTIONS)
     problem = jax.jit(monte_carlo.noisy)(problem, jax.random.key(0))
-    weights = lambda p: (p.points.weight, p.lines.weight, p.depth.weight, p.intrinsics_prior.weight)
+    weights = lambda p: (
+        p.terms["points"].weight,
+        p.terms["lines"].weight,
+        p.terms["depth"].weight,
+        p.terms["intrinsics_prior"].weight,
+    )
     fourfold = eqx.tree_at(weights, problem, replace_fn=lambda weight: 4 * weight)
     plain, doubted = (estimated(p, truth).scaled() for p in (problem, fourfold))
     for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(doubted), strict=True):
@@ -163,7 +170,7 @@ def test_what_speaks_of_held_unknowns_alone_is_no_redundancy() -> None:
     assert kept(Aspect(weight=jnp.ones(1)), problem) == [0.0]
     free = eqx.tree_at(lambda p: p.fixed_intrinsics, problem, problem.fixed_intrinsics.at[1].set(False))
     assert kept(Aspect(weight=jnp.ones(1)), free) == [1.0]
-    assert kept(problem.intrinsics_prior.reweighted(jnp.ones(4)), problem) == [0.0, 0.0, 1.0, 1.0]
+    assert kept(problem.terms["intrinsics_prior"].reweighted(jnp.ones(4)), problem) == [0.0, 0.0, 1.0, 1.0]
     assert kept(PositionFix(keyframe=every, position=jnp.zeros((3, 3)), weight=one), problem) == [0.0, 1.0, 1.0]
     place, pixel = jnp.tile(jnp.array([0.1, 0.2, 3.0]), (3, 1)), jnp.zeros((3, 2))
     sighting = Sighting(keyframe=every, place=place, pixel=pixel, weight=one)

@@ -50,7 +50,9 @@ def test_one_number_is_the_weight_of_each_row_of_a_flat_term() -> None:
     rows = {"normal": np.tile([0.0, 0.0, 1.0], (3, 1)), "distance": np.full(3, 2.0)}
     at = {"landmark": SCENE.observations.point_landmark[:3], "edge": SCENE.observations.point_edge[:3]}
     one, listed = (
-        SCENE.pack(terms=[vg.terms.FlatTerm(PointToPlane, {**rows, "weight": weight}, **at)])[0].point_to_plane.weight
+        SCENE.pack(terms=[vg.terms.FlatTerm(PointToPlane, {**rows, "weight": weight}, **at)])[0]
+        .terms["point_to_plane"]
+        .weight
         for weight in (2.0, np.full(3, 2.0))
     )
     assert float(one.sum()) == 6.0

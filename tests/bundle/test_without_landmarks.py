@@ -60,7 +60,7 @@ def solved() -> tuple[Problem, State, np.ndarray]:
     size = 6 * problem.num_keyframes
     rows = lambda step: vg.residuals_at(problem, state.moved(jnp.pad(step, (0, 4))))["epipolar"]
     jacobian = np.asarray(jax.jit(jax.jacfwd(rows))(jnp.zeros(size)))[:, 6:]
-    information = jacobian.T @ (np.asarray(problem.epipolar.weight)[:, None] * jacobian)
+    information = jacobian.T @ (np.asarray(problem.terms["epipolar"].weight)[:, None] * jacobian)
     scale = np.asarray(scale_direction(problem, state))[6:size]
     basis = np.linalg.svd(scale.T)[2][1:].T
     return problem, state, basis @ np.linalg.inv(basis.T @ information @ basis) @ basis.T
@@ -84,7 +84,7 @@ def test_covariances_without_landmarks_hold_the_scale(
         spread = np.sqrt(np.diag(expected))
         error = np.abs(found.poses[i] - expected) / spread[:, None] / spread
         assert error.max() < 1e-6, f"keyframe {i}: off by {error.max():.1e} of its variances"
-    rows, unknowns = problem.epipolar.weight.size, 6 * (problem.num_keyframes - 1) - 1
+    rows, unknowns = problem.terms["epipolar"].weight.size, 6 * (problem.num_keyframes - 1) - 1
     factor = 2 * vg.energy(problem, state) / (rows - unknowns)
     assert float(found.variance_factor) == pytest.approx(float(factor), rel=1e-9)
 

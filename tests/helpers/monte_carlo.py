@@ -73,16 +73,21 @@ def noisy(problem: Problem, key: Array) -> Problem:
     keys = jax.random.split(key, 4)
     deviation = lambda weight: jnp.where(weight > 0, 1 / jnp.sqrt(jnp.where(weight > 0, weight, 1.0)), 0.0)
     draw = lambda key, spread: spread * jax.random.normal(key, spread.shape, spread.dtype)
-    point = jnp.repeat(deviation(problem.points.weight)[..., None], 2, -1)
-    depth = problem.depth.sigma * deviation(problem.depth.alpha * problem.depth.weight)
+    point = jnp.repeat(deviation(problem.terms["points"].weight)[..., None], 2, -1)
+    depth = problem.terms["depth"].sigma * deviation(problem.terms["depth"].alpha * problem.terms["depth"].weight)
     return eqx.tree_at(
-        lambda p: (p.points.target, p.lines.coefficients, p.depth.mean, p.intrinsics_prior.mean),
+        lambda p: (
+            p.terms["points"].target,
+            p.terms["lines"].coefficients,
+            p.terms["depth"].mean,
+            p.terms["intrinsics_prior"].mean,
+        ),
         problem,
         (
-            problem.points.target + draw(keys[0], point),
-            problem.lines.coefficients.at[..., 2].add(draw(keys[1], deviation(problem.lines.weight))),
-            problem.depth.mean + draw(keys[2], depth),
-            problem.intrinsics_prior.mean + draw(keys[3], deviation(problem.intrinsics_prior.weight)),
+            problem.terms["points"].target + draw(keys[0], point),
+            problem.terms["lines"].coefficients.at[..., 2].add(draw(keys[1], deviation(problem.terms["lines"].weight))),
+            problem.terms["depth"].mean + draw(keys[2], depth),
+            problem.terms["intrinsics_prior"].mean + draw(keys[3], deviation(problem.terms["intrinsics_prior"].weight)),
         ),
     )
 

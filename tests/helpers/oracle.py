@@ -47,17 +47,17 @@ def projected(problem: Any, state: Any) -> jax.Array:
 
 def residuals(problem: Any, state: Any) -> Residuals:
     """By term, before weights: points `[e, p, 2]`, lines `[e, l, 1]`, depth `[n, s, 1]`, the camera's `[4, 1]`."""
-    pixels, points = projected(problem, state), problem.points.weight.shape[1]
-    a, b, c = jnp.moveaxis(problem.lines.coefficients, -1, 0)
+    pixels, points = projected(problem, state), problem.terms["points"].weight.shape[1]
+    a, b, c = jnp.moveaxis(problem.terms["lines"].coefficients, -1, 0)
     u, v = jnp.moveaxis(pixels[:, points:], -1, 0)
     found = {
-        "points": pixels[:, :points] - problem.points.target,
+        "points": pixels[:, :points] - problem.terms["points"].target,
         "lines": (a * u + b * v + c)[..., None],
-        "depth": ((state.inverse_depth - problem.depth.mean) / problem.depth.sigma)[..., None],
-        "intrinsics_prior": (state.intrinsics - problem.intrinsics_prior.mean)[:, None],
+        "depth": ((state.inverse_depth - problem.terms["depth"].mean) / problem.terms["depth"].sigma)[..., None],
+        "intrinsics_prior": (state.intrinsics - problem.terms["intrinsics_prior"].mean)[:, None],
     }
-    if any(term.name == "marginal" for term in problem.terms):
-        prior = problem.marginal
+    if "marginal" in problem.terms:
+        prior = problem.terms["marginal"]
         off = (state.poses @ jaxlie.SE3(prior.poses.wxyz_xyz).inverse()).log().reshape(-1)
         found["marginal"] = prior.root @ jnp.concatenate([off, state.intrinsics - prior.intrinsics]) + prior.offset
     return found
@@ -65,8 +65,8 @@ def residuals(problem: Any, state: Any) -> Residuals:
 
 def weights(problem: Any) -> Residuals:
     """What multiplies squared residuals, by term."""
-    found = {name: getattr(problem, name).weight for name in ("points", "lines", "intrinsics_prior")}
-    return {**found, "depth": problem.depth.alpha * problem.depth.weight, "marginal": jnp.ones(())}
+    found = {name: problem.terms[name].weight for name in ("points", "lines", "intrinsics_prior")}
+    return {**found, "depth": problem.terms["depth"].alpha * problem.terms["depth"].weight, "marginal": jnp.ones(())}
 
 
 def squares(problem: Any, state: Any) -> Residuals:
@@ -77,7 +77,7 @@ def squares(problem: Any, state: Any) -> Residuals:
 
 def kernel(problem: Any, name: str) -> Any:
     """The robust kernel of a term."""
-    return getattr(problem, name).kernel
+    return problem.terms[name].kernel
 
 
 def energies(problem: Any, state: Any) -> Residuals:

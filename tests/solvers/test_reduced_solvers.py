@@ -189,7 +189,7 @@ def times(problem: Problem, factor: float | jax.Array) -> Problem:
 
 def depths(target: jax.Array, factor: jax.Array, problem: Problem, start: State) -> tuple[jax.Array, Solution]:
     """The sum of all inverse depths that these targets give, and the solution."""
-    points = eqx.tree_at(lambda points: points.target, problem.points, target)
+    points = eqx.tree_at(lambda points: points.target, problem.terms["points"], target)
     solution = solve(times(problem.with_term(points), factor), start, solver=SchurLevenbergMarquardt())
     return solution.state.inverse_depth.sum(), solution
 
@@ -208,8 +208,8 @@ def test_tiny_weights_ask_for_the_same_steps() -> None:
     """
     problem, start = packed(sequence(), kernel=Square())
     derivative = jax.jit(jax.grad(depths, has_aux=True))
-    expected, ordinary = derivative(problem.points.target, jnp.asarray(1.0), problem, start)
-    found, tiny = derivative(problem.points.target, jnp.asarray(TINY), problem, start)
+    expected, ordinary = derivative(problem.terms["points"].target, jnp.asarray(1.0), problem, start)
+    found, tiny = derivative(problem.terms["points"].target, jnp.asarray(TINY), problem, start)
     check_same(tiny, ordinary)
     np.testing.assert_allclose(found, expected, atol=1e-6 * float(jnp.abs(expected).max()))
 

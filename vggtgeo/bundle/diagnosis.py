@@ -155,7 +155,7 @@ def diagnose(problem: Problem, start: State, state: State, energy: Float[Array, 
         motion=motion.astype(dtype),
         energy=2 * (prepared_energy(problem, state) if energy is None else energy),
         redundancy=rows - unknowns,
-        names=tuple(term.name for term in terms),
+        names=terms.names,
         shapes=tuple(jnp.shape(term.weight) for term in terms),
     )
 

@@ -149,7 +149,7 @@ class FlatTerm:
         >>> window = vg.simulate_window(keyframes=3, points=10, lines=1)
         >>> fields = dict(normal=np.tile([0.0, 0.0, 1.0], (10, 1)), distance=np.full(10, 3.0))
         >>> planes = vg.terms.FlatTerm(PointToPlane, fields, landmark=np.arange(10), edge=np.zeros(10, int))
-        >>> window.pack(terms=[planes])[0].point_to_plane.normal.shape  # edges, slots, entries
+        >>> window.pack(terms=[planes])[0].terms["point_to_plane"].normal.shape  # edges, slots, entries
         (6, 14, 3)
 
     """

@@ -42,7 +42,7 @@ from vggtgeo.bundle.padding import (
     pad_edges,
     rows_of_keyframes,
 )
-from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.problem import Edges, Problem, State, Terms
 from vggtgeo.bundle.terms.landmark import DepthPrior, HostPixel, SlotTerm
 from vggtgeo.bundle.terms.landmark_edge import EdgeTerm
 from vggtgeo.bundle.terms.node import DenseTerm, IntrinsicsPrior
@@ -93,7 +93,7 @@ def pack(
         >>> window = vg.simulate_window(keyframes=3, points=10, lines=1)
         >>> guess = window.start, window.intrinsics, window.observations.depth_mean
         >>> problem, initial, index = vg.pack(window.observations, *guess)
-        >>> problem.points.target.shape, index.gather(initial.inverse_depth).shape
+        >>> problem.terms["points"].target.shape, index.gather(initial.inverse_depth).shape
         ((6, 10, 2), (42,))
 
     """
@@ -115,7 +115,7 @@ def pack(
     problem = Problem(
         pixels=_per_slot(index, observations.pixel, 0.0, dtype),
         edges=graph,
-        terms=(*seen, _intrinsics_prior(cameras, dtype), *(_padded(term, index, size, dtype) for term in terms)),
+        terms=Terms((*seen, _intrinsics_prior(cameras, dtype), *(_padded(term, index, size, dtype) for term in terms))),
         fixed_pose=to_device(np.concatenate([fixed, np.ones(padding, bool)])),
         fixed_intrinsics=to_device(cameras.fixed),
         camera_of=None if camera_of is None else to_device(np.pad(camera_of, (0, padding)), np.int32),

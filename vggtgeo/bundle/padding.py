@@ -117,8 +117,8 @@ class SlotIndex:
         >>> window = vg.simulate_window(3, points=10, lines=1)
         >>> problem, initial, index = window.pack()
         >>> def energy(weights):  # [A], as `window.observations` lists the matches
-        ...     padded = index.scatter_points(weights, window.observations, problem.points.weight)
-        ...     return vg.energy(problem.with_term(problem.points.reweighted(padded)), initial)
+        ...     padded = index.scatter_points(weights, window.observations, problem.terms["points"].weight)
+        ...     return vg.energy(problem.with_term(problem.terms["points"].reweighted(padded)), initial)
         >>> jax.jit(jax.grad(energy))(jnp.ones(60)).shape
         (60,)
 
@@ -164,8 +164,8 @@ class SlotIndex:
 
         Args:
             values: [D, ...], in the order of `Observations.host`.
-            into: [n, s, ...], such as `initial.inverse_depth` or `problem.depth.weight`; it determines shape and
-                precision. Empty slots keep its values.
+            into: [n, s, ...], such as `initial.inverse_depth` or `problem.terms["depth"].weight`; it determines shape
+                and precision. Empty slots keep its values.
 
         """
         return _scattered(values, into, (self.host, self.slot), self.shape[0])
@@ -176,7 +176,7 @@ class SlotIndex:
         Args:
             values: [A, ...], in the order of `observations`.
             observations: the packed observations.
-            into: [e, p, ...], such as `problem.points.weight` or `problem.points.target`; it determines shape and
+            into: [e, p, ...], such as `target` or `weight` of `problem.terms["points"]`; it determines shape and
                 precision. Slots without a match keep its values, so that a weight of 0 stays 0.
 
         """
@@ -188,7 +188,7 @@ class SlotIndex:
         Args:
             values: [B, ...], in the order of `observations`.
             observations: the packed observations.
-            into: [e, l, ...], such as `problem.lines.weight` or `problem.lines.coefficients`.
+            into: [e, l, ...], such as `weight` or `coefficients` of `problem.terms["lines"]`.
 
         """
         first = self.shape[2] - (np.shape(into)[1] if np.ndim(into) > 1 else 0)  # the slots of lines come last

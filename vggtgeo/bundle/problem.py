@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal, overload
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -119,16 +119,70 @@ class Edges(eqx.Module):
         return self.source, self.target
 
 
+class Terms(eqx.Module):
+    """The terms of a problem: `terms["points"]`, in the order of their energies in the sum.
+
+    Iteration, `len` and `in` (by name) are as usual. The names of the package's own terms have their types.
+
+    Fields:
+        ordered: The terms. The first one has a name that occurs twice.
+    """
+
+    ordered: tuple[AbstractTerm, ...] = eqx.field(converter=tuple)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names in order."""
+        return tuple(term.name for term in self.ordered)
+
+    def get(self, name: str, default: AbstractTerm | None = None) -> AbstractTerm | None:
+        """Return the term of a name, or the default."""
+        return next((term for term in self.ordered if term.name == name), default)
+
+    def __iter__(self) -> Iterator[AbstractTerm]:
+        return iter(self.ordered)
+
+    def __len__(self) -> int:
+        return len(self.ordered)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    @overload
+    def __getitem__(self, name: Literal["points"]) -> PointTerm: ...
+    @overload
+    def __getitem__(self, name: Literal["lines"]) -> LineTerm: ...
+    @overload
+    def __getitem__(self, name: Literal["depth"]) -> DepthPrior: ...
+    @overload
+    def __getitem__(self, name: Literal["host_pixels"]) -> HostPixel: ...
+    @overload
+    def __getitem__(self, name: Literal["intrinsics_prior"]) -> IntrinsicsPrior: ...
+    @overload
+    def __getitem__(self, name: Literal["marginal"]) -> MarginalPrior: ...
+    @overload
+    def __getitem__(self, name: str) -> AbstractTerm: ...
+    def __getitem__(self, name: str) -> AbstractTerm:
+        found = self.get(name)
+        if found is None:
+            raise InputError(f"`terms` has no term `{name}`; it has {', '.join(self.names) or 'no terms'}")
+        return found
+
+
+def _as_terms(terms: Terms | tuple[AbstractTerm, ...]) -> Terms:
+    return terms if isinstance(terms, Terms) else Terms(terms)
+
+
 class Problem(eqx.Module):
     """A bundle-adjustment problem, made by `vggtgeo.pack`; differentiable by every float leaf.
 
     Pixels, 1/m for inverse depths, poses world -> camera. An observation of weight 0 is absent, so that a kind can be
-    disabled without a change of shapes. A term is also an attribute by its name: `problem.points`.
+    disabled without a change of shapes.
 
     Fields:
         pixels: Pixel of each slot in its host keyframe: point slots first, then line samples.
         edges: The covisibility graph.
-        terms: The terms; the sum of their energies is minimised.
+        terms: The terms, in order and by name; the sum of their energies is minimised.
         fixed_pose: Keyframes with a fixed pose (the gauge).
         fixed_intrinsics: Fixed parameters of the cameras.
         fraction: For line segments: the last `g m` slots are `g` segments of `m` samples, and the inverse depth of a
@@ -142,11 +196,11 @@ class Problem(eqx.Module):
     Example:
         >>> import jax.numpy as jnp, vggtgeo as vg
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
-        >>> [term.name for term in problem.terms]
-        ['points', 'lines', 'depth', 'host_pixels', 'intrinsics_prior']
-        >>> problem.points.target.shape, problem.lines.weight.shape
+        >>> problem.terms.names
+        ('points', 'lines', 'depth', 'host_pixels', 'intrinsics_prior')
+        >>> problem.terms["points"].target.shape, problem.terms["lines"].weight.shape
         ((6, 10, 2), (6, 4))
-        >>> without = problem.with_term(problem.lines.reweighted(jnp.zeros((6, 4))))
+        >>> without = problem.with_term(problem.terms["lines"].reweighted(jnp.zeros((6, 4))))
         >>> bool(vg.energy(without, initial) < vg.energy(problem, initial))
         True
 
@@ -154,7 +208,7 @@ class Problem(eqx.Module):
 
     pixels: Float[Array, "h s 2"]
     edges: Edges
-    terms: tuple[AbstractTerm, ...]
+    terms: Terms = eqx.field(converter=_as_terms)
     fixed_pose: Bool[Array, " n"]
     fixed_intrinsics: Bool[Array, "*g k"]
     fraction: Float[Array, "h g m"] | None = None
@@ -162,13 +216,6 @@ class Problem(eqx.Module):
     camera: type[AbstractCamera] = eqx.field(static=True, default=Pinhole)
     positive_depth: bool = eqx.field(static=True, default=True)
     host: Int[Array, " h"] | None = None
-
-    def __getattr__(self, name: str) -> Any:
-        # `vars`, not `self.terms`: while Equinox builds or copies a module, fields are missing and this would recurse.
-        for term in vars(self).get("terms", ()):
-            if getattr(term, "name", None) == name:
-                return term
-        raise AttributeError(f"`Problem` has no attribute and no term `{name}`")
 
     def with_term(self, term: AbstractTerm, *, replace: bool = False) -> Problem:
         """Add a term, or replace the term of the same name.
@@ -194,8 +241,8 @@ class Problem(eqx.Module):
             >>> class SecondFix(PositionFix):
             ...     name = "second_fix"
             >>> first, second = (kind(keyframe=[1], position=jnp.zeros((1, 3))) for kind in (PositionFix, SecondFix))
-            >>> [term.name for term in problem.with_term(first).with_term(second).terms[-2:]]
-            ['position_fix', 'second_fix']
+            >>> problem.with_term(first).with_term(second).terms.names[-2:]
+            ('position_fix', 'second_fix')
 
         """
         check_kind("term", term, AbstractTerm, "a term, such as `vggtgeo.terms.PointTerm`")
@@ -203,7 +250,7 @@ class Problem(eqx.Module):
         if isinstance(term, EdgeTerm | SlotTerm):
             rows = self.edges.source.shape if isinstance(term, EdgeTerm) else self.pixels.shape[:-2]
             check_padded(term, rows, self.pixels.shape[-2])
-        old = next((old for old in self.terms if old.name == term.name), None)
+        old = self.terms.get(term.name)
         if old is None:
             return self.with_terms((*self.terms, term))
         if not (isinstance(term, type(old)) or isinstance(old, type(term))):
@@ -222,17 +269,17 @@ class Problem(eqx.Module):
         """Return the problem without the term of that name; unchanged if there is none."""
         return self.with_terms(tuple(term for term in self.terms if term.name != name))
 
-    def with_terms(self, terms: tuple[AbstractTerm, ...]) -> Problem:
+    def with_terms(self, terms: Terms | tuple[AbstractTerm, ...]) -> Problem:
         """Return the problem with other terms.
 
         Raises:
             InputError: `terms` is not a tuple of terms.
 
         """
-        check_kind("terms", terms, tuple, "a tuple of terms")
+        check_kind("terms", terms, (Terms, tuple), "a tuple of terms")
         for term in terms:
             check_kind("terms", term, AbstractTerm, "terms in it, such as `vggtgeo.terms.PointTerm`")
-        return eqx.tree_at(lambda problem: problem.terms, self, terms)
+        return eqx.tree_at(lambda problem: problem.terms, self, _as_terms(terms))
 
     @property
     def edge_terms(self) -> tuple[EdgeTerm, ...]:

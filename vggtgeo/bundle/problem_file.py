@@ -24,7 +24,7 @@ from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
 from vggtgeo.bundle.packing import pack
 from vggtgeo.bundle.padding import SlotIndex
-from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.problem import Edges, Problem, State, Terms
 from vggtgeo.bundle.terms.term import AbstractTerm
 from vggtgeo.geometry import camera_models as cameras
 from vggtgeo.io.archives import Archive, ArrayHeader, open_archive
@@ -35,13 +35,13 @@ from vggtgeo.io.persistence import DATA, HEADER, Format, by_name
 from vggtgeo.solvers.kernels import Barron, Cauchy, GemanMcClure, Huber, Square
 
 PROBLEM_CLASSES: tuple[type, ...] = (
-    *(Problem, State, Edges, SlotIndex, jaxlie.SE3, jaxlie.SO3),
+    *(Problem, Terms, State, Edges, SlotIndex, jaxlie.SE3, jaxlie.SO3),
     *(Square, Huber, Cauchy, GemanMcClure, Barron),
     *(cameras.Pinhole, cameras.RadialTangential, cameras.KannalaBrandt),
     *map(cameras.with_shared_focal, (cameras.Pinhole, cameras.RadialTangential, cameras.KannalaBrandt)),
 )
 """Classes of the package that a saved problem may have, besides those of `bundle/terms/`."""
-PROBLEM = Format("problem", 3, by_name(PROBLEM_CLASSES), True, ": pass your own classes as `terms`")
+PROBLEM = Format("problem", 4, by_name(PROBLEM_CLASSES), True, ": pass your own classes as `terms`")
 
 LAYOUT: dict[str, tuple[str | int, ...]] = {
     "edges": ("E", 2),

@@ -107,10 +107,10 @@ def _with_priors(windows: Batch, weight: Array) -> Problem:
     empty = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), empty_prior(keyframes, weight.dtype)
     )
-    problem = windows.problem.with_term(windows.problem.points.reweighted(weight)).with_term(empty)
-    if all(term.name != BaselinePrior.name for term in problem.terms):
+    problem = windows.problem.with_term(windows.problem.terms["points"].reweighted(weight)).with_term(empty)
+    if BaselinePrior.name not in problem.terms:
         return problem
-    unit = problem.baselines
+    unit = problem.terms[BaselinePrior.name]
     return problem.with_term(unit.reweighted(unit.weight.at[1:].set(0.0)), replace=True)
 
 

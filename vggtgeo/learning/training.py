@@ -108,7 +108,7 @@ def _packed(window: TrackedWindow, size: PaddedSize, terms: Sequence[GivenTerm])
     problem, initial, index = pack(seen, *guess, size=size, terms=terms)
 
     def per_match(values: np.ndarray) -> Array:
-        array = np.zeros((*problem.points.weight.shape, *values.shape[1:]), values.dtype)
+        array = np.zeros((*problem.terms["points"].weight.shape, *values.shape[1:]), values.dtype)
         array[seen.point_edge, index.slot[seen.point_landmark]] = values  # edges are given sorted by host
         return jnp.asarray(array)
 
@@ -117,7 +117,7 @@ def _packed(window: TrackedWindow, size: PaddedSize, terms: Sequence[GivenTerm])
         problem=problem,
         initial=initial,
         truth=poses.inverse().translation(),
-        present=problem.points.weight > 0,
+        present=problem.terms["points"].weight > 0,
         features=per_match(window.features),
         saliency=per_match(window.saliency),
         right=per_match(window.right),
@@ -137,7 +137,7 @@ def error_and_gradient(window: Batch, confidence: Float[Array, "e p"]) -> tuple[
 
     def loss(confidence: Array) -> Array:
         weight = jnp.where(window.present, GAIN * confidence, 0.0)
-        problem = eqx.tree_at(lambda p: p.points.weight, window.problem, weight)
+        problem = eqx.tree_at(lambda p: p.terms["points"].weight, window.problem, weight)
         solution = solve(problem, window.initial)
         error = log_error(solution.state.poses.inverse().translation()[1:], window.truth[1:])
         # A solve that stayed at its start, for a weight that is no number, must not count as an error.

@@ -12,7 +12,7 @@ from pathlib import Path
 import jaxlie
 
 from vggtgeo.bundle.padding import SlotIndex
-from vggtgeo.bundle.problem import Edges, Problem, State
+from vggtgeo.bundle.problem import Edges, Problem, State, Terms
 from vggtgeo.bundle.terms.landmark import DepthPrior
 from vggtgeo.bundle.terms.marginal import MarginalPrior
 from vggtgeo.bundle.terms.measured_pose import BaselinePrior, RelativePose, RotationPrior, SurfaceAlignment
@@ -44,12 +44,12 @@ STATE_CLASSES: tuple[type, ...] = (
     *(Tracker, FramePose, SecondMotion, SeenPoints, UnplacedFrame, TrackingQuality, Window, WindowPrior, PendingWindow),
     *(Features, PixelDescriptors, Mast3rView, Fit, LineFeatures, Segments, Pair, PointMatches, LineMatches),
     *(MeasuredRotation, MeasuredBaseline, MeasuredRelativePose, MarginalPrior),
-    *(Adjustment, Problem, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
+    *(Adjustment, Problem, Terms, State, Edges, SlotIndex, Pinhole, jaxlie.SE3, jaxlie.SO3),
     *(PointTerm, LineTerm, DepthPrior, IntrinsicsPrior, RelativePose, SurfaceAlignment, RotationPrior, BaselinePrior),
     *(Square, Huber, Cauchy, GemanMcClure, Barron, IterationRecord, RgbdView, Points),
 )
 """All classes that a file may have; a state with any other (descriptors of a user's matcher) is not written."""
-VERSION = 21
+VERSION = 22
 """Of the content: a file of another one is refused."""
 
 

@@ -176,10 +176,10 @@ def test_without_a_kind_is_the_problem_without_it(observed: Observe, kind: str) 
     # problem that never had the kind.
     problem, truth = packed(WELL, at_truth=True)
     weight = {
-        "points": lambda p: p.points.weight,
-        "lines": lambda p: p.lines.weight,
-        "depth": lambda p: p.depth.weight,
-        "intrinsics_prior": lambda p: p.intrinsics_prior.weight,
+        "points": lambda p: p.terms["points"].weight,
+        "lines": lambda p: p.terms["lines"].weight,
+        "depth": lambda p: p.terms["depth"].weight,
+        "intrinsics_prior": lambda p: p.terms["intrinsics_prior"].weight,
     }[kind]
     found = observed(problem, truth)
     lacking = observed(eqx.tree_at(weight, problem, replace_fn=jnp.zeros_like), truth)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -33,6 +32,7 @@ from vggtgeo.bundle.terms.measured_pose import quadratic
 from vggtgeo.bundle.terms.node import DenseTerm, node_derivatives, node_residuals
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Cameras
+from vggtgeo.io.errors import InputError
 from vggtgeo.slam.sparse_map.factors import (
     MeasuredBaseline,
     MeasuredRelativePose,
@@ -96,7 +96,7 @@ def test_what_is_written_by_hand_is_what_is_derived(shape: float, shared_focal: 
     state = eqx.tree_at(lambda s: s.inverse_depth, state, state.inverse_depth.at[0, 0].set(60.0))
     four = eqx.tree_at(lambda s: s.intrinsics, state, jnp.asarray(SCENE.start_intrinsics))
     behind = oracle.seen_from(problem, four)[:, 0, 2] < oracle.LEAST_DEPTH
-    assert bool(jnp.any(behind & (problem.edges.source == 0) & (problem.points.weight[:, 0] > 0)))
+    assert bool(jnp.any(behind & (problem.edges.source == 0) & (problem.terms["points"].weight[:, 0] > 0)))
     found = by_hand_and_derived(problem, state, jnp.asarray(0.7))
     assert set(found) == {"points", "lines"}
     for name, pairs in found.items():
@@ -194,9 +194,9 @@ def made(kind: str, problem: vg.Problem, state: vg.State) -> vg.terms.AbstractTe
     if kind in factors:
         (term,) = factor_terms(factors[kind], known, {type(factors[kind][0]): 4}, metric=True)
     elif kind == "log_depth":
-        term = LogDepth(log=jnp.log(problem.depth.mean) + 0.1, weight=problem.depth.weight)
+        term = LogDepth(log=jnp.log(problem.terms["depth"].mean) + 0.1, weight=problem.terms["depth"].weight)
     elif kind == "epipolar":
-        term = Epipolar(target=problem.points.target, weight=problem.points.weight)
+        term = Epipolar(target=problem.terms["points"].target, weight=problem.terms["points"].weight)
     elif kind == "square_pixels":
         term = SquarePixels(weight=jnp.ones(1))
     elif kind == "sighting":
@@ -325,16 +325,42 @@ def test_a_second_list_of_one_class_does_not_take_the_place_of_the_first() -> No
 def test_names_and_replacement() -> None:
     # Proves how terms are found: by their class's name in snake case, replaced in place, added as the last, left out.
     problem, _, _ = SCENE.pack()
-    names: Callable[[vg.Problem], list[str]] = lambda p: [term.name for term in p.terms]
-    own = LogDepth(log=problem.depth.mean, weight=problem.depth.weight)
-    assert names(problem.with_term(own)) == ["points", "lines", "depth", "intrinsics_prior", "log_depth"]
-    lighter = problem.lines.reweighted(0.5 * problem.lines.weight)
+    own = LogDepth(log=problem.terms["depth"].mean, weight=problem.terms["depth"].weight)
+    assert problem.with_term(own).terms.names == ("points", "lines", "depth", "intrinsics_prior", "log_depth")
+    lighter = problem.terms["lines"].reweighted(0.5 * problem.terms["lines"].weight)
     changed = problem.with_term(lighter)
-    assert names(changed) == names(problem)
-    np.testing.assert_array_equal(changed.lines.weight, lighter.weight)
-    assert names(problem.without_term("lines")) == ["points", "depth", "intrinsics_prior"]
-    with pytest.raises(AttributeError, match="no attribute and no term `imu`"):
-        _ = problem.imu
+    assert changed.terms.names == problem.terms.names
+    np.testing.assert_array_equal(changed.terms["lines"].weight, lighter.weight)
+    assert problem.without_term("lines").terms.names == ("points", "depth", "intrinsics_prior")
+
+
+def test_terms_are_an_ordered_collection_by_name() -> None:
+    # Proves access by name and order, errors that list the existing names, and that any way to give terms is equal.
+    problem, initial, _ = SCENE.pack()
+    terms = problem.terms
+    assert [term.name for term in terms] == list(terms.names) == ["points", "lines", "depth", "intrinsics_prior"]
+    assert len(terms) == 4
+    assert "lines" in terms
+    assert "imu" not in terms
+    assert terms["lines"] is terms.ordered[1]
+    assert terms.get("lines") is terms["lines"]
+    assert terms.get("imu") is None
+    assert terms.get("imu", terms["depth"]) is terms["depth"]
+    with pytest.raises(InputError, match="no term `imu`; it has points, lines, depth, intrinsics_prior"):
+        _ = terms["imu"]
+    empty = problem.with_terms(())
+    with pytest.raises(InputError, match="no term `points`; it has no terms"):
+        _ = empty.terms["points"]
+    with pytest.raises(AttributeError):
+        _ = problem.points
+    structure = jax.tree.structure(problem)
+    parts = {field.name: getattr(problem, field.name) for field in fields(problem)}
+    again = (vg.Problem(**{**parts, "terms": tuple(terms)}), empty.with_terms(terms), problem.with_terms(tuple(terms)))
+    assert {hash(jax.tree.structure(given)) for given in again} == {hash(structure)}
+    assert all(jax.tree.structure(given) == structure for given in again)
+    jitted = jax.jit(vg.energy)
+    assert len({float(jitted(given, initial)) for given in (problem, *again)}) == 1
+    assert jitted._cache_size() == 1
 
 
 class TwiceRelative(vg.terms.RelativePose):

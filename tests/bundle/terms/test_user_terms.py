@@ -28,7 +28,7 @@ def solved(own: tuple[vg.Problem, vg.State, vg.State]) -> vg.Solution:
 def without(problem: vg.Problem, *names: str) -> vg.Problem:
     """The problem with the weights of these terms zero: of the same structure, so nothing is compiled again."""
     for name in names:
-        term = getattr(problem, name)
+        term = problem.terms[name]
         problem = problem.with_term(term.reweighted(0 * term.weight), replace=True)
     return problem
 
@@ -59,7 +59,7 @@ def test_gradient_by_own_data(own) -> None:
     problem, initial, _ = own
     for name in ("lines", "step_of_wheels", "point_to_plane"):  # few terms compile quickly
         problem = problem.without_term(name)
-    get = lambda p: p.position_fix.position
+    get = lambda p: p.terms["position_fix"].position
 
     def loss(position: jax.Array) -> jax.Array:
         moved = eqx.tree_at(get, problem, position)

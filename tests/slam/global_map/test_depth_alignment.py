@@ -131,7 +131,7 @@ def test_surfaces_bring_keyframes_back(keyframes: list[Keyframe]) -> None:
         term = align_pairs(wrong, pairs, surfaces, EFFECTIVE, len(pairs))
         poses = jaxlie.SE3(jnp.asarray(rigid.to_quaternion(np.array([each.pose for each in wrong]))))
         start = vg.State(poses, initial.intrinsics, initial.inverse_depth)
-        found = solve(problem.with_terms((term, problem.depth)), start).state
+        found = solve(problem.with_terms((term, problem.terms["depth"])), start).state
         new = rigid.to_matrix(np.asarray(found.poses.wxyz_xyz))
         wrong = [replace(each, pose=pose) for each, pose in zip(wrong, new, strict=True)]
     for each, true in zip(wrong, keyframes, strict=True):

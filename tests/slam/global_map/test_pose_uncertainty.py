@@ -70,7 +70,7 @@ def test_a_sparse_factor_gives_the_same_deviations() -> None:
         np.testing.assert_allclose(worst[:, column], expected, rtol=1e-6, atol=1e-15)
     # All ties to one keyframe taken away: nothing determines it, and that is said, not raised.
     alone, _, _ = window.pack()
-    unseen = alone.with_term(alone.points.reweighted(0.0 * alone.points.weight))
+    unseen = alone.with_term(alone.terms["points"].reweighted(0.0 * alone.terms["points"].weight))
     assert sparse_worst(unseen, state, np.array([16]))[0].max() > 1e3 * worst.max()
 
 

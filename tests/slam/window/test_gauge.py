@@ -123,7 +123,7 @@ def test_what_is_held_is_said() -> None:
     problem, initial, _ = window.pack(terms=(empty_prior(KEYFRAMES), _ties(window, np.zeros((2, 2), int), np.zeros(2))))
     apart = np.asarray(problem.edges.source)[:, None] == 3
     apart = apart | (np.asarray(problem.edges.target)[:, None] == 3)
-    cut = problem.with_term(problem.points.reweighted(jnp.where(apart, 0.0, problem.points.weight)))
+    cut = problem.with_term(problem.terms["points"].reweighted(jnp.where(apart, 0.0, problem.terms["points"].weight)))
     cut = replace(cut, fixed_pose=jnp.asarray(np.arange(KEYFRAMES) == 0))
     held, gauge = with_one_gauge(cut, initial, KEYFRAMES, metric=True)
     assert gauge.free == ((3,),)
@@ -150,10 +150,10 @@ def test_windows_whose_first_keyframe_leaves_keep_their_gauge(seed: int) -> None
         prior = WindowPrior(numbers, marginalise_jit(problem, state, jnp.asarray(leaving)))
         staying = np.arange(KEYFRAMES) > leaving
         gone = ~staying[np.asarray(problem.edges.source)] | ~staying[np.asarray(problem.edges.target)]
-        problem = problem.with_term(problem.points.reweighted(problem.points.weight * ~gone[:, None]))
-        depth = problem.depth
+        problem = problem.with_term(problem.terms["points"].reweighted(problem.terms["points"].weight * ~gone[:, None]))
+        depth = problem.terms["depth"]
         problem = problem.with_term(depth.reweighted(depth.weight * staying[:, None]))
-        ties = problem.relative_poses
+        ties = problem.terms["relative_poses"]
         inside = staying[np.asarray(ties.first)] & staying[np.asarray(ties.second)]
         problem = problem.with_term(ties.reweighted(ties.weight * inside), replace=True)
         order = tuple(number if staying[number] else -1 for number in range(KEYFRAMES))

@@ -149,7 +149,7 @@ def _found(
         ),
         edges=jnp.stack(problem.edges.ends, 1),
         edge_parallax=_edge_parallax(problem, state),
-        terms=tuple(term.name for term in problem.terms),
+        terms=problem.terms.names,
         keyframes=problem.num_keyframes,
         parameters=problem.parameter_names,
     )

@@ -70,7 +70,7 @@ class DepthPrior(SlotTerm):
         kernel: robust kernel of each observation.
 
     Example:
-        >>> problem.depth.mean.shape  # rows of landmarks (one a keyframe), slots
+        >>> problem.terms["depth"].mean.shape  # rows of landmarks (one a keyframe), slots
         (4, 32)
 
     """
@@ -103,7 +103,7 @@ class HostPixel(AbstractTerm):
 
     Example:
         >>> problem, initial, _ = vg.simulate_window(keyframes=3, points=10, lines=1).pack()
-        >>> problem.host_pixels.weight.shape, initial.pixel_offset.shape
+        >>> problem.terms["host_pixels"].weight.shape, initial.pixel_offset.shape
         ((3, 10), (3, 10, 2))
 
     """

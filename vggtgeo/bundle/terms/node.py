@@ -102,7 +102,7 @@ class PoseTerm(NodeTerm):
         ...     def residual(self, pose, camera):
         ...         return pose.inverse().translation() - self.position
         >>> fix = PositionFix(keyframe=[1], position=jax.numpy.zeros((1, 3)), weight=jax.numpy.ones(1))
-        >>> [term.name for term in problem.with_term(fix).terms][-1]
+        >>> problem.with_term(fix).terms.names[-1]
         'position_fix'
 
     """
@@ -208,7 +208,7 @@ class IntrinsicsPrior(CameraTerm):
         kernel: robust kernel of each observation.
 
     Example:
-        >>> problem.intrinsics_prior.mean.shape
+        >>> problem.terms["intrinsics_prior"].mean.shape
         (4,)
 
     """

@@ -187,7 +187,7 @@ class PointTerm(ImageTerm):
         first_slot: slot of the host that the first column observes; set by `pack`.
 
     Example:
-        >>> problem.points.target.shape  # edges, slots, (u, v)
+        >>> problem.terms["points"].target.shape  # edges, slots, (u, v)
         (12, 20, 2)
 
     """
@@ -211,7 +211,7 @@ class LineTerm(ImageTerm):
         first_slot: slot of the host that the first column observes; set by `pack`.
 
     Example:
-        >>> problem.lines.coefficients.shape  # edges, samples, (a, b, c)
+        >>> problem.terms["lines"].coefficients.shape  # edges, samples, (a, b, c)
         (12, 12, 3)
 
     """

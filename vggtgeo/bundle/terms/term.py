@@ -96,7 +96,7 @@ class AbstractTerm(eqx.Module):
         kernel: robust kernel of each observation; the square by default.
 
     Example: a term of a problem, without its first edge.
-        >>> term = problem.points
+        >>> term = problem.terms["points"]
         >>> term.reweighted(term.weight.at[0].set(0.0)).present()[0].any().item()
         False
 

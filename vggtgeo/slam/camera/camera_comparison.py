@@ -57,15 +57,15 @@ def shifted_problem(problem: Problem, shifts: Shifts, factor: float, most: float
     larger ones come from landmarks at the camera's centre, or from a distortion that folds the image.
     """
     slots, points, lines = (np.clip(factor * shift, -most, most) for shift in shifts)
-    coefficients = np.asarray(problem.lines.coefficients, np.float64)
+    coefficients = np.asarray(problem.terms["lines"].coefficients, np.float64)
     offset = coefficients[..., 2] + np.sum(coefficients[..., :2] * lines, -1)
     like = lambda values: jnp.asarray(values, problem.pixels.dtype)
     return eqx.tree_at(
-        lambda p: (p.pixels, p.points.target, p.lines.coefficients),
+        lambda p: (p.pixels, p.terms["points"].target, p.terms["lines"].coefficients),
         problem,
         (
             like(np.asarray(problem.pixels) - slots),
-            like(np.asarray(problem.points.target) - points),
+            like(np.asarray(problem.terms["points"].target) - points),
             like(np.concatenate([coefficients[..., :2], offset[..., None]], -1)),
         ),
     )
@@ -73,10 +73,10 @@ def shifted_problem(problem: Problem, shifts: Shifts, factor: float, most: float
 
 def _energies(problem: Problem, state: State) -> Float[Array, "e p"]:
     residual = residuals_at(problem, state)["points"]
-    return problem.points.kernel.rho(problem.points.weight * jnp.sum(residual**2, -1)) / 2
+    return problem.terms["points"].kernel.rho(problem.terms["points"].weight * jnp.sum(residual**2, -1)) / 2
 
 
-_energies_jit = CachedProgram(_energies, lambda problem, state: problem.points.weight)
+_energies_jit = CachedProgram(_energies, lambda problem, state: problem.terms["points"].weight)
 
 
 def gain(

@@ -102,11 +102,11 @@ def refine_given_camera(pairs: list[CameraPair], problem: Problem, state: State,
     if not reason:
         return RefinedCamera(given, given)
     held_out = _held_out(problem)
-    weight = jnp.asarray(np.where(held_out, 0.0, problem.points.weight))
-    training = without_surfaces(problem.with_term(problem.points.reweighted(weight)))
+    weight = jnp.asarray(np.where(held_out, 0.0, problem.terms["points"].weight))
+    training = without_surfaces(problem.with_term(problem.terms["points"].reweighted(weight)))
     held = solve(training, state)
     start = eqx.tree_at(lambda s: s.intrinsics, held, jnp.asarray(wanted))
-    prior = eqx.tree_at(lambda term: term.mean, training.intrinsics_prior, jnp.asarray(wanted))
+    prior = eqx.tree_at(lambda term: term.mean, training.terms["intrinsics_prior"], jnp.asarray(wanted))
     moved = solve(training.with_term(prior), start)
     # Weights of the whole problem: in training the held-out matches have weight zero.
     found, needed = gain((problem, held), (problem, moved), held_out)
@@ -120,10 +120,10 @@ def estimate_with_map(problem: Problem, state: State, solve: Solve) -> tuple[Pro
     """
     given = np.asarray(state.intrinsics, np.float64)
     weight = jnp.asarray(calibration_sigma(given) ** -2)
-    free = problem.with_term(eqx.tree_at(lambda term: term.weight, problem.intrinsics_prior, weight))
+    free = problem.with_term(eqx.tree_at(lambda term: term.weight, problem.terms["intrinsics_prior"], weight))
     moved = solve(free, state)
     # No matches are held out: four parameters do not overfit thousands of matches.
-    better = gain((problem, state), (free, moved), np.asarray(problem.points.present()), fitted=len(given))
+    better = gain((problem, state), (free, moved), np.asarray(problem.terms["points"].present()), fitted=len(given))
     wanted = np.asarray(moved.intrinsics, np.float64)
     return free, RefinedCamera(given, wanted, moved, *better)
 
@@ -181,7 +181,7 @@ def _averaged(estimate: PairwiseIntrinsics, given: np.ndarray) -> tuple[np.ndarr
 
 def _held_out(problem: Problem) -> np.ndarray:
     """Return the held-out matches, bool [e, p]: a random share of those whose key point keeps `MIN_SEEN` others."""
-    present = np.asarray(problem.points.present())
+    present = np.asarray(problem.terms["points"].present())
     source = np.asarray(problem.edges.source)
     chosen = present & (np.random.default_rng(SEED).random(present.shape) < HELD_OUT)
     left = np.zeros((problem.num_keyframes, present.shape[1]), int)
@@ -191,7 +191,7 @@ def _held_out(problem: Problem) -> np.ndarray:
 
 def without_surfaces(problem: Problem) -> Problem:
     """Return the problem with zero weights of aligned surfaces."""
-    surfaces = [term for term in problem.terms if term.name == "surfaces"]
-    if not surfaces:
+    surfaces = problem.terms.get("surfaces")
+    if surfaces is None:
         return problem
-    return problem.with_term(surfaces[0].reweighted(jnp.zeros_like(surfaces[0].weight)), replace=True)
+    return problem.with_term(surfaces.reweighted(jnp.zeros_like(surfaces.weight)), replace=True)

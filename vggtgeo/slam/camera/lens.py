@@ -115,7 +115,7 @@ def find_lens(problem: Problem, state: State, size: tuple[int, int], solve: Solv
             bent = replace(bent, pinhole=pinhole_of(problem, found))
     camera = bent.camera(warp)
     # No matches are held out: two parameters do not overfit thousands of matches.
-    present = np.asarray(problem.points.present())
+    present = np.asarray(problem.terms["points"].present())
     better, needed = gain((problem, state), (bent.at(warp), found), present, fitted=len(problem.camera.names) + 2)
     return FoundLens(camera, found, better, needed, largest_shift(camera))
 
@@ -156,7 +156,7 @@ class _Undistorted:
 
     @classmethod
     def of(cls, problem: Problem, state: State, size: tuple[int, int]) -> _Undistorted:
-        camera, count = pinhole_of(problem, state), problem.points.weight.shape[1]
+        camera, count = pinhole_of(problem, state), problem.terms["points"].weight.shape[1]
         poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
         host, target = np.asarray(problem.edges.source), np.asarray(problem.edges.target)
         pixels, inverse = (
@@ -180,16 +180,16 @@ class _Undistorted:
 
     def at(self, warp: np.ndarray) -> Problem:
         """Return the problem for undistorted pixels, each match with the weight of its noise in the distorted image."""
-        camera, present = self.camera(warp), np.asarray(self.problem.points.present())
+        camera, present = self.camera(warp), np.asarray(self.problem.terms["points"].present())
         slots = np.asarray(self.problem.pixels, np.float64)
-        matched = np.asarray(self.problem.points.target, np.float64)[present]
+        matched = np.asarray(self.problem.terms["points"].target, np.float64)[present]
         ideal, points = camera.undistorted(matched), np.zeros((*present.shape, 2))
         points[present] = matched - ideal
         lines = (self._scales(warp, self.lines)[0] - 1)[..., None] * (self.lines - self.pinhole[2:])
         shifts = Shifts(slots - camera.undistorted(slots), points, lines)
-        weight = np.array(self.problem.points.weight)
+        weight = np.array(self.problem.terms["points"].weight)
         weight[present] *= np.maximum(np.prod(self._scales(warp, ideal), axis=0), 0.0)
-        weighted = self.problem.with_term(self.problem.points.reweighted(jnp.asarray(weight)))
+        weighted = self.problem.with_term(self.problem.terms["points"].reweighted(jnp.asarray(weight)))
         return shifted_problem(weighted, shifts, 1.0, max(self.size) / 2)
 
     def _scales(self, warp: np.ndarray, ideal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -200,7 +200,7 @@ class _Undistorted:
 
     def energy(self, warp: np.ndarray, state: State) -> float:
         """Return the energy of the matches and of the prior of the coefficients."""
-        matches = np.sum(match_energies(self.at(warp), state), where=np.asarray(self.problem.points.present()))
+        matches = np.sum(match_energies(self.at(warp), state), where=np.asarray(self.problem.terms["points"].present()))
         return float(matches + np.sum(self.coefficients(warp) ** 2) / (2 * RADIAL**2))
 
     def gradient(self, warp: np.ndarray, state: State) -> np.ndarray:

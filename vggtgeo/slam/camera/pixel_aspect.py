@@ -89,13 +89,13 @@ def find_aspect(problem: Problem, state: State, solve: Solve) -> FoundAspect | N
     fx, fy, *_ = (float(value) for value in found.intrinsics)
     if not (np.isfinite(np.asarray(found.intrinsics)).all() and min(fx, fy) > 0):
         return None
-    better, needed = gain((problem, state), (free, found), np.asarray(problem.points.present()), fitted=1)
+    better, needed = gain((problem, state), (free, found), np.asarray(problem.terms["points"].present()), fitted=1)
     return FoundAspect(free, found, float(np.log(fx / fy)), better, needed)
 
 
 def _with_both(problem: Problem) -> Problem:
     """Return the problem with two focal lengths, each with the prior of the one."""
-    prior = problem.intrinsics_prior
+    prior = problem.terms["intrinsics_prior"]
     wider = IntrinsicsPrior(index=jnp.arange(len(Pinhole.names)), mean=_twice(prior.mean), weight=_twice(prior.weight))
     fixed = _twice(problem.fixed_intrinsics)
     return replace(problem.with_term(wider), camera=Pinhole, fixed_intrinsics=fixed)

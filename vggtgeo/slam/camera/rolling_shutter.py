@@ -82,9 +82,9 @@ def row_shifts(problem: Problem, state: State, motions: np.ndarray, size: tuple[
     poses = rigid.to_matrix(np.asarray(state.poses.wxyz_xyz, np.float64))
     pixels, inverse = np.asarray(problem.pixels, np.float64), np.asarray(state.inverse_depth, np.float64)
     shift = lambda at, depth, motion: image_shift(at, depth, motion, camera, size, columns)
-    count = problem.points.weight.shape[1]
+    count = problem.terms["points"].weight.shape[1]
     edges = np.stack([np.asarray(problem.edges.source), np.asarray(problem.edges.target)], 1)
-    matched = np.asarray(problem.points.target, np.float64)
+    matched = np.asarray(problem.terms["points"].target, np.float64)
 
     def of_edges(part: slice) -> tuple[np.ndarray, np.ndarray]:
         host, target = edges[part].T
@@ -181,7 +181,7 @@ class _Search:
         source = np.asarray(self.problem.edges.source)
         points = self.shifts.points.shape[1]
         both = np.stack([self.shifts.slots[source][:, :points], self.shifts.points], -2)
-        return np.asarray(np.linalg.norm(both, axis=-1).max(-1)[np.asarray(self.problem.points.present())])
+        return np.asarray(np.linalg.norm(both, axis=-1).max(-1)[np.asarray(self.problem.terms["points"].present())])
 
     def at(self, seconds: float) -> Problem:
         """Return the problem corrected for this readout time."""
@@ -191,7 +191,7 @@ class _Search:
         """Return the derivative of the energy of each keyframe's matches by the readout time, float64 [n]."""
         step = PROBE / self.usual
         later, earlier = (match_energies(self.at(seconds + sign * step), state) for sign in (1, -1))
-        each = np.where(np.asarray(self.problem.points.present()), later - earlier, 0.0).sum(1) / (2 * step)
+        each = np.where(np.asarray(self.problem.terms["points"].present()), later - earlier, 0.0).sum(1) / (2 * step)
         sums = np.zeros(self.problem.num_keyframes)
         np.add.at(sums, np.asarray(self.problem.edges.source), each)
         return sums
@@ -223,7 +223,7 @@ def find_readout(
     columns, search, slope = chosen
     seconds, moved = _descend(search, state, slope, longest, solve)
     without = search.at(seconds)
-    better, needed = gain((problem, state), (without, moved), np.asarray(problem.points.present()), fitted=2)
+    better, needed = gain((problem, state), (without, moved), np.asarray(problem.terms["points"].present()), fitted=2)
     shift = float(np.percentile(search.sizes, USUAL_LARGEST)) * abs(seconds)
     return FoundReadout(Readout(seconds, columns, shift), without, moved, better, needed)
 
