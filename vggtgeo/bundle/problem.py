@@ -120,12 +120,12 @@ class Edges(eqx.Module):
 
 
 class Terms(eqx.Module):
-    """The terms of a problem: `terms["points"]`, in the order of their energies in the sum.
+    """The terms of a problem, in order and by name: `terms["points"]`, `"points" in terms`, `len(terms)`.
 
-    Iteration, `len` and `in` (by name) are as usual. The names of the package's own terms have their types.
+    Iteration yields the terms in the order in which their energies are added. Of two with one name the first is found.
 
     Fields:
-        ordered: The terms. The first one has a name that occurs twice.
+        ordered: The terms.
     """
 
     ordered: tuple[AbstractTerm, ...] = eqx.field(converter=tuple)
