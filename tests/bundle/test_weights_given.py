@@ -41,7 +41,7 @@ def test_one_number_is_the_weight_of_each_observation(kind: str, given: dict[str
     assert float(expected) > 0
     packed, start, _ = SCENE.pack(terms=[short])
     for found, state in ((problem.with_term(short), initial), (packed, start)):
-        assert getattr(found, name).weight.shape == (count,)
+        assert found.terms[name].weight.shape == (count,)
         assert float(vg.analysis.energy_terms(found, state)[name]) == pytest.approx(float(expected), rel=1e-12)
 
 

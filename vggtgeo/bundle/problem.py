@@ -148,6 +148,7 @@ class Terms(eqx.Module):
     def __contains__(self, name: object) -> bool:
         return name in self.names
 
+    # The package's own names, so that a type checker knows their terms.
     @overload
     def __getitem__(self, name: Literal["points"]) -> PointTerm: ...
     @overload
