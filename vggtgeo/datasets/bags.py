@@ -2,9 +2,9 @@
 
 Topics are found by their types: images (`sensor_msgs/Image` or `CompressedImage`; colour before grey and infrared),
 depth (encoding 16UC1, millimetres, or 32FC1, metres, raw or `compressedDepth`; registered to the colour camera before
-any other; depth with a camera of its own is registered by what the bag states of it, `bag_cameras.py`), the camera's
-`CameraInfo`, and poses for the truth (`PoseStamped`, `Odometry` or `TransformStamped`), whose
-name contains `truth`, `gt`, `vicon` or `mocap`. A choice among several is reported.
+any other; depth of a second camera is registered with the calibration in the bag, see `bag_cameras.py`), the camera's
+`CameraInfo`, and ground-truth poses (`PoseStamped`, `Odometry` or `TransformStamped`), whose name contains `truth`,
+`gt`, `vicon` or `mocap`. A choice among several topics is reported.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -47,7 +47,7 @@ from vggtgeo.io.errors import InputError, NoteWarning, install_hint, warn
 _Read = TypeVar("_Read")
 METADATA = "metadata.yaml"
 ROS_2 = (".db3", ".mcap")
-"""Suffixes of the files that lie beside a `metadata.yaml`."""
+"""Suffixes of the data files of a ROS 2 bag, next to its `metadata.yaml`."""
 
 
 def is_bag(path: Path) -> bool:
@@ -58,7 +58,7 @@ def is_bag(path: Path) -> bool:
 
 
 def why_incomplete(folder: Path) -> str | None:
-    """Return why a folder is not one bag: bags of ROS 1, or a ROS 2 bag without its metadata; None otherwise."""
+    """Return an error if a folder holds bags of ROS 1, or a ROS 2 bag without its metadata; None otherwise."""
     known = not folder.is_dir() or (folder / METADATA).is_file()
     bags = [] if known else sorted(path.name for path in folder.iterdir() if path.suffix in (".bag", *ROS_2))
     if not bags:
@@ -69,7 +69,7 @@ def why_incomplete(folder: Path) -> str | None:
 @dataclass(frozen=True)
 class RosBag:
     """A recording. Fields: path; name; camera; colour, depth, poses: topics, "" for none; times of the images;
-    depth_camera, where the depth is of another camera: it is registered to `camera`.
+    depth_camera: of depth that must be registered to `camera`, None if it is already.
     """
 
     path: Path
@@ -87,7 +87,7 @@ class RosBag:
         """Choose the topics. depth: False to ignore depth.
 
         Raises:
-            InputError: there are no colour images, the depth is of another camera and the bag has no extrinsics, or
+            InputError: there are no images, the depth is of another camera and the bag has no extrinsics, or
                 rosbags is not installed.
 
         """
@@ -109,8 +109,9 @@ class RosBag:
             size = (other.camera.width, other.camera.height) if other else (width, height)
             has_depth = depth and bool(chosen.depth) and _depth_is_usable(reader, path, chosen.depth, times, size)
             if has_depth and other:
-                text = f"is of a camera of its own, {1e3 * float(np.linalg.norm(other.motion[:3, 3])):.0f} mm beside"
-                warn(f"`{path}`: the depth of `{chosen.depth}` {text}: registered to `{chosen.colour}`", NoteWarning)
+                millimetres = 1e3 * float(np.linalg.norm(other.motion[:3, 3]))
+                text = f"registered to `{chosen.colour}`; its own camera is {millimetres:.0f} mm away"
+                warn(f"`{path}`: the depth of `{chosen.depth}` is {text}", NoteWarning)
         return cls(path, path.name, camera, chosen.colour, chosen.depth, poses, tuple(times), has_depth, other)
 
     def __len__(self) -> int:
@@ -121,13 +122,13 @@ class RosBag:
         return self._read(range(len(self))[start:end:stride])
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the poses of a topic of ground truth: of the tracked body (markers on the camera, for example)."""
+        """Return the poses of a topic of ground truth: of the tracked body, for example the markers on the camera."""
         if not self.poses:
             return None
         with _reader(self.path) as reader:
             messages = _messages(reader, self.poses)
-            whole = [(time, *_pose(message)) for time, message in messages if not isinstance(message, InputError)]
-        rows = np.reshape(whole, (-1, 8))
+            valid = [(time, *_pose(message)) for time, message in messages if not isinstance(message, InputError)]
+        rows = np.reshape(valid, (-1, 8))
         return trajectory_of(rows[:, 0], poses_of(rows[:, 1:4], rows[:, 4:]), self.path)
 
     def _read(self, chosen: range) -> Iterator[Frame]:

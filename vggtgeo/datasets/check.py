@@ -1,4 +1,4 @@
-"""Checks of a recording before a run: times, images, depth and ground truth of a sample of its frames."""
+"""Check a recording before a run: times, images, depth and ground truth of a sample of its frames."""
 
 import itertools
 import os
@@ -16,9 +16,9 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, InputWarning, NoteWarning
 
 SAMPLES = 20
-"""Frames that are decoded."""
+"""Number of frames that are decoded."""
 PLAUSIBLE_MEDIAN_DEPTH = (0.5, 6.5)
-"""Metres, of a room, used by the verdict, too: a wrong unit is mostly outside."""
+"""Metres, indoors; a wrong unit is mostly outside. The verdict uses it, too."""
 _MIN_DEPTH_SHARE = 0.2
 """Share of pixels; depth cameras give 0.5 to 0.9 indoors."""
 _DARK = 8.0
@@ -26,12 +26,12 @@ _DARK = 8.0
 _GAP = 5.0
 """Times the median step between two frames."""
 _FAST, _FAST_CAR = 5.0, 60.0
-"""Metres a second between two poses of the ground truth: above those of a hand or small drone, and of a car."""
+"""Metres a second between two poses of the ground truth: faster than a hand or small drone, and than a car."""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """Fields: facts, what the recording has. problems, what is wrong or doubtful; empty for none."""
+    """Fields: facts, lines that describe the recording. problems, what is wrong or doubtful; empty for none."""
 
     facts: tuple[str, ...]
     problems: tuple[str, ...]
@@ -43,23 +43,24 @@ def inspect(path: str | os.PathLike[str], kind: str | None = None) -> Inspection
         warnings.simplefilter("always", InputWarning)
         try:
             sequence = open_sequence(path, kind)
-            missing, there = _without_missing(sequence)
-            count = len(there)
-            frames = list(there.frames(0, None if count else SAMPLES, max(count // SAMPLES, 1)))
+            missing, readable = _without_missing(sequence)
+            count = len(readable)
+            # A live camera has no length: its first frames are taken.
+            frames = list(readable.frames(0, None if count else SAMPLES, max(count // SAMPLES, 1)))
             truth = sequence.ground_truth()
         except InputError as error:
-            return Inspection((), (*_texts(caught), str(error)))
+            return Inspection((), (*_problem_texts(caught), str(error)))
     notes = tuple(str(one.message) for one in caught if issubclass(one.category, NoteWarning))
     problems = [
-        *_texts(caught),
+        *_problem_texts(caught),
         *missing,
-        *_of_images(frames),
-        *_of_times(frames, len(sequence)),
-        *_of_depth(sequence, frames),
+        *_image_problems(frames),
+        *_time_problems(frames, len(sequence)),
+        *_depth_problems(sequence, frames),
     ]
-    problems += _of_truth(truth, frames, _FAST_CAR if isinstance(sequence, Kitti) else _FAST)
+    problems += _truth_problems(truth, frames, _FAST_CAR if isinstance(sequence, Kitti) else _FAST)
     if not sequence.camera.known and not any("intrinsics" in text for text in problems):
-        problems.append("the intrinsics are a guess; give --intrinsics, or put them into calibration.txt")
+        problems.append("the intrinsics are a guess; pass --intrinsics, or write them into calibration.txt")
     return Inspection((*_facts(sequence, frames, truth), *dict.fromkeys(notes)), tuple(dict.fromkeys(problems)))
 
 
@@ -74,12 +75,12 @@ def _without_missing(sequence: Sequence) -> tuple[list[str], Sequence]:
         for file in sequence.files
         if file.image not in gone
     )
-    messages = [f"{len(gone)} files that are listed are missing, `{min(gone)}` first"] if gone else []
+    messages = [f"{len(gone)} listed files do not exist, first `{min(gone)}`"] if gone else []
     return messages, replace(sequence, files=files)
 
 
-def _texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:
-    """Return the warnings without notes, which report what was done as intended."""
+def _problem_texts(caught: Iterable[warnings.WarningMessage]) -> list[str]:
+    """Return the texts of the warnings, without notes: these report no problem."""
     problems = (one for one in caught if issubclass(one.category, InputWarning))
     return [str(one.message) for one in problems if not issubclass(one.category, NoteWarning)]
 
@@ -105,25 +106,25 @@ def _facts(sequence: Sequence, frames: list[Frame], truth: Trajectory | None) ->
         low, middle, high = np.quantile(known, (0.02, 0.5, 0.98))
         facts.append(f"depth {low:.2f} to {high:.2f} m, half of it below {middle:.2f} m")
     else:
-        facts.append("no depth: the scale stays free")
-    facts.append("no truth" if truth is None else f"truth: {len(truth)} poses, path {truth.length:.2f} m")
+        facts.append("no depth: the scale is unknown")
+    facts.append("no ground truth" if truth is None else f"ground truth: {len(truth)} poses, path {truth.length:.2f} m")
     return tuple(facts)
 
 
-def _of_images(frames: list[Frame]) -> list[str]:
+def _image_problems(frames: list[Frame]) -> list[str]:
     if not frames:
         return ["no frame can be read"]
     dark = sum(float(frame.image.mean()) < _DARK for frame in frames)
-    problems = [f"{dark} of {len(frames)} images looked at are black"] if dark else []
-    return [*problems, *_of_repeats([frame.image for frame in frames], "images")]
+    problems = [f"{dark} of {len(frames)} sampled images are black"] if dark else []
+    return [*problems, *_repeat_problems([frame.image for frame in frames], "images")]
 
 
-def _of_repeats(images: list[np.ndarray], what: str) -> list[str]:
+def _repeat_problems(images: list[np.ndarray], what: str) -> list[str]:
     same = sum(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in itertools.pairwise(images))
-    return [f"{same} of {len(images)} {what} looked at are the same as the one before: frozen?"] if same else []
+    return [f"{same} of {len(images)} sampled {what} equal the previous one: was the recorder frozen?"] if same else []
 
 
-def _of_times(frames: list[Frame], count: int) -> list[str]:
+def _time_problems(frames: list[Frame], count: int) -> list[str]:
     times = np.array([frame.timestamp for frame in frames])
     if not np.isfinite(times).all():
         return [f"frame {frames[int(np.argmin(np.isfinite(times)))].index} has no time (a NaN or an infinity)"]
@@ -138,41 +139,42 @@ def _of_times(frames: list[Frame], count: int) -> list[str]:
     if steps.max() > _GAP * middle:
         row = int(steps.argmax())
         where = f"between frames {frames[row].index} and {frames[row + 1].index}"
-        problems.append(f"{where} the step is {steps.max() / middle:.0f} times the usual one: frames are missing")
+        problems.append(f"{where} the time step is {steps.max() / middle:.0f} times the median: frames are missing")
     if middle > 1.0 and count > 2:
-        problems.append(f"frames are {middle:.1f} s apart: too few to be tracked, or times in another unit")
+        problems.append(f"frames are {middle:.1f} s apart: too far to be tracked, or the times have a wrong unit")
     return problems
 
 
-def _of_depth(sequence: Sequence, frames: list[Frame]) -> list[str]:
+def _depth_problems(sequence: Sequence, frames: list[Frame]) -> list[str]:
     if not sequence.has_depth:
         return []
     depths = [frame.depth for frame in frames if frame.depth is not None and np.isfinite(frame.depth).any()]
     if not depths:
-        return ["none of the depth images looked at has a valid pixel"]
+        return ["none of the sampled depth images has a valid pixel"]
     problems = []
     share = float(np.mean([np.isfinite(depth).mean() for depth in depths]))
     if share < _MIN_DEPTH_SHARE:
         problems.append(f"only {100 * share:.0f} % of the pixels have depth")
     middle = float(np.median(np.concatenate([depth[np.isfinite(depth)][::7] for depth in depths])))
     if not PLAUSIBLE_MEDIAN_DEPTH[0] <= middle <= PLAUSIBLE_MEDIAN_DEPTH[1]:
-        problems.append(f"the median depth is {middle:.3g} m: is the unit of the depth files another one?")
-    return [*problems, *_of_repeats(depths, "depth images")]
+        problems.append(f"the median depth is {middle:.3g} m: is the unit of the depth files wrong?")
+    return [*problems, *_repeat_problems(depths, "depth images")]
 
 
-def _of_truth(truth: Trajectory | None, frames: list[Frame], fast: float) -> list[str]:
+def _truth_problems(truth: Trajectory | None, frames: list[Frame], fast: float) -> list[str]:
     if truth is None or not frames or len(truth) < 2:
         return []
     times = np.array([frame.timestamp for frame in frames])
     within = (times >= truth.timestamps[0] - 0.05) & (times <= truth.timestamps[-1] + 0.05)
     if not within.any():
-        return ["no frame lies within the times of the truth: the clocks differ"]
+        return ["no frame lies within the times of the ground truth: the clocks differ"]
     problems = []
     if within.mean() < 0.9:
-        problems.append(f"{100 * (1 - within.mean()):.0f} % of the frames looked at lie outside the times of the truth")
+        share = 100 * (1 - within.mean())
+        problems.append(f"{share:.0f} % of the sampled frames lie outside the times of the ground truth")
     speed = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1) / np.diff(truth.timestamps)
     if speed.max() > fast:
         row = int(speed.argmax())
         when = f"{truth.timestamps[row]:.2f} s"
-        problems.append(f"the truth moves at {speed.max():.0f} m/s at {when}: a jump, or another unit")
+        problems.append(f"the ground truth moves at {speed.max():.0f} m/s at {when}: a jump, or a wrong unit")
     return problems

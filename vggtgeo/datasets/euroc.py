@@ -1,7 +1,8 @@
-"""EuRoC MAV in the ASL layout: `mav0/cam0/data.csv`, `mav0/cam0/data/NANOSECONDS.png`, `sensor.yaml`, the truth beside.
+"""EuRoC MAV in the ASL layout: `mav0/cam0/data.csv`, `mav0/cam0/data/NANOSECONDS.png`, `sensor.yaml`, ground truth.
 
-The left camera alone is read; its distortion is removed like any other. Source: M. Burri et al., "The EuRoC micro
-aerial vehicle datasets", IJRR 2016.
+Only the left camera is read; its distortion is removed later, as for all readers.
+
+Source: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
 
 import re
@@ -37,7 +38,7 @@ class Euroc(FolderSequence):
         if base is None:
             raise InputError(f"`{folder}` must have `mav0/cam0/data.csv`, as a sequence of EuRoC")
         if (base / "imu0" / "data.csv").is_file():
-            warn(f"`{folder}`: the IMU is not used; images alone leave the scale free", NoteWarning)
+            warn(f"`{folder}`: the IMU is not used; from images alone the scale is unknown", NoteWarning)
         camera_folder = base / "cam0"
         frames = [(time, camera_folder / "data" / name, None) for time, name in _images(camera_folder / "data.csv")]
         sensor = camera_folder / "sensor.yaml"

@@ -1,4 +1,4 @@
-"""Base of all sequences of image files: a list of files, read one by one, with warnings about invalid ones."""
+"""Base class of all sequences of image files: a list of files, read one by one, with warnings about invalid ones."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,7 +17,7 @@ from vggtgeo.datasets.image_files import (
     MIN_DEPTH,
     DepthFormat,
     ImageFile,
-    is_there,
+    path_exists,
     read_depth,
     read_image_file,
 )
@@ -25,12 +25,14 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, LeftOutWarning, UnusableDepthWarning, warn
 
-LATEST = 1e11
-"""Seconds of a time stamp at most, 3,000 years: Unix times in nanoseconds are 1e18."""
+MAX_TIMESTAMP = 1e11
+"""Maximum timestamp, seconds (3,000 years); Unix times in nanoseconds, 1e18, are above it."""
 MAX_ENLARGEMENT = 32
-"""Pixels of an image to one of its depth, along a side at most; phones have 8."""
+"""Maximum ratio of the sides of an image and of its depth; phones have 8."""
 _SAMPLES = 3
-_SAME_SHAPE = 0.01
+"""Number of images that are read to find the common size."""
+_SAME_ASPECT = 0.01
+"""Maximum relative difference of the aspect ratios of images and depth."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,10 @@ class FrameFile:
 
 @dataclass(frozen=True)
 class FolderSequence:
-    """A sequence of image files; the layouts (7-Scenes, TUM, plain folder) list the files and know the truth.
+    """A sequence of image files. Subclasses (7-Scenes, TUM, plain folder) list the files and read the ground truth.
 
-    Fields: folder; name; camera; files, in the order of time; depth_format, how the depth files code metres;
-    has_depth, False to leave the depth files alone.
+    Fields: folder; name; camera; files, in the order of time; depth_format, unit of the depth files; has_depth, False
+    to ignore the depth files.
     """
 
     folder: Path
@@ -59,7 +61,7 @@ class FolderSequence:
     has_depth: bool = False
 
     depth_of_fewer_pixels: ClassVar[bool] = False
-    """Whether depth of fewer pixels and the same aspect as the images is enlarged to them."""
+    """Whether depth of a lower resolution and the same aspect as the images is enlarged to them."""
 
     @classmethod
     def listed(
@@ -79,15 +81,16 @@ class FolderSequence:
         if not files:
             raise InputError(f"`{folder}` has no images of a {cls.__name__}; `vggtgeo data list` shows its layout")
         for file in files:
-            if not abs(file.timestamp) <= LATEST:
-                text = f"`{file.image.name}` has the time {file.timestamp:g}; it must be in seconds"
-                raise InputError(f"`{folder}`: {text}")
+            if not abs(file.timestamp) <= MAX_TIMESTAMP:
+                name = file.image.name
+                raise InputError(f"`{folder}`: the time of `{name}` must be in seconds, got {file.timestamp:g}")
         without = sum(file.depth is None for file in files)
         if 0 < without < len(files):
             warn(f"`{folder}`: {without} of {len(files)} images have no depth")
-        whole = cls(folder, folder.resolve().name, Camera.guess(1, 1), files, coding, without < len(files), **fields)
-        whole = replace(whole, camera=camera(*whole.common_size()))
-        return replace(whole, has_depth=whole.depth_is_usable())
+        # The camera needs the size of the images, and the check of the depth needs the camera.
+        sequence = cls(folder, folder.resolve().name, Camera.guess(1, 1), files, coding, without < len(files), **fields)
+        sequence = replace(sequence, camera=camera(*sequence.common_size()))
+        return replace(sequence, has_depth=sequence.depth_is_usable())
 
     def __len__(self) -> int:
         return len(self.files)
@@ -98,7 +101,7 @@ class FolderSequence:
         return self._read_all(self.files[start:end:stride])
 
     def ground_truth(self) -> Trajectory | None:
-        """Return the poses of `groundtruth.txt` (TUM format), None without it; layouts with others override it."""
+        """Return the poses of `groundtruth.txt` (TUM format), None without it; subclasses may override it."""
         file = self.folder / "groundtruth.txt"
         return Trajectory.load_tum(file) if file.exists() else None
 
@@ -109,14 +112,14 @@ class FolderSequence:
 
     def holds(self, path: Path) -> bool:
         """Return whether a file of `files` exists."""
-        return is_there(path)
+        return path_exists(path)
 
     def stored_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """Return the image in a file, see `read_image_file`; layouts in archives override it."""
+        """Return the image in a file, see `read_image_file`; sequences in archives override it."""
         return read_image_file(path, min_bits)
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """Return the image with the sequence's camera; layouts whose images must be changed override it."""
+        """Return the image with the sequence's camera; sequences that resample their images override it."""
         return self.stored_image(path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
@@ -125,21 +128,21 @@ class FolderSequence:
         return self.enlarge_depth(depth) if self.depth_of_fewer_pixels else depth
 
     def enlarge_depth(self, depth: np.ndarray) -> np.ndarray:
-        """Enlarge depth of fewer pixels to the images, float32 [height, width]; each pixel takes the nearest depth.
+        """Enlarge depth of a lower resolution to the images, float32 [height, width], without interpolation.
 
-        Depth of another aspect, or of hardly any pixels, is of another view, and is returned as it is.
+        Depth of another aspect ratio, or of very few pixels, shows another view and is returned unchanged.
         """
         (rows, columns), width, height = depth.shape, self.camera.width, self.camera.height
-        same_view = abs(columns * height / width - rows) < max(1.0, _SAME_SHAPE * rows)
+        same_view = abs(columns * height / width - rows) < max(1.0, _SAME_ASPECT * rows)
         if not same_view or not columns < width <= columns * MAX_ENLARGEMENT:
             return depth
         return np.asarray(cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
 
     def common_size(self) -> tuple[int, int]:
-        """Return width and height of most of a few readable images; raise InputError if none can be read."""
+        """Return the most common width and height of a few images; raise InputError if none can be read."""
         shapes: Counter[tuple[int, ...]] = Counter()
         reason = ""
-        for file in _spread(self.files):
+        for file in _ends_and_middle_first(self.files):
             try:
                 shapes[self.stored_image(file.image).image.shape] += 1
             except InputError as error:
@@ -147,17 +150,17 @@ class FolderSequence:
             if shapes.total() == _SAMPLES:
                 break
         if not shapes:
-            raise InputError(f"none of the {len(self)} images of `{self.folder}` can be read; the first: {reason}")
+            raise InputError(f"none of the {len(self)} images of `{self.folder}` can be read; first error: {reason}")
         height, width, _ = shapes.most_common(1)[0][0]
         return width, height
 
     def depth_is_usable(self) -> bool:
         """Return whether a depth file has a valid pixel, with an UnusableDepthWarning if none has.
 
-        Looks at the first, middle and last file, and at the others only while no valid pixel has been seen. Raises
-        InputError where the depth has another size than the images.
+        Reads the first, middle and last file, then the others until one has a valid pixel. Raises InputError if the
+        depth has another size than the images.
         """
-        depths = [file.depth for file in _spread(self.files) if file.depth is not None]
+        depths = [file.depth for file in _ends_and_middle_first(self.files) if file.depth is not None]
         reason = ""
         for path in depths:
             try:
@@ -167,13 +170,13 @@ class FolderSequence:
                 continue
             if depth.shape != (self.camera.height, self.camera.width):
                 size = self._depth_size_message(path, depth)
-                raise InputError(f"{size}: register the depth to the images, or leave it out with --rgb-only")
+                raise InputError(f"{size}: register the depth to the images, or ignore it with --rgb-only")
             if np.isfinite(depth).any():
                 return True
         if depths:
             warn(
                 f"`{self.folder}`: none of the {len(depths)} depth images has a valid pixel{reason}, {MIN_DEPTH:g} to "
-                f"{MAX_DEPTH:g} m (`--depth-scale` gives the values in a metre); reading the images only",
+                f"{MAX_DEPTH:g} m (`--depth-scale` sets the units per metre); reading the images only",
                 UnusableDepthWarning,
             )
         return False
@@ -194,7 +197,7 @@ class FolderSequence:
             warn(f"`{self.name}`: {len(empty)} of {len(files)} depth images have no valid pixel, first `{empty[0]}`")
 
     def _read_depth(self, file: FrameFile) -> np.ndarray | None:
-        """Read the depth of a frame; None if there is none, or, with a warning, if it cannot be used."""
+        """Read the depth of a frame; None if it has none, or, with a warning, if it is invalid."""
         if file.depth is None:
             return None
         try:
@@ -213,7 +216,7 @@ class FolderSequence:
 
 
 class ImageChecks:
-    """Reads the images of a sequence in their order; warns of those that cannot be used, and of an orientation."""
+    """Reads the images of a sequence in order, and warns of invalid ones and of an EXIF orientation."""
 
     def __init__(self, camera: Camera) -> None:
         self._size = camera.width, camera.height
@@ -222,7 +225,7 @@ class ImageChecks:
     def checked(self, place: Path, load: Callable[[Path, int], ImageFile]) -> UInt8[np.ndarray, "h w 3"] | None:
         """Return an image; None, after a warning, if it cannot be read or has another size than the camera's images.
 
-        load: returns the image at `place`, with at least so many bits.
+        load: returns the image at `place`, read with at least the given number of bits.
         """
         try:
             read = load(place, self._bits)
@@ -249,7 +252,8 @@ def existing(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def _spread(files: Sequence[FrameFile]) -> list[FrameFile]:
+def _ends_and_middle_first(files: Sequence[FrameFile]) -> list[FrameFile]:
+    """Return all files, with the first, middle and last one in front."""
     first = dict.fromkeys((0, len(files) // 2, len(files) - 1))
     order = [*first, *(row for row in range(len(files)) if row not in first)]
     return [files[row] for row in order] if files else []

@@ -81,25 +81,25 @@ def check_selection(name: str, count: int, start: int, end: int | None, stride: 
     """Raise InputError unless `start`, `end`, `stride` select at least one of `count` frames of sequence `name`."""
     check_range(start, end, stride)
     if start >= count:
-        raise InputError(f"`start` is {start}; `{name}` has {count} frames: give at most {count - 1}")
+        raise InputError(f"`start` must be at most {count - 1}, got {start}: `{name}` has {count} frames")
 
 
 def check_range(start: int, end: int | None, stride: int) -> None:
-    """Raise InputError unless `start`, `end`, `stride` select frames of a long enough sequence."""
+    """Raise InputError unless `start`, `end`, `stride` are a valid range of frames."""
     check_whole("start", start)
     check_whole("stride", stride, 1)
     if end is not None:
         check_whole("end", end)
         if end <= start:
-            raise InputError(f"`start` is {start} and `end` {end}; they must be 0 <= start < end")
+            raise InputError(f"`end` must be above `start`, got start {start} and end {end}")
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:
     """Raise InputError for a frame with an invalid image, depth or time, or another size than the camera's images."""
-    time: Any = frame.timestamp  # of a user: annotations are not checked
+    time: Any = frame.timestamp  # may have any type: a user makes frames, too
     check_image(f"the image of `{frame.name}`", frame.image)
     if not isinstance(time, numbers.Real) or not -MAX_TIME <= frame.timestamp <= MAX_TIME:
-        raise InputError(f"the time of `{frame.name}` is {time!r:.60}; it must be a number of seconds")
+        raise InputError(f"the time of `{frame.name}` must be a number of seconds, got {time!r:.60}")
     if frame.depth is not None:
         check_depth(f"the depth of `{frame.name}`", frame.depth, frame.image)
     height, width = frame.image.shape[:2]
@@ -113,28 +113,28 @@ def check_frame(frame: Frame, camera: Camera) -> None:
 def check_image(name: str, image: Any) -> None:
     """Raise InputError unless an image is an array uint8 [H, W, 3]."""
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-        raise InputError(f"{name} is {described(image)}; it must be uint8 [H, W, 3], RGB")
+        raise InputError(f"{name} must be uint8 [H, W, 3], RGB, got {type_and_shape(image)}")
 
 
 def check_depth(name: str, depth: Any, image: np.ndarray) -> None:
     """Raise InputError unless depth is an array of metres with the size of its image."""
     if isinstance(depth, np.ma.MaskedArray) or not isinstance(depth, np.ndarray) or depth.dtype.kind != "f":
         raise InputError(
-            f"{name} is {described(depth)}; it must be a float array, in metres (millimetres: divide by 1000.0), with "
-            "NaN for none (a masked array: `depth.filled(np.nan)`)"
+            f"{name} must be a float array, got {type_and_shape(depth)}: give metres (millimetres: divide by 1000.0), "
+            "with NaN for none (a masked array: `depth.filled(np.nan)`)"
         )
     if depth.shape != image.shape[:2]:
-        raise InputError(f"{name} has the shape {depth.shape}, its image {image.shape[:2]}; make them equal")
+        raise InputError(f"{name} must have the shape of its image, {image.shape[:2]}, got {depth.shape}")
 
 
-def described(given: Any) -> str:
-    """Return type and shape of an array, the type of another value."""
-    kind = f"of the type `{type(given).__name__}`"
+def type_and_shape(given: Any) -> str:
+    """Return the type of a value, and of an array the shape, for errors."""
+    kind = f"`{type(given).__name__}`"
     return f"{kind}, {given.dtype} {given.shape}" if isinstance(given, np.ndarray) else kind
 
 
 class NearestInTime:
-    """Values of a stream of (time, value), asked for by rising times: depth that comes beside images."""
+    """Finds in a stream of (time, value) the value nearest to each of a series of rising times: depth for images."""
 
     def __init__(self, entries: Iterator[tuple[float, Any]]) -> None:
         self._entries = entries

@@ -6,9 +6,10 @@ the world; so the ground truth is mirrored as well, and errors are the same.
 
 The rendered depth is a text of 640 x 480 distances from the camera's centre along the ray of each pixel, metres, row by
 row. With the ray `r = ((u - cx) / fx, (v - cy) / fy, 1)` of the pixel (u, v) the depth is `z = d / |r|`. The camera's
-file names its place, where it looks and what is up in the image: `z = dir`, `x = up x z`, `y = z x x`, camera -> world,
-with y up. Source: A. Handa et al., "A benchmark
-for RGB-D visual odometry, 3D reconstruction and SLAM", ICRA 2014.
+file states its position, its viewing direction `dir` and its upward direction `up`; the axes of camera -> world, with y
+up, are `z = dir`, `x = up x z`, `y = z x x`.
+
+Source: A. Handa et al., "A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM", ICRA 2014.
 """
 
 import re
@@ -43,8 +44,8 @@ class IclNuim(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has no `rgb.txt`, but the ground truth with a list of pairs or numbered images, or a
-        list of frame numbers, depth first: a list of times may be of any program.
+        """Return whether `folder` has no `rgb.txt`, and ground truth with a list of pairs or numbered images, or a list
+        of frame numbers with the depth first. A list of times is not enough: other programs write such lists.
         """
         file, truth = folder / _LIST, bool(files_like(folder, "*.gt.freiburg"))
         if (folder / "rgb.txt").is_file():
@@ -76,8 +77,8 @@ def _camera(folder: Path, width: int, height: int) -> Camera:
 
 def _truth(folder: Path) -> Trajectory | None:
     """Return the poses of `*.gt.freiburg` or `groundtruth.txt` in the mirrored world; None without either."""
-    there = [*files_like(folder, "*.gt.freiburg"), folder / "groundtruth.txt"]
-    file = next((file for file in there if file.is_file()), None)
+    candidates = [*files_like(folder, "*.gt.freiburg"), folder / "groundtruth.txt"]
+    file = next((file for file in candidates if file.is_file()), None)
     if file is None:
         return None
     rows = read_matrices(file, 8)
@@ -94,7 +95,7 @@ def _numbered(folder: Path) -> list[tuple[float, str, str]]:
 
 @dataclass(frozen=True)
 class IclNuimRaw(FolderSequence):
-    """One rendered sequence. Truth: that of each image's camera, else `*.gt.freiburg`, mirrored in y."""
+    """One rendered sequence. Truth: the camera file of each image, else `*.gt.freiburg`, mirrored in y."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -112,7 +113,7 @@ class IclNuimRaw(FolderSequence):
         return cls.listed(folder, frames, lambda *size: _camera(folder, *size))
 
     def load_depth(self, path: Path) -> Float[np.ndarray, "h w"]:
-        """Return the depth along the optical axis, float32, NaN for none; InputError for another count of numbers."""
+        """Return the depth along the optical axis, float32, NaN for none; raise InputError for a wrong count."""
         width, height = self.camera.width, self.camera.height
         with parsing(path, f"{width} x {height} distances, metres"):
             distances = np.array(whole_text(path).split(), np.float32).reshape(height, width)
@@ -121,11 +122,11 @@ class IclNuimRaw(FolderSequence):
         return metres_of_floats(distances / np.sqrt(1.0 + across**2 + down[:, None] ** 2))
 
     def ground_truth(self) -> Trajectory | None:
-        there = [file for file in self.files if file.image.with_suffix(".txt").is_file()]
-        if not there:
+        posed = [file for file in self.files if file.image.with_suffix(".txt").is_file()]
+        if not posed:
             return _truth(self.folder)
-        poses = np.stack([_pose(file.image.with_suffix(".txt")) for file in there])
-        return trajectory_of([file.timestamp for file in there], _MIRROR @ poses @ _MIRROR, self.folder)
+        poses = np.stack([_pose(file.image.with_suffix(".txt")) for file in posed])
+        return trajectory_of([file.timestamp for file in posed], _MIRROR @ poses @ _MIRROR, self.folder)
 
 
 def _images(folder: Path) -> list[Path]:
@@ -135,13 +136,13 @@ def _images(folder: Path) -> list[Path]:
 def _pose(file: Path) -> Float[np.ndarray, "4 4"]:
     """Return camera -> world, the camera's y up."""
     text = whole_text(file)
-    place, ahead, up = (_vector(file, text, name) for name in ("cam_pos", "cam_dir", "cam_up"))
+    position, direction, up = (_vector(file, text, name) for name in ("cam_pos", "cam_dir", "cam_up"))
     pose = np.eye(4)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # invalid directions: the pose is left out
-        z = ahead / np.linalg.norm(ahead)
+        z = direction / np.linalg.norm(direction)
         x = np.cross(up, z)
         x /= np.linalg.norm(x)
-        pose[:3] = np.column_stack([x, np.cross(z, x), z, place])
+        pose[:3] = np.column_stack([x, np.cross(z, x), z, position])
     return pose
 
 
@@ -149,5 +150,5 @@ def _vector(file: Path, text: str, name: str) -> Float[np.ndarray, "3"]:
     found = re.search(_VECTOR.format(name), text, re.MULTILINE)
     numbers = numbers_of(found.group(1).replace(",", " ").split(), f"`{file}`: `{name}`") if found else []
     if len(numbers) != 3:
-        raise InputError(f"`{file}` has no `{name} = [x, y, z]'`")
+        raise InputError(f"`{file}` has no `{name} = [x, y, z]`")
     return np.array(numbers)

@@ -29,21 +29,21 @@ OTHER_PICTURES = frozenset({".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", "
 """Image formats of phones and cameras that are not read."""
 DEPTH_SUFFIXES = IMAGE_SUFFIXES | {".npy", ".pfm", ".exr"}
 _EXR_DEPTH = re.compile(r"(.*[.])?(z|depth|depth[.]v|y|v|r)", re.IGNORECASE)
-"""Channels of Blender, Nuke, grey images and Record3D."""
+"""Names of the depth channel in files of Blender, Nuke and Record3D, and in grey images."""
 MAX_PIXELS = 100_000_000
-"""Pixels of an image that is decoded: 0.3 GB."""
+"""Maximum number of pixels of an image that is decoded: 0.3 GB."""
 MAX_BYTES = 700_000_000
-"""Size of an image file: 100 million pixels of 16 bits in three channels, uncompressed, and some."""
+"""Maximum size of an image file: 100 million pixels of 16 bits in three channels, uncompressed, and its header."""
 BITS = (8, 10, 12, 14, 16)
-"""Bits of the values in a 16-bit file: cameras of 10 and 12 bits write such files without filling them."""
+"""Possible bits of the values in a 16-bit file: cameras of 10 and 12 bits do not use its full range."""
 _FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "PPM", "TIFF")
 _ORIENTATION = 274
 _BROKEN = (
     *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, struct.error, OverflowError),
     Image.DecompressionBombError,
 )
-"""What Pillow raises for damaged files."""
-# Of damaged EXIF data and directories: what is wrong with a file is the error below.
+"""Exceptions that Pillow raises for damaged files."""
+# Pillow warns of damaged EXIF data and directories, which do no harm; what does harm is an error of this module.
 warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
 _FEW_EXTRA_BYTES = re.compile(r"data: [1-4] extraneous bytes before marker 0xd9")
 """Encoders of some cameras write a few bytes between the data and the end mark of a JPEG."""
@@ -72,18 +72,19 @@ def read_image_file(path: Path, min_bits: int = 8) -> ImageFile:
     """Return the image, as RGB, and the properties of its file.
 
     Raises InputError if the file is missing, damaged or not an image.
-    min_bits: the least number of bits of a 16-bit image, however dark it is: that of the images before it.
+    min_bits: minimum number of bits to assume for a 16-bit image. The bits of previous images are given here, so that a
+    dark image is not brightened.
     """
     return image_in(content_of(path, MAX_BYTES), path, min_bits)
 
 
 def image_in(content: bytes, path: Path, min_bits: int = 8) -> ImageFile:
-    """Return the image in the content of a file; path: for messages. Otherwise as `read_image_file`."""
+    """Return the image in the content of a file; path: its name, for errors. Otherwise as `read_image_file`."""
     header = image_header(content, path)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = decoded(content, path, flags, header)
     if image.dtype not in (np.uint8, np.uint16) or image.ndim != 3:
-        raise InputError(f"`{path}` is {image.dtype} of shape {image.shape}; images must have 8 or 16 bits")
+        raise InputError(f"`{path}` must have 8 or 16 bits, got {image.dtype} of shape {image.shape}")
     image, bits = eight_bits(image, min_bits)
     return ImageFile(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), bits, header.orientation)
 
@@ -98,35 +99,36 @@ def eight_bits(image: np.ndarray, min_bits: int = 8) -> tuple[np.ndarray, int]:
 
 
 def image_header(content: bytes, path: Path) -> ImageHeader:
-    """Return the header of an image file; raise InputError if it is empty, truncated, too large, or of a format that is
-    not read. path: for messages.
+    """Return the header of an image file; path: its name, for errors.
+
+    Raises InputError if the file is empty, truncated, too large, or of an unsupported format.
     """
     try:
         with Image.open(io.BytesIO(content), formats=_FORMATS) as image:
-            # Its own `getexif` of a PNG decodes the image.
+            # `getexif` of Pillow's PNG class would decode the whole image; that of its base class does not.
             tagged = image.format in ("JPEG", "MPO", "PNG", "WEBP")
             orientation = Image.Image.getexif(image).get(_ORIENTATION, 1) if tagged else 1
             header = ImageHeader(image.format or "", orientation if orientation in range(1, 9) else 1)
-            _check_values(path, image.width * image.height)
+            _check_pixel_count(path, image.width * image.height)
             image.verify()  # the check sums of a PNG, up to its end
     except InputError:
         raise
     except UnidentifiedImageError:
         raise InputError(
-            f"`{path}` begins with {content[:16]!r}; it must be a PNG, JPEG, TIFF, WebP, BMP or PNM: convert it, or "
-            "copy it again if it is damaged"
+            f"`{path}` must be a PNG, JPEG, TIFF, WebP, BMP or PNM, got a file that begins with {content[:16]!r}: "
+            "convert it, or copy it again if it is damaged"
         ) from None
     except _BROKEN as error:
         raise InputError(f"`{path}` is truncated or damaged: {error}") from None
     return header
 
 
-def _check_values(path: Path, count: int) -> None:
+def _check_pixel_count(path: Path, count: int) -> None:
     if not 0 < count <= MAX_PIXELS:
         raise InputError(f"`{path}` declares {count} pixels; at most {MAX_PIXELS // 10**6} million are decoded")
 
 
-def is_there(path: Path) -> bool:
+def path_exists(path: Path) -> bool:
     """Return whether a path exists; False for names that the file system does not accept."""
     try:
         return path.exists()
@@ -137,7 +139,7 @@ def is_there(path: Path) -> bool:
 def decoded(content: bytes, path: Path, flags: int, header: ImageHeader | None = None) -> np.ndarray:
     """Return the pixels in the content of an image file, as OpenCV has them (BGR); raise InputError if it is invalid.
 
-    path: its name, for messages. flags: of `cv2.imdecode`; without effect on a JPEG. header: if it has been read.
+    path: its name, for errors. flags: of `cv2.imdecode`; without effect on a JPEG. header: if already known.
     """
     if (header or image_header(content, path)).format in ("JPEG", "MPO"):
         try:
@@ -146,12 +148,12 @@ def decoded(content: bytes, path: Path, flags: int, header: ImageHeader | None =
             damaged = str(error).startswith(("Corrupt JPEG data", "Premature end"))
             if damaged and not _FEW_EXTRA_BYTES.search(str(error)):
                 raise InputError(f"`{path}` is truncated or damaged: {error}") from None
-    try:  # JPEGs of rare samplings and of arithmetic coding, too, which simplejpeg does not decode
+    try:  # also for JPEGs of rare subsamplings and of arithmetic coding, which simplejpeg does not decode
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
         raise InputError(f"`{path}` cannot be decoded: {error.err}") from None
     if image is None:
-        raise InputError(f"`{path}` cannot be decoded: it is damaged, or of a kind that OpenCV does not decode")
+        raise InputError(f"`{path}` cannot be decoded: it is damaged, or OpenCV does not support it")
     return image
 
 
@@ -159,8 +161,8 @@ def decoded(content: bytes, path: Path, flags: int, header: ImageHeader | None =
 class DepthFormat:
     """Unit of depth files.
 
-    Fields: units_per_metre, of 16-bit values. invalid, 16-bit values that mean "no depth". floats_per_metre, units of
-    floating-point values, which are metres by convention.
+    Fields: units_per_metre, of 16-bit values. invalid, 16-bit values that mean "no depth". floats_per_metre, units per
+    metre of floating-point values, 1 by convention.
     """
 
     units_per_metre: float
@@ -169,7 +171,7 @@ class DepthFormat:
 
 
 MIN_DEPTH, MAX_DEPTH = 1e-3, 1000.0
-"""Metres, of floating-point depth: renderers write 1e10 for the background, and swapped bytes read as 1e-40."""
+"""Valid range, metres. Renderers write 1e10 for the background; floats of the wrong byte order read as 1e-40."""
 MILLIMETRES = DepthFormat(1000.0, (0, 65535))
 """7-Scenes: 0 and 65535 mean no depth."""
 FIVE_THOUSANDTHS = DepthFormat(5000.0)
@@ -186,7 +188,7 @@ def read_depth(path: Path, coding: DepthFormat) -> Float[np.ndarray, "h w"]:
         return metres_of_floats(codes, coding.floats_per_metre)
     if codes.dtype != np.uint16 or codes.ndim != 2:
         raise InputError(
-            f"`{path}` is {codes.dtype} of shape {codes.shape}; depth must be one channel, uint16 or float"
+            f"`{path}` must have one channel of uint16 or float depth, got {codes.dtype} of shape {codes.shape}"
         )
     return metres_of_codes(codes, coding)
 
@@ -225,18 +227,18 @@ def exr_depth(path: Path) -> np.ndarray:
         import OpenEXR
     except ImportError:
         raise InputError(f"`{path}` needs the package OpenEXR; {install_hint('phones')}") from None
-    content_of(path, MAX_BYTES)  # OpenEXR names no reason
+    content_of(path, MAX_BYTES)  # raises if it cannot be read: OpenEXR's own errors give no reason
     try:
         header = OpenEXR.File(str(path), header_only=True).header()
         (left, top), (right, bottom) = header["dataWindow"]
         names = [channel.name for channel in header["channels"]]
-        # All channels are decoded.
-        _check_values(path, (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1) * len(names))
+        # OpenEXR decodes all channels, so all of them count.
+        _check_pixel_count(path, (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1) * len(names))
         found = [name for name in names if _EXR_DEPTH.fullmatch(name)]
         if len(found) > 1:  # Blender writes colours, too: R, G, B beside Z
             found = [name for name in found if name.lower().endswith(("z", "depth", "depth.v"))] or found
         if len(found) != 1:
-            raise InputError(f"`{path}` has the channels {', '.join(names)}; it must have one of Z, V, Y, R, depth")
+            raise InputError(f"`{path}` must have one channel Z, V, Y, R or depth, got {', '.join(names)}")
         return np.asarray(OpenEXR.File(str(path), separate_channels=True).channels()[found[0]].pixels)
     except InputError:
         raise

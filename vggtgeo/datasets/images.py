@@ -1,10 +1,10 @@
-"""Plain folders: images alone, in natural order (2 before 10); or colour and depth of recorders and scripts, in folders
-`rgb/0.png` and `depth/0.png`, or both in one folder, distinguished by a word of their names (`color_0.jpg`,
-`depth_0.png`).
+"""Plain folders of images, or of colour and depth as recorders and scripts write them.
 
-Open3D's recorders write `color/`, `depth/` and `intrinsic.json`; scripts of users often write `rgb/` and `depth/`
-without a camera. Depth is in millimetres (Open3D, RealSense, Kinect), or in metres if it is of floats (TIFF, PFM,
-`.npy`), unless `with_depth_scale` sets another unit.
+Images without depth are read in natural order (2 before 10). Colour and depth are in two folders (`rgb/0.png`,
+`depth/0.png`), or in one folder with a word in their names (`color_0.jpg`, `depth_0.png`). Open3D's recorders write
+`color/`, `depth/` and `intrinsic.json`; scripts often write `rgb/` and `depth/` without a camera. Depth of integers is
+in millimetres (Open3D, RealSense, Kinect), depth of floats (TIFF, PFM, `.npy`) in metres, unless `with_depth_scale`
+sets another unit.
 """
 
 import re
@@ -32,18 +32,18 @@ _UNITS = (
 COLOUR = ("rgb", "color", "colour", "image", "images", "frames")
 DEPTH = ("depth", "depths")
 _NEITHER = {"conf", "confidence", "mask", "inverse", "disparity"}
-"""Words of names of files that are neither images nor depth."""
+"""Words in the names of files that are neither images nor depth."""
 _LOOSE_SHARE = 0.5
-"""Maximum share of images beside the folder of colour that are not of the recording."""
+"""Maximum number of images next to the colour folder, as a share of those in it: more would be the recording."""
 _WITH_DEPTH = 0.5
-"""Minimum depths per image of a folder of both: a single image called `depth` is not enough."""
+"""Minimum number of depth files per image in a folder of both: a single image called `depth` is not enough."""
 _NUMBERS = re.compile(r"([0-9]+)")
 _NUMBERED = re.compile(r"[^0-9]*([0-9]{1,15})")
 
 
 @dataclass(frozen=True)
 class ImageFolder(FolderSequence):
-    """Images of one folder, without depth. Truth: `groundtruth.txt` (TUM format), where there is one.
+    """Images of one folder, without depth. Ground truth: `groundtruth.txt` (TUM format), if present.
 
     Time is position / 30 s, unless all names are times: seconds with a decimal point (`12.034.png`), nanoseconds (18 or
     19 digits), or micro- or milliseconds since 1970 (16 or 13), or `with_rate` says otherwise.
@@ -65,20 +65,20 @@ class ImageFolder(FolderSequence):
 
 
 def warn_of_unread(folder: Path, images: list[Path]) -> None:
-    """Warn of images in formats that are not read, unless `images` has them, too (HEIC of a phone beside JPEG)."""
+    """Warn of images in unsupported formats that have no copy in `images` (phones write HEIC and JPEG)."""
     read = {image.stem for image in images}
     other = [
         path for path in files_like(folder, "*") if path.suffix.lower() in OTHER_PICTURES and path.stem not in read
     ]
     if other:
-        text = f"`{folder}`: {len(other)} images (`{other[0].name}`) are of a format that is not read"
-        warn(LeftOutWarning(f"{text}; left out: convert to PNG or JPEG", len(other)))
+        text = f"`{folder}`: {len(other)} images (`{other[0].name}`) have an unsupported format"
+        warn(LeftOutWarning(f"{text} and are left out: convert them to PNG or JPEG", len(other)))
 
 
 def files_like(folder: Path, pattern: str) -> list[Path]:
-    """Return the files in `folder` whose names match, in natural order, without hidden ones.
+    """Return the files in `folder` whose names match, in natural order, without hidden files.
 
-    macOS puts a hidden one beside each file that it copies to another disk (`._0.txt` beside `0.txt`).
+    macOS writes a hidden file for each file that it copies to another disk (`._0.txt` for `0.txt`).
     """
     found = (path for path in folder.glob(pattern) if path.name[0] != "." and path.is_file())
     return sorted(found, key=lambda path: (natural_key(path.stem), path.name))
@@ -86,7 +86,7 @@ def files_like(folder: Path, pattern: str) -> list[Path]:
 
 def natural_key(name: str) -> list[int | str]:
     """Return a key that sorts digits as numbers: `a2` before `a10`."""
-    # The groups of the pattern are every second part.
+    # `split` returns the groups of the pattern, the digits, at odd positions.
     return [int(part) if row % 2 else part.lower() for row, part in enumerate(_NUMBERS.split(name))]
 
 
@@ -110,14 +110,16 @@ def times_or_rate(images: list[Path]) -> list[float]:
 
 
 def rows_of(images: list[Path], lines: int | None) -> tuple[int, ...]:
-    """Return the line of each image in a list of a whole recording: the number that its name ends with, so that a part
-    of the recording, or one with holes, keeps its times and its truth; those beyond the last line have none. Its place
-    where names have no numbers, or others: each image has its line, then.
+    """Return for each image its line in the list of times or poses of the whole recording.
+
+    It is the number at the end of the image's name, so that a part of a recording keeps its times and its ground truth.
+    It is the image's position if names have no distinct numbers, or numbers that do not fit a list with one line for
+    each image. lines: of the list; None if there is none.
     """
     found = [_NUMBERED.fullmatch(image.stem) for image in images]
     numbers = [int(match.group(1)) for match in found if match]
-    apart = len(set(numbers)) == len(images)
-    if apart and (lines != len(images) or max(numbers, default=0) < lines):
+    distinct = len(set(numbers)) == len(images)
+    if distinct and (lines != len(images) or max(numbers, default=0) < lines):
         return tuple(numbers)
     return tuple(range(len(images)))
 
@@ -145,8 +147,8 @@ def partners_in_time(images: Sequence[tuple[float, Path]], depths: Sequence[tupl
 class RgbdFolders(FolderSequence):
     """Images in one folder, and their depth in a second one or the same. Ground truth: `groundtruth.txt` (TUM format).
 
-    Depth is paired with the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`), or of
-    the nearest time within 0.02 s if names are times. Times are as in a folder of images. Depth of fewer pixels (a
+    Depth is paired with the image of the same name; else of the same number (`rgb_7.png`, `depth_7.png`); else, if
+    names are times, of the nearest time within 0.02 s. Times are those of `ImageFolder`. Depth of a lower resolution (a
     phone's LiDAR) is enlarged to images of the same aspect.
     """
 
@@ -154,18 +156,16 @@ class RgbdFolders(FolderSequence):
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether `folder` has images in a folder of `COLOUR`, and few of its own; or names of its own images
-        distinguish depth.
-        """
-        colour = _folder(folder, COLOUR, IMAGE_SUFFIXES)
+        """Return whether `folder` has a colour folder and few images of its own, or names that distinguish depth."""
+        colour = _find_folder(folder, COLOUR, IMAGE_SUFFIXES)
         if colour is None:
-            return _of_one_folder(folder) is not None
+            return _files_by_words(folder) is not None
         return len(image_files(folder)) <= _LOOSE_SHARE * len(image_files(colour))
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images and find their depths; raise InputError if they cannot be paired."""
-        colour, (images, depths) = _listed(folder)
+        """List the images and their depth files; raise InputError if they cannot be paired."""
+        colour, (images, depths) = _find_files(folder)
         warn_of_unread(colour, images)
         times = times_or_rate(images)
         partners = _partners(folder, images, depths) if depths else [None] * len(images)
@@ -178,19 +178,19 @@ class RgbdFolders(FolderSequence):
         return cls.listed(folder, rows, camera)
 
 
-def _listed(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
+def _find_files(folder: Path) -> tuple[Path, tuple[list[Path], list[Path]]]:
     """Return the folder of the images, and the files of images and depths."""
-    colour, depth = _folder(folder, COLOUR, IMAGE_SUFFIXES), _folder(folder, DEPTH, DEPTH_SUFFIXES)
+    colour, depth = _find_folder(folder, COLOUR, IMAGE_SUFFIXES), _find_folder(folder, DEPTH, DEPTH_SUFFIXES)
     if colour is not None:
         return colour, (image_files(colour), [] if depth is None else image_files(depth, DEPTH_SUFFIXES))
-    both = _of_one_folder(folder)
+    both = _files_by_words(folder)
     if both is None:
         raise InputError(f"`{folder}` has no folder of images named {', '.join(f'`{name}`' for name in COLOUR)}")
     return folder, both
 
 
-def _of_one_folder(folder: Path) -> tuple[list[Path], list[Path]] | None:
-    """Return images and depths of one folder, by the words of their names; None if few names say depth."""
+def _files_by_words(folder: Path) -> tuple[list[Path], list[Path]] | None:
+    """Return images and depth files of one folder, by words in their names; None if too few names mark depth."""
     depths = [path for path in image_files(folder, DEPTH_SUFFIXES) if _is_depth(path)]
     others = [path for path in image_files(folder) if not _words(path) & {*DEPTH, *_NEITHER}]
     images = [path for path in others if _words(path) & set(COLOUR)] or others
@@ -205,9 +205,10 @@ def _is_depth(path: Path) -> bool:
     return bool(_words(path) & set(DEPTH)) and not _words(path) & _NEITHER
 
 
-def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str]) -> Path | None:
-    """Return the first of the folders `names` that has images, in any case; any name with the word depth counts as
-    depth (`aligned_depth_to_color`).
+def _find_folder(folder: Path, names: Sequence[str], suffixes: frozenset[str]) -> Path | None:
+    """Return the first folder of `names`, in upper or lower case, that has images; None without one.
+
+    Any name with the word depth counts as `depth`, for example `aligned_depth_to_color`.
     """
     there = {}
     for path in sorted(path for path in folder.iterdir() if path.is_dir() and image_files(path, suffixes)):
@@ -220,7 +221,7 @@ def _folder(folder: Path, names: Sequence[str], suffixes: frozenset[str]) -> Pat
 def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path | None]:
     """Return the depth of each image, None without one."""
     for key in (lambda path: path.stem, _number):
-        found = _by(key, images, depths)
+        found = _paired_by(key, images, depths)
         if found is not None:
             return found
     image_times, depth_times = _times_by_name(images), _times_by_name(depths)
@@ -235,8 +236,8 @@ def _partners(folder: Path, images: list[Path], depths: list[Path]) -> list[Path
     )
 
 
-def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path]) -> list[Path | None] | None:
-    """Return pairs by a key of the names; None if keys are not distinct, or pair less than half of the files."""
+def _paired_by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path]) -> list[Path | None] | None:
+    """Pair images and depths by a key of their names; None if keys are not distinct, or pair less than half."""
     keys = [[key(path) for path in paths] for paths in (images, depths)]
     if any(None in own or len(set(own)) < len(own) for own in keys):
         return None
@@ -247,6 +248,6 @@ def _by(key: Callable[[Path], str | None], images: list[Path], depths: list[Path
 
 
 def _number(path: Path) -> str | None:
-    """Return the last number in a name that is not a time."""
+    """Return the last number in a name; None without one, or if the name is a time."""
     numbers = re.findall(r"\d+", path.stem)
     return str(int(numbers[-1])) if numbers and _times_by_name([path]) is None else None

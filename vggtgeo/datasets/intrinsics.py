@@ -1,4 +1,4 @@
-"""Sources of a camera: a file in the folder, published values, the user's option, or a guess."""
+"""Read a camera from a file of the folder, published values or the user's option, or guess it."""
 
 import math
 import re
@@ -13,12 +13,12 @@ from vggtgeo.geometry.camera import Camera, check_distortion, check_intrinsics
 from vggtgeo.io.errors import GuessedCameraWarning, InputError, warn
 from vggtgeo.io.files import whole_text
 
-NARROWEST, WIDEST = 1.0, 170.0
+MIN_FIELD_OF_VIEW, MAX_FIELD_OF_VIEW = 1.0, 170.0
 """Minimum and maximum field of view of a pinhole camera, degrees."""
-FARTHEST_CENTRE = 10.0
-"""Maximum coordinate of a principal point, in image sizes: a cropped image may have it outside."""
-MIN_VALID = 0.5
-"""Minimum share of the undistorted image that is inside the original; lenses of benchmarks keep more than 0.8."""
+MAX_CENTRE = 10.0
+"""Maximum coordinate of a principal point, in units of the image size; of a cropped image it may lie outside."""
+MIN_VALID_SHARE = 0.5
+"""Minimum share of the undistorted image that has pixels in the original; lenses of benchmarks have above 0.8."""
 MAX_ASPECT = 4.0
 """Maximum ratio of the focal lengths, either way; 1 for square pixels, up to 2 for interlaced and anamorphic ones."""
 _OPENCV = (
@@ -29,7 +29,7 @@ _FISHEYES = ("equidistant", "equi", "fisheye", "kannala_brandt", "kannala_brandt
 """Names of the two lens models in ROS, Kalibr, EuRoC, RealSense, COLMAP and nerfstudio."""
 CALIBRATION, DISTORTION = "calibration.txt", "distortion.txt"
 FISHEYE = "fisheye"
-"""Last word of such a file, after four coefficients of Kannala and Brandt."""
+"""Last word of a calibration of a fisheye, after the four coefficients of Kannala and Brandt."""
 
 
 # Colour cameras of the TUM RGB-D benchmark, freiburg1 to 3, and of Bonn RGB-D Dynamic, 640 x 480 (fx fy cx cy,
@@ -45,7 +45,9 @@ _RECORDING = re.compile(r"freiburg([123])|(?:^|[_-])fr([123])(?:[_-]|$)|(rgbd_bo
 
 
 def parse_intrinsics(text: str) -> tuple[float, float, float, float]:
-    """Return `"fx,fy,cx,cy"` as numbers, pixels; raise InputError unless four numbers, focal lengths positive."""
+    """Return `"fx,fy,cx,cy"` as numbers, pixels; raise InputError if they are not four, or a focal length is not
+    positive.
+    """
     try:
         return check_intrinsics(_numbers(text))
     except InputError as error:
@@ -63,15 +65,15 @@ def pinhole_of(matrix: np.ndarray) -> tuple[float, float, float, float]:
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     values = check_intrinsics((fx, fy, cx, cy))
     if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6):
-        raise InputError(f"found {matrix.tolist()}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        raise InputError(f"the matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {matrix.tolist()}")
     return values
 
 
 def is_fisheye(where: str, model: str) -> bool:
-    """Return whether a lens model is a fisheye; raise InputError for an unknown model. where: for messages."""
+    """Return whether a lens model is a fisheye; raise InputError for an unknown model. where: for errors."""
     if model.lower() not in ("", *_OPENCV, *_FISHEYES):
         known = ", ".join((*_OPENCV, *_FISHEYES))
-        raise InputError(f"{where} is {model[:40]}; read are {known}: undistort the images")
+        raise InputError(f"{where} must be one of {known}, got {model[:40]}: undistort the images")
     return model.lower() in _FISHEYES
 
 
@@ -88,11 +90,11 @@ def camera_from_folder(folder: Path, width: int, height: int) -> Camera | None:
             with parsing(file, expected):
                 camera = read(file, width, height)
             check_plausible(f"`{file}`", camera)
-            warn_of_other_size(f"`{file}`", camera)
+            warn_if_other_size(f"`{file}`", camera)
             return camera
     file = folder / "metadata.json"
     content = read_json(file) if file.is_file() else None
-    if not isinstance(content, dict) or not {"K", "w", "h"} <= content.keys():  # another program's
+    if not isinstance(content, dict) or not {"K", "w", "h"} <= content.keys():  # of another program
         return None
     same = same_size((content["w"], content["h"]), (width, height))
     return camera_of_record3d(file, content, width, height) if same else None
@@ -104,8 +106,9 @@ def camera_or_guess(folder: Path, width: int, height: int) -> Camera:
 
 
 def camera_of_record3d(file: Path, content: Mapping[str, Any], width: int, height: int) -> Camera:
-    """Return the camera of Record3D's metadata: the median over frames (autofocus changes them slightly), else the
-    matrix `K`, by columns; raise InputError if it is invalid.
+    """Return the camera of Record3D's metadata; raise InputError if it is invalid.
+
+    It is the median over frames, since autofocus changes the intrinsics slightly, else the matrix `K`, by columns.
     """
     frames = content.get("perFrameIntrinsicCoeffs")
     with parsing(file, "nine numbers `K`, or four of each frame in `perFrameIntrinsicCoeffs`"):
@@ -119,25 +122,27 @@ def camera_of_record3d(file: Path, content: Mapping[str, Any], width: int, heigh
 
 
 def check_plausible(where: str, camera: Camera) -> None:
-    """Raise InputError for a camera that is implausible for its image size: its field of view, the ratio of its focal
-    lengths, its principal point, or a distortion that keeps less than half of the image.
+    """Raise InputError for a camera that is implausible for its image size.
+
+    Checks the field of view, the ratio of the focal lengths, the principal point, and that undistortion keeps half of
+    the image.
     """
     (fx, fy, cx, cy), width, height = camera.intrinsics, camera.width, camera.height
     angle = _field_of_view(camera)
-    if not NARROWEST <= angle <= WIDEST or max(fx, fy) > MAX_ASPECT * min(fx, fy):
+    if not MIN_FIELD_OF_VIEW <= angle <= MAX_FIELD_OF_VIEW or max(fx, fy) > MAX_ASPECT * min(fx, fy):
         raise InputError(
-            f"{where}: fx {fx:g} and fy {fy:g} make a field of view of {angle:.3g} deg for images of {width} x "
-            f"{height} pixels; they must be in pixels"
+            f"{where}: fx and fy must be in pixels, got {fx:g} and {fy:g}, a field of view of {angle:.3g} deg for "
+            f"images of {width} x {height} pixels"
         )
-    if abs(cx) > FARTHEST_CENTRE * width or abs(cy) > FARTHEST_CENTRE * height:
+    if abs(cx) > MAX_CENTRE * width or abs(cy) > MAX_CENTRE * height:
         raise InputError(
             f"{where}: the principal point ({cx:g}, {cy:g}) is far outside images of {width} x {height} pixels"
         )
     valid = camera.undistorter().valid if any(camera.distortion) else None
-    if valid is not None and valid.mean() < MIN_VALID:
+    if valid is not None and valid.mean() < MIN_VALID_SHARE:
         raise InputError(
-            f"{where}: the distortion {camera.distortion} leaves {100 * valid.mean():.0f} % of the image; it must be "
-            "k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order"
+            f"{where}: the distortion must be k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order, got "
+            f"{camera.distortion}, which leaves {100 * valid.mean():.0f} % of the image"
         )
 
 
@@ -161,22 +166,22 @@ def guess_with_warning(name: str, width: int, height: int, pixel_aspect: float =
     camera = Camera.guess(width, height, pixel_aspect)
     focal = " and ".join(dict.fromkeys(f"{value:.0f}" for value in camera.intrinsics[:2]))
     warn(
-        f"`{name}`: no camera file found, so the camera is estimated (normal for a phone video), beginning with a "
-        f"focal length of {focal} pixels. To give it: --intrinsics fx,fy,cx,cy (in Python: `camera`), or a file "
-        f"`{CALIBRATION}` with `fx fy cx cy` beside the images",
+        f"`{name}`: no camera file found (normal for a phone video), so the camera is estimated from a first guess, "
+        f"a focal length of {focal} pixels. If you know it, pass --intrinsics fx,fy,cx,cy (in Python: `camera`), or "
+        f"write `fx fy cx cy` into a file `{CALIBRATION}` next to the images",
         GuessedCameraWarning,
     )
     return camera
 
 
 def _read_calibration(file: Path, width: int, height: int) -> Camera:
-    words = _without_comments(file).replace(",", " ").split()
+    words = _without_comments(file).replace(",", " ").split()  # commas, since the last word may be `fisheye`
     fisheye = words[-1:] == [FISHEYE]
     numbers = _numbers(" ".join(words[:-1] if fisheye else words))
     beside = file.with_name(DISTORTION)
     if len(numbers) == 4 and not fisheye and beside.is_file():
         with parsing(beside, "k1 k2 p1 p2 [k3 [k4 k5 k6]]"):
-            numbers += _numbers(_without_comments(beside).replace(",", " "))
+            numbers += _numbers(_without_comments(beside))
     return Camera(check_intrinsics(numbers[:4]), width, height, check_distortion(numbers[4:]), fisheye=fisheye)
 
 
@@ -204,19 +209,19 @@ def _numbers(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(word) for word in text.replace(",", " ").split())
     except ValueError:
-        raise InputError(f"found {text.strip()!r}, which must be numbers") from None
+        raise InputError(f"the values must be numbers, got {text.strip()!r}") from None
 
 
 def _without_comments(file: Path) -> str:
     return " ".join(line.split("#", 1)[0] for line in whole_text(file).splitlines())
 
 
-def warn_of_other_size(where: str, camera: Camera) -> None:
-    """Warn of a principal point or a field of view that is implausible for images of this size."""
+def warn_if_other_size(where: str, camera: Camera) -> None:
+    """Warn if a principal point or a field of view suggests that the camera was calibrated at another image size."""
     cx, cy = camera.intrinsics[2:]
     centred = 0 <= cx < camera.width and 0 <= cy < camera.height
     if not centred or _field_of_view(camera) < 10:
         warn(
-            f"{where}: principal point ({cx:g}, {cy:g}) and field of view {_field_of_view(camera):.0f} deg are odd "
+            f"{where}: principal point ({cx:g}, {cy:g}) and field of view {_field_of_view(camera):.0f} deg are unusual "
             f"for images of {camera.width} x {camera.height}; was it calibrated at another image size?"
         )

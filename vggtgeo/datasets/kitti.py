@@ -32,7 +32,7 @@ class Kitti(FolderSequence):
     """
 
     baseline: float = 0.0
-    """Metres along x from the left grey camera, that of the ground truth, to this one."""
+    """Metres along x from the left grey camera, to which the ground truth refers, to this camera."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -41,19 +41,19 @@ class Kitti(FolderSequence):
     @classmethod
     def open(cls, folder: Path) -> Self:
         images = {folder / name: image_files(folder / name) for name in _FOLDERS}
-        place = max(images, key=lambda each: len(images[each]))  # colour, where both have as many
-        times = _times(folder, place)
-        rows = rows_of(images[place], len(times) if times else None)
+        image_folder = max(images, key=lambda each: len(images[each]))  # the first, colour, if numbers are equal
+        times = _times(folder, image_folder)
+        rows = rows_of(images[image_folder], len(times) if times else None)
         if times and max(rows, default=-1) >= len(times):
             raise InputError(
-                f"`{folder}` has {len(rows)} images, by their numbers up to {max(rows)} counted from 0, and "
-                f"{len(times)} times; give those of the whole drive"
+                f"`{folder}` must have a time for each image of the drive, got {len(times)} times for {len(rows)} "
+                f"images with numbers up to {max(rows)}, counted from 0"
             )
-        every = [times[row] if times else (row - rows[0]) / RATE for row in rows]
-        frames = [(time, image, None) for time, image in zip(every, images[place], strict=True)]
+        image_times = [times[row] if times else (row - rows[0]) / RATE for row in rows]
+        frames = [(time, image, None) for time, image in zip(image_times, images[image_folder], strict=True)]
         if (folder / "oxts").is_dir():
-            warn(f"`{folder}`: the GPS and IMU in `oxts` are not used: there is no truth", NoteWarning)
-        name = place.relative_to(folder).parts[0]
+            warn(f"`{folder}`: GPS and IMU in `oxts` are not read, so there is no ground truth", NoteWarning)
+        name = image_folder.relative_to(folder).parts[0]
         baseline = 0.0
 
         def camera(width: int, height: int) -> Camera:
@@ -73,13 +73,13 @@ class Kitti(FolderSequence):
             return None
         poses = poses_of_rows(read_matrices(file, 12))
         poses[:, :3, 3] += self.baseline * poses[:, :3, 0]
-        lines = rows_of([one.image for one in self.files], len(poses))  # another list than that of times, maybe cut
+        lines = rows_of([one.image for one in self.files], len(poses))  # may have fewer lines than the list of times
         return trajectory_of_rows([one.timestamp for one in self.files], lines, poses, file)
 
 
-def _times(folder: Path, place: Path) -> list[float]:
+def _times(folder: Path, image_folder: Path) -> list[float]:
     """Return the times of all lines, seconds; empty without a list."""
-    seconds, stamps = folder / "times.txt", place.parent / "timestamps.txt"
+    seconds, stamps = folder / "times.txt", image_folder.parent / "timestamps.txt"
     file = seconds if seconds.is_file() else stamps
     if not file.is_file():
         return []
@@ -90,7 +90,7 @@ def _times(folder: Path, place: Path) -> list[float]:
             moments = [datetime.fromisoformat(line[:26]) for line in whole_text(file).splitlines() if line.strip()]
             times = [(moment - moments[0]).total_seconds() for moment in moments]
         if not times:
-            raise ValueError("it has no time")
+            raise ValueError("the file is empty")
     return times
 
 
@@ -105,7 +105,7 @@ def _camera(folder: Path, name: str, width: int, height: int) -> tuple[Camera, f
         values = _calibration(file)
         for key in _LINES[name]:
             if key in values:
-                if size in values:  # a drive that is not rectified has larger images
+                if size in values:  # the images of an unrectified drive are larger
                     check_size(file, _numbers(file, values, size, 2).tolist(), (width, height))
                 row = _numbers(file, values, key, 12)
                 intrinsics = intrinsics_of(file, row[[0, 5, 2, 6]].tolist())

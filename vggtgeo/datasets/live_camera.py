@@ -29,7 +29,7 @@ def is_live(text: str) -> bool:
 class LiveCamera:
     """Frames of a live camera, without depth and ground truth, until the stream ends or the run is interrupted.
 
-    The length is unknown (0). Times are those of arrival.
+    The length is unknown (0). Timestamps are the times of arrival.
     """
 
     source: str
@@ -40,16 +40,16 @@ class LiveCamera:
     def open(cls, source: str) -> Self:
         """Open a camera and read one frame for the size; raise InputError if no camera answers."""
         with _capture(source) as capture:
-            there, image = capture.read()
-        if not there:
-            raise InputError(f"`{_public(source)}` gives no frame: is the camera connected, and not in use?")
+            received, image = capture.read()
+        if not received:
+            raise InputError(f"`{_without_login(source)}` gives no frame: is the camera connected, and not in use?")
         height, width = image.shape[:2]
-        return cls(source, guess_with_warning(_public(source), width, height))
+        return cls(source, guess_with_warning(_without_login(source), width, height))
 
     @property
     def name(self) -> str:
         """Return the source without its password."""
-        return _public(self.source)
+        return _without_login(self.source)
 
     def __len__(self) -> int:
         return 0
@@ -72,14 +72,14 @@ class LiveCamera:
                     return
                 now = max(monotonic(), last + 1e-6)
                 if index >= start and (index - start) % stride == 0:
-                    there, image = capture.retrieve()
-                    if there:
+                    received, image = capture.retrieve()
+                    if received:
                         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
                         yield Frame(index, now - began, rgb, None, f"{self.name}, {index}")
                 last = now
 
 
-def _public(source: str) -> str:
+def _without_login(source: str) -> str:
     """Return an address without the user's name and password."""
     return re.sub(r"//[^/?#]*@", "//", source)
 
@@ -88,14 +88,16 @@ def _public(source: str) -> str:
 def _capture(source: str) -> Iterator[cv2.VideoCapture]:
     webcam = _WEBCAM.fullmatch(source)
     logging: Any = cv2.utils.logging
-    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the error below replaces its warnings
+    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the error below replaces OpenCV's log lines
     try:
         capture = cv2.VideoCapture(int(webcam.group(1) or 0) if webcam else source)
     finally:
         logging.setLogLevel(level)
     try:
         if not capture.isOpened():
-            raise InputError(f"`{_public(source)}` cannot be opened: is the camera connected, and the address right?")
+            raise InputError(
+                f"`{_without_login(source)}` cannot be opened: is the camera connected, and the address right?"
+            )
         yield capture
     finally:
         capture.release()

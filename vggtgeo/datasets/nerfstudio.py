@@ -1,4 +1,4 @@
-"""`transforms.json` with images: of nerfstudio, instant-ngp, and the apps that export for them (Polycam, Record3D).
+"""Images with a `transforms.json`: nerfstudio, instant-ngp, and apps that export for them (Polycam, Record3D).
 
 | key, of the file or of a frame | meaning |
 |---|---|
@@ -6,9 +6,10 @@
 | `depth_file_path` or `depth_path` of a frame | 16-bit depth, millimetres, or `integer_depth_scale` metres a unit |
 | `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, `k1` ... `p2` | the camera; pixel (0, 0) is the corner of the top-left pixel |
 | `camera_model`, `is_fisheye` | the lens: a pinhole, distorted or not, or a fisheye of `k1` ... `k4` |
-| `camera_angle_x` | field of view, radians, where there is no focal length |
+| `camera_angle_x` | field of view, radians, used without a focal length |
 
-The poses are those of another program (COLMAP, ARKit), often of free scale, not an independent ground truth.
+The poses were estimated by another program (COLMAP, ARKit), often with unknown scale. They are not an independent
+ground truth.
 """
 
 import math
@@ -21,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, is_there
+from vggtgeo.datasets.image_files import IMAGE_SUFFIXES, MILLIMETRES, path_exists
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, natural_key
 from vggtgeo.datasets.intrinsics import guess_with_warning, intrinsics_of, is_fisheye
 from vggtgeo.datasets.pose_files import parsing, read_json, trajectory_of
@@ -31,10 +32,10 @@ from vggtgeo.io.errors import InputError, warn
 
 FILE = "transforms.json"
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenGL's camera axes to OpenCV's, and back."""
+"""Changes camera axes from OpenGL's to OpenCV's, and back."""
 _EXPECTED = "`frames` with `file_path` and `transform_matrix` (4 x 4 numbers), and the camera as nerfstudio writes it"
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-_OF_FISHEYE = ("k1", "k2", "k3", "k4")
+_FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Nerfstudio(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the frames by the numbers in their images' names; their order in the file is arbitrary."""
+        """List the frames in the order of their images' names; their order in the file is arbitrary."""
         file = folder / FILE
         with parsing(file, _EXPECTED):
             content = read_json(file)
@@ -60,7 +61,7 @@ class Nerfstudio(FolderSequence):
             ]
             coding = replace(MILLIMETRES, units_per_metre=1.0 / float(content.get("integer_depth_scale", 1e-3)))
             for frame in images.values():
-                _pose(frame)
+                _pose(frame)  # invalid poses are reported here, not after the run
         camera = lambda *size: _camera(file, content, list(images.values()), *size)
         return cls.listed(folder, rows, camera, coding)
 
@@ -73,32 +74,34 @@ class Nerfstudio(FolderSequence):
 
     @property
     def truth_in_metres(self) -> bool:
-        """Return whether the poses are metric, as those with depth (phones); COLMAP's are not."""
+        """Return whether the poses are metric: they are with depth (phones); COLMAP's are not."""
         return any(one.depth is not None for one in self.files)
 
 
 def _images(folder: Path, content: Mapping[str, Any]) -> dict[Path, Mapping[str, Any]]:
-    """Return the frames by their images, whose suffixes may be missing, or changed by a conversion."""
-    return {_below(folder, frame["file_path"], IMAGE_SUFFIXES): frame for frame in content["frames"]}
+    """Return the frames by image file; the suffix in `file_path` may be missing, or that of another format."""
+    return {_find_inside(folder, frame["file_path"], IMAGE_SUFFIXES): frame for frame in content["frames"]}
 
 
 def _depth(folder: Path, frame: Mapping[str, Any]) -> Path | None:
     name = frame.get("depth_file_path") or frame.get("depth_path")
-    return None if name is None else _below(folder, name)
+    return None if name is None else _find_inside(folder, name)
 
 
-def _below(folder: Path, name: str, suffixes: Collection[str] = ()) -> Path:
-    """Return a file below the folder; others are never opened. The file of a path of another place, before the folder
-    was copied, is searched by its name, here and in `images`, also with other suffixes.
+def _find_inside(folder: Path, name: str, suffixes: Collection[str] = ()) -> Path:
+    """Return a file inside the folder; files outside are never opened.
+
+    A path that does not exist inside, since the folder was moved, is searched by its file name in the folder and in
+    `images`, also with other suffixes.
     """
     path = Path(name.replace("\\", "/"))
     inside = not path.is_absolute() and ".." not in path.parts
     places = [folder / place for place in ([path] if inside else []) + [Path("images") / path.name, Path(path.name)]]
     stems = [place.with_suffix("") if path.suffix.lower() in suffixes else place for place in places]
     converted = [Path(f"{stem}{suffix}") for stem in stems for suffix in sorted(suffixes)]
-    found = next(filter(is_there, [*places, *converted]), None)
+    found = next(filter(path_exists, [*places, *converted]), None)
     if found is None and not inside:
-        raise InputError(f"`{folder}`: {name!r} is missing below the folder of `{FILE}`")
+        raise InputError(f"`{folder}`: {name!r} of `{FILE}` does not exist inside the folder")
     return found or places[0]
 
 
@@ -111,7 +114,7 @@ def _pose(frame: Mapping[str, Any]) -> np.ndarray:
 
 
 def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, Any]], width: int, height: int) -> Camera:
-    """Return the camera of the file, or the median of those of its frames, for images of this size."""
+    """Return the camera of the file, or the median of its frames' cameras, for images of this size."""
 
     def number(key: str, default: float = 0.0) -> float:
         places = (content,) if content.get(key) is not None else frames
@@ -128,8 +131,8 @@ def _camera(file: Path, content: Mapping[str, Any], frames: list[Mapping[str, An
         named = is_fisheye(f"`{file}`: `camera_model`", str(content.get("camera_model", "")))
         fisheye = named or content.get("is_fisheye") is True  # nerfstudio, instant-ngp
         if unread := [key for key in ("k4", "k5", "k6") if number(key) and not (fisheye and key == "k4")]:
-            warn(f"`{file}` has {', '.join(unread)} of its lens, left out: undistort the images")
-        lens = tuple(map(number, _OF_FISHEYE if fisheye else _DISTORTION))
+            warn(f"`{file}`: the coefficients {', '.join(unread)} are not supported and ignored: undistort the images")
+        lens = tuple(map(number, _FISHEYE_DISTORTION if fisheye else _DISTORTION))
         distortion = check_distortion(lens if fisheye or lens[4] else lens[:4]) if fisheye or any(lens) else ()
         intrinsics = intrinsics_of(file, (fx, number("fl_y", fx), *centre))
     return Camera(intrinsics, round(across), round(down), distortion, fisheye=fisheye).resized(width, height)

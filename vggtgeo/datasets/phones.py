@@ -5,13 +5,13 @@ App ("All data") and Polycam ("Raw data", below `keyframes/`).
 |---|---|---|---|---|
 | images | `rgb.mp4` | `lowres_wide/*_TIME.png` | `frame_00012.jpg`, one of a few | `images/TIME.jpg` |
 | depth, mm | `depth/NNNNNN.png` | `lowres_depth/*_TIME.png` | `depth_00012.png` | `depth/TIME.png` |
-| trust in it: 0 is low | `confidence/NNNNNN.png` | | `conf_00012.png` | `confidence/TIME.png` |
+| confidence: 0 is low | `confidence/NNNNNN.png` | | `conf_00012.png` | `confidence/TIME.png` |
 | camera | `camera_matrix.csv` | `lowres_wide_intrinsics/*.pincam` | `frame_00012.json` | `cameras/TIME.json` |
 | poses | `odometry.csv` | `lowres_wide.traj` | the same | the same |
 
-The depth has fewer pixels of the same view (256 x 192); it is enlarged to the images without interpolation. Polycam's
-corrected data (`corrected_images/`, ...: refined poses, undistorted images) are preferred. Thumbnails and meshes are
-not read. Poses are those of ARKit, not an independent ground truth: differences from them are not errors.
+The depth has a lower resolution (256 x 192); it is enlarged to the images without interpolation. Polycam's corrected
+data (`corrected_images/`, ...: refined poses, undistorted images) are preferred. Thumbnails and meshes are not read.
+Poses are estimates of ARKit, not an independent ground truth: differences from them are not errors.
 """
 
 import re
@@ -39,10 +39,10 @@ from vggtgeo.geometry.trajectory import Trajectory, poses_of, read_matrices
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning, warn
 from vggtgeo.io.files import whole_text
 
-LARGEST = 960
-"""Maximum pixels of the longer side: the depth has 256, and images of 1920 cost four times as much."""
+MAX_SIDE = 960
+"""Maximum pixels of the longer side of an image: the depth has only 256, and 1920 pixels cost four times as much."""
 _MIN_CONFIDENCE = 1
-"""Minimum of 0 (low), 1 and 2; Polycam writes 0, 127 and 255."""
+"""Minimum confidence of depth that is used. Apps write 0 (low), 1 and 2; Polycam 0, 127 and 255."""
 _CONFIDENCE = "confidence"
 _LISTS = "odometry.csv", "camera_matrix.csv"
 """Files of Stray Scanner beside the video."""
@@ -68,20 +68,20 @@ class StrayScanner:
     def open(cls, folder: Path) -> Self:
         """Open the video; images are reduced to at most 960 pixels, by an integer factor."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", InputWarning)  # the video has no intrinsics, but the folder has
+            warnings.simplefilter("ignore", InputWarning)  # of missing intrinsics, which the folder has
             video = VideoFile.open(folder / "rgb.mp4", depth=False)
         width, height = video.camera.width, video.camera.height
-        reduction = -(-max(width, height) // LARGEST)
+        reduction = -(-max(width, height) // MAX_SIDE)
         file = folder / "camera_matrix.csv"
         matrix = read_matrix(file, (3, 3))
-        # pixel (0, 0) is the centre of the corner pixel, not the corner
+        # Coordinates (0, 0) are the centre of the corner pixel, not the corner of the image.
         centre = (matrix[:2, 2] + 0.5) / reduction - 0.5
         intrinsics = intrinsics_of(file, (matrix[0, 0] / reduction, matrix[1, 1] / reduction, *centre))
         camera = Camera(intrinsics, width // reduction, height // reduction)
         times = tuple(_odometry(folder)[:, 0].tolist())
         if len(times) != len(video):
             text = f"has {len(video)} frames, `odometry.csv` {len(times)} times"
-            warn(f"`{folder}`: `rgb.mp4` {text}; frames behind {min(len(video), len(times))} are left out")
+            warn(f"`{folder}`: `rgb.mp4` {text}; frames from {min(len(video), len(times))} on are left out")
         has_depth = bool(files_like(folder / "depth", "*.png"))
         return cls(folder, folder.resolve().name, camera, video, times, has_depth)
 
@@ -108,7 +108,7 @@ class StrayScanner:
         try:
             depth = read_depth(file, MILLIMETRES)
             if (self.folder / _CONFIDENCE).is_dir():
-                remove_doubtful(depth, self.folder / _CONFIDENCE / file.name)
+                remove_low_confidence(depth, self.folder / _CONFIDENCE / file.name)
             depth = cv2.resize(depth, (self.camera.width, self.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
             return np.asarray(depth, np.float32)
         except InputError as error:
@@ -116,16 +116,16 @@ class StrayScanner:
             return np.full((self.camera.height, self.camera.width), np.nan, np.float32)
 
 
-def remove_doubtful(depth: np.ndarray, file: Path) -> None:
-    """Replace depth of low confidence by NaN; warn if the confidence cannot be read, and keep all depth."""
+def remove_low_confidence(depth: np.ndarray, file: Path) -> None:
+    """Replace depth of low confidence by NaN; keep all depth, with a warning, if the confidence cannot be read."""
     try:
-        trust = read_codes(file)
-        if trust.shape != depth.shape:
-            raise InputError(f"`{file}` has shape {trust.shape}, its depth {depth.shape}")
+        confidence = read_codes(file)
+        if confidence.shape != depth.shape:
+            raise InputError(f"`{file}` must have the shape of its depth, {depth.shape}, got {confidence.shape}")
     except InputError as error:
         warn(f"{error}; all depth of the frame is used")
     else:
-        depth[trust < _MIN_CONFIDENCE] = np.nan
+        depth[confidence < _MIN_CONFIDENCE] = np.nan
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _odometry(folder: Path) -> np.ndarray:
     head = whole_text(file).strip().partition("\n")[0]
     rows = read_matrices(file, head.count(",") + 1, skip="t")
     if rows.shape[1] < 9 or not len(rows):
-        raise InputError(f"`{file}`: expected lines `timestamp, frame, x, y, z, qx, qy, qz, qw` after a head")
+        raise InputError(f"`{file}`: expected lines `timestamp, frame, x, y, z, qx, qy, qz, qw` after a header")
     return rows
 
 
@@ -191,9 +191,9 @@ def _pincam(folder: Path, width: int, height: int) -> Camera:
 
 
 class _View(NamedTuple):
-    """What the file of an image's camera states.
+    """Content of the camera file of an image.
 
-    Fields: time, seconds; intrinsics, fx, fy, cx, cy; size, width and height of its images, if stated; pose float64
+    Fields: time, seconds; intrinsics, fx, fy, cx, cy; size, width and height of the images, if stated; pose float64
     [4, 4], camera -> world, OpenGL's axes.
     """
 
@@ -204,7 +204,7 @@ class _View(NamedTuple):
 
 
 class _Files(NamedTuple):
-    """Files of one image. camera: that which `_View` is read from."""
+    """Files of one image. camera: the file with the content of `_View`."""
 
     image: Path
     camera: Path
@@ -216,17 +216,17 @@ class _Files(NamedTuple):
 class PhoneExport(FolderSequence):
     """Images of a phone, each with a file of camera, pose and time. Ground truth: ARKit's poses.
 
-    poses: float64 [4, 4], camera -> world, by image. confidence: files by that of the depth.
+    poses: float64 [4, 4], camera -> world, by image file. confidence: confidence files by depth file.
     """
 
     poses: Mapping[Path, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
     confidence: Mapping[Path, Path] = field(default_factory=dict, compare=False, repr=False)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth, enlarged to the images, without that of low confidence."""
+        """Return the depth, enlarged to the images, without pixels of low confidence."""
         depth = read_depth(path, self.depth_format)
         if path in self.confidence:
-            remove_doubtful(depth, self.confidence[path])
+            remove_low_confidence(depth, self.confidence[path])
         return self.enlarge_depth(depth)
 
     def ground_truth(self) -> Trajectory | None:
@@ -242,7 +242,7 @@ class PhoneExport(FolderSequence):
 
     @classmethod
     def view_of(cls, file: Path) -> _View:
-        """Read the file of a camera."""
+        """Read a camera file."""
         raise NotImplementedError
 
     @classmethod
@@ -251,7 +251,7 @@ class PhoneExport(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the images; those without a valid camera are left out."""
+        """List the images; those without a valid camera file are left out, with a warning."""
         views: dict[_Files, _View] = {}
         for one in cls.files_of(folder):
             try:
@@ -281,7 +281,7 @@ class Scanner3d(PhoneExport):
         with parsing(file, "`intrinsics` of 9 numbers, `cameraPoseARFrame` of 16, and `time`"):
             content = read_json(file)
             matrix = np.reshape(content["intrinsics"], (3, 3)).astype(np.float64)
-            matrix = matrix if matrix[0, 2] or matrix[1, 2] else matrix.T  # by columns, as ARKit has it
+            matrix = matrix if matrix[0, 2] or matrix[1, 2] else matrix.T  # some versions write columns, as ARKit does
             pose = np.reshape(content["cameraPoseARFrame"], (4, 4)).astype(np.float64)
             pose = pose.T if pose[3, :3].any() and not pose[:3, 3].any() else pose
             intrinsics = intrinsics_of(file, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))

@@ -1,14 +1,15 @@
-"""Recordings of the app Record3D (a phone's LiDAR, or the camera of its face), as it shares them: a `.r3d`, which is a
-zip archive, or the same unpacked, or what it exports as "EXR + JPG".
+"""Recordings of the app Record3D (a phone's LiDAR or its front depth camera).
 
-| `.r3d` | EXR + JPG | what it holds |
+The app shares a `.r3d`, which is a zip archive, or exports "EXR + JPG". An unpacked `.r3d` is read, too.
+
+| `.r3d` | EXR + JPG | content |
 |---|---|---|
-| `metadata` | `metadata.json` | size, camera (of each frame, too), times, ARKit's poses: quaternion x y z w, place |
+| `metadata` | `metadata.json` | size, camera (also of each frame), times, ARKit's poses: quaternion x y z w, position |
 | `rgbd/0.jpg` | `rgb/0.jpg` | the image |
 | `rgbd/0.depth` | `depth/0.exr` | depth, float32 metres; in a `.r3d` compressed with LZFSE |
-| `rgbd/0.conf` | | trust in it, uint8, 0 to 2, compressed likewise; not of every phone |
+| `rgbd/0.conf` | | confidence of the depth, uint8, 0 to 2, compressed likewise; some phones write none |
 
-LZFSE is decoded by the package imagecodecs, EXR by OpenEXR (extra `phones`). Poses are those of ARKit, not an
+LZFSE is decoded by the package imagecodecs, EXR by OpenEXR (extra `phones`). Poses are estimates of ARKit, not an
 independent ground truth.
 """
 
@@ -41,23 +42,21 @@ SUFFIX = ".r3d"
 METADATA, EXPORTED = "metadata", "metadata.json"
 _IMAGE = re.compile(r"rgbd?/(\d{1,9})\.(jpe?g|png)")
 _MIN_CONFIDENCE = 1
-"""Minimum of 0 (low), 1 and 2."""
+"""Minimum confidence of depth that is used: of 0 (low), 1 and 2."""
 
 
 @dataclass(frozen=True)
 class Record3d(FolderSequence):
     """A recording of Record3D. `folder`: the archive, or the unpacked folder. Ground truth: ARKit's poses.
 
-    depth_size: width and height of the depth, which is enlarged to the images.
+    depth_size: width and height of the depth files; (0, 0) if unknown. The depth is enlarged to the images.
     """
 
     depth_size: tuple[int, int] = (0, 0)
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
-        """Return whether a folder or a zip archive has `metadata` and `rgbd`, or `metadata.json` and EXR; or the suffix
-        of a file is `.r3d`.
-        """
+        """Return whether a path is a `.r3d`, or has `metadata` and `rgbd`, or `metadata.json` and EXR."""
         if folder.suffix.lower() == SUFFIX and folder.is_file():  # a truncated one is not a zip archive
             return True
         try:
@@ -73,20 +72,20 @@ class Record3d(FolderSequence):
         try:
             names = _names(folder)
         except UNREADABLE as error:
-            raise InputError(f"`{folder}` is damaged, must be a zip archive of Record3D: {error}") from None
+            raise InputError(f"`{folder}` must be a zip archive of Record3D, and is damaged: {error}") from None
         numbered = {int(match.group(1)): folder / name for name in sorted(names) if (match := _IMAGE.fullmatch(name))}
         if not names & {METADATA, EXPORTED} or not numbered:
             raise InputError(f"`{folder}` must be a recording of Record3D, with `{METADATA}` and `rgbd/0.jpg`, ...")
         numbers = sorted(numbered)
         depths = [_depth_of(numbered[number]) for number in numbers]
-        there = [depth if depth.relative_to(folder).as_posix() in names else None for depth in depths]
+        existing = [depth if depth.relative_to(folder).as_posix() in names else None for depth in depths]
         unread = cls(folder, "", Camera.guess(1, 1), ())
         metadata = unread.metadata()
         with parsing(unread.file, "`fps`, `frameTimestamps`, `dw` and `dh` as numbers"):
             times = _times(metadata, numbers)
-            depth_size = int(metadata.get("dw", 0)), int(metadata.get("dh", 0))  # (0, 0): of older versions of the app
+            depth_size = int(metadata.get("dw", 0)), int(metadata.get("dh", 0))  # older versions of the app write none
         camera = lambda *size: _camera(unread.file, metadata, *size) or guess_with_warning(str(folder), *size)
-        frames = zip(times, (numbered[number] for number in numbers), there, strict=True)
+        frames = zip(times, (numbered[number] for number in numbers), existing, strict=True)
         return cls.listed(folder, frames, camera, depth_size=depth_size)
 
     @property
@@ -99,22 +98,22 @@ class Record3d(FolderSequence):
             return dict(json_in(self._content(self.file, MAX_TEXT), self.file))
 
     def holds(self, path: Path) -> bool:
-        return self._inside(path).is_file()
+        return self._entry(path).is_file()
 
     def stored_image(self, path: Path, min_bits: int = 8) -> ImageFile:
         return image_in(self._content(path), path, min_bits)
 
     def load_depth(self, path: Path) -> np.ndarray:
-        """Return the depth in a file of the archive, enlarged to the images, without that of low confidence."""
+        """Return the depth in a file of the archive, enlarged to the images, without pixels of low confidence."""
         if path.suffix == ".exr":
             return self.enlarge_depth(read_depth(path, self.depth_format))
         shape = self.camera.height, self.camera.width
         depth = _shaped(self._unpacked(path, 4), np.float32, path, self.depth_size[::-1], shape)
         depth = metres_of_floats(depth)
-        trusted = path.with_suffix(".conf")
-        if self.holds(trusted):
-            trust = _shaped(self._unpacked(trusted, 1), np.uint8, trusted, depth.shape, shape)
-            depth[trust < _MIN_CONFIDENCE] = np.nan
+        file = path.with_suffix(".conf")
+        if self.holds(file):
+            confidence = _shaped(self._unpacked(file, 1), np.uint8, file, depth.shape, shape)
+            depth[confidence < _MIN_CONFIDENCE] = np.nan
         return self.enlarge_depth(depth)
 
     def ground_truth(self) -> Trajectory | None:
@@ -125,33 +124,33 @@ class Record3d(FolderSequence):
         with parsing(where, "7 numbers for each of `poses`, a quaternion and a position"):
             rows = np.array(poses, np.float64).reshape(len(poses), 7)
         numbers = [int(file.image.stem) for file in self.files]
-        there = [row for row, number in enumerate(numbers) if number < len(rows)]
-        found = poses_of(rows[:, 4:], rows[:, :4])[[numbers[row] for row in there]] @ FROM_OPENGL
-        return trajectory_of([self.files[row].timestamp for row in there], found, where)
+        posed = [row for row, number in enumerate(numbers) if number < len(rows)]
+        found = poses_of(rows[:, 4:], rows[:, :4])[[numbers[row] for row in posed]] @ FROM_OPENGL
+        return trajectory_of([self.files[row].timestamp for row in posed], found, where)
 
     def _content(self, path: Path, max_bytes: int = MAX_BYTES) -> bytes:
-        """Return the content of a file in the folder or archive; at most `max_bytes` of a folder's."""
+        """Return the content of a file in the folder or archive; in a folder it may have at most `max_bytes`."""
         if self.folder.is_dir():
             return content_of(path, max_bytes)
         try:
-            return self._inside(path).read_bytes()
+            return self._entry(path).read_bytes()
         except UNREADABLE as error:
             raise InputError(f"`{path}` cannot be read: {error}") from None
 
-    def _inside(self, path: Path) -> Path | zipfile.Path:
+    def _entry(self, path: Path) -> Path | zipfile.Path:
         return self._root / path.relative_to(self.folder).as_posix()
 
     @cached_property
     def _root(self) -> Path | zipfile.Path:
-        """Keep the archive open: its directory takes longer to read than an image."""
+        """Return the folder or the open archive, kept open since its directory takes longer to read than an image."""
         return _root(self.folder)
 
     def _unpacked(self, path: Path, item_bytes: int) -> bytes:
-        """Return decompressed bytes (LZFSE): at most one item per pixel of the image."""
-        most = item_bytes * self.camera.width * self.camera.height
+        """Return bytes decompressed from LZFSE: at most one item per pixel of the image, as a protection of memory."""
+        max_bytes = item_bytes * self.camera.width * self.camera.height
         packed = self._content(path)
         try:
-            content = _decoder()(packed, out=most + 1)
+            content = _decoder()(packed, out=max_bytes + 1)
         except (ValueError, RuntimeError) as error:
             raise InputError(f"`{path}` cannot be unpacked (LZFSE): {error}") from None
         return bytes(content)
@@ -183,7 +182,7 @@ def _decoder() -> Callable[..., Any]:
 
 
 def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image: tuple[int, int]) -> np.ndarray:
-    """Return an array of this size (rows, columns), or, for (0, 0), with the aspect of an image."""
+    """Return an array of `size` (rows, columns); for (0, 0) the size follows from the aspect of the image."""
     each = np.dtype(kind).itemsize
     rows, columns = size
     if not all(size):
@@ -191,13 +190,13 @@ def _shaped(content: bytes, kind: type, path: Path, size: tuple[int, int], image
         columns = round(rows * image[1] / image[0])
     if not content or rows * columns * each != len(content):
         raise InputError(
-            f"`{path}` unpacks to {len(content)} bytes; expected {rows * columns * each}, {columns} x {rows} pixels"
+            f"`{path}` must unpack to {rows * columns * each} bytes, {columns} x {rows} pixels, got {len(content)}"
         )
     return np.frombuffer(content, kind).reshape(rows, columns)
 
 
 def _times(metadata: Mapping[str, Any], numbers: list[int]) -> list[float]:
-    """Return the times of the images, seconds: those of the file if they increase, else by its frame rate."""
+    """Return the times of the images, seconds: those of the metadata if they increase, else by the frame rate."""
     stamps = metadata.get("frameTimestamps") or ()
     times = [float(stamps[number]) for number in numbers] if len(stamps) > numbers[-1] else []
     if times and all(after > before for before, after in pairwise(times)):

@@ -1,7 +1,7 @@
 """Replica as rendered for NICE-SLAM: `results/frameXXXXXX.jpg`, `results/depthXXXXXX.png`, `traj.txt`.
 
-The camera is in `cam_params.json` beside the rooms; the depth is in 1 / 6553.5 m there. Source: Z. Zhu et al.,
-"NICE-SLAM", CVPR 2022; J. Straub et al., "The Replica Dataset", 2019.
+The camera and the unit of the depth, 1 / 6553.5 m, are in `cam_params.json` next to the folders of the rooms. Source:
+Z. Zhu et al., "NICE-SLAM", CVPR 2022; J. Straub et al., "The Replica Dataset", 2019.
 """
 
 import math
@@ -28,10 +28,10 @@ _EXPECTED = "`camera` with fx, fy, cx, cy and a positive `scale`, units a metre"
 
 @dataclass(frozen=True)
 class Replica(FolderSequence):
-    """One room. Truth: `traj.txt`, a matrix camera -> world a line. The files have no times: 30 frames a second."""
+    """One room. Truth: `traj.txt`, one matrix camera -> world on each line. Without times: 30 frames a second."""
 
     rows: tuple[int, ...] = ()
-    """Of each image the line of `traj.txt`."""
+    """Line of `traj.txt` of each image."""
 
     @classmethod
     def matches(cls, folder: Path) -> bool:
@@ -46,14 +46,14 @@ class Replica(FolderSequence):
             ((row - rows[0]) / FRAMES_PER_SECOND, image, existing(depth))
             for row, image, depth in zip(rows, images, depths, strict=True)
         ]
-        places = folder / _CAMERA, folder.resolve().parent / _CAMERA
-        file = next((file for file in places if file.is_file()), None)
+        candidates = folder / _CAMERA, folder.resolve().parent / _CAMERA
+        file = next((file for file in candidates if file.is_file()), None)
         with parsing(file or folder, _EXPECTED):
             stated = {"scale": _UNITS} if file is None else read_json(file)["camera"]
             scale = float(stated["scale"])
             if not 0 < scale < math.inf:
                 raise ValueError(f"`scale` is {scale}")
-        camera = lambda *size: _unstated_camera(folder, *size) if file is None else _camera(file, stated, *size)
+        camera = lambda *size: _default_camera(folder, *size) if file is None else _camera(file, stated, *size)
         return cls.listed(folder, frames, camera, DepthFormat(scale), rows=rows)
 
     def ground_truth(self) -> Trajectory | None:
@@ -68,7 +68,7 @@ def _camera(file: Path, stated: Mapping[str, Any], width: int, height: int) -> C
         return Camera(intrinsics_of(file, [stated[name] for name in ("fx", "fy", "cx", "cy")]), width, height)
 
 
-def _unstated_camera(folder: Path, width: int, height: int) -> Camera:
+def _default_camera(folder: Path, width: int, height: int) -> Camera:
     if (width, height) == _PUBLISHED_SIZE:
         return Camera(_PUBLISHED, width, height)
     own = camera_from_folder(folder, width, height)

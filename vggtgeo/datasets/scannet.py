@@ -1,4 +1,4 @@
-"""ScanNet as its readers export it.
+"""ScanNet as its two SensReader programs export it.
 
 | SensReader in Python | in C++ (BundleFusion's scans, too) | |
 |---|---|---|
@@ -6,11 +6,12 @@
 | `depth/0.png` | `frame-000000.depth.pgm` or `.png` | millimetres |
 | `pose/0.txt` | `frame-000000.pose.txt` | camera -> world |
 | `intrinsic/intrinsic_color.txt`, `..._depth.txt` | `_info.txt` or `info.txt` | of both cameras |
-| `intrinsic/extrinsic_color.txt`, `..._depth.txt` | the same | where stated, the rig -> the camera |
+| `intrinsic/extrinsic_color.txt`, `..._depth.txt` | the same | optional, rig -> camera |
 
-The colour images are larger than the depth and of another camera; they are resampled to the intrinsics of the depth,
-so that no depth is invented. If the extrinsics of the cameras differ, depth and poses are transformed to the colour
-camera.
+The colour images are larger than the depth images and of another camera. They are resampled to the intrinsics of the
+depth camera, so that depth need not be interpolated. If the extrinsics of the cameras differ, depth and poses are
+transformed to the colour camera.
+
 Source: A. Dai et al., "ScanNet", CVPR 2017.
 """
 
@@ -29,7 +30,7 @@ from vggtgeo.datasets.depth_registration import DepthRegistration
 from vggtgeo.datasets.folder import FolderSequence
 from vggtgeo.datasets.image_files import MILLIMETRES, ImageFile, read_depth
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, files_like, image_files
-from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_of_other_size
+from vggtgeo.datasets.intrinsics import check_plausible, intrinsics_of, warn_if_other_size
 from vggtgeo.datasets.pose_files import have_rotations, numbers_of, parsing, read_matrix, trajectory_of
 from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
@@ -44,7 +45,7 @@ class ScanNet(FolderSequence):
     """One scan. Ground truth: the pose files, camera -> world, without those of lost frames (infinities)."""
 
     colour: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
-    """Intrinsics of the colour images as they lie on the disk."""
+    """Intrinsics of the colour images as stored."""
     motion: np.ndarray = field(default_factory=lambda: np.eye(4), compare=False, repr=False)
     """float64 [4, 4], depth camera -> colour camera, metres."""
 
@@ -65,17 +66,17 @@ class ScanNet(FolderSequence):
         colour, depth = _intrinsics(folder, "color"), _intrinsics(folder, "depth")
 
         def camera(width: int, height: int) -> Camera:
-            # An absurd ratio of the two cameras would make a filter of any width.
-            taken = Camera(colour, width, height)
-            check_plausible(f"`{folder}`: the colour camera", taken)
-            warn_of_other_size(f"`{folder}`: the colour camera", taken)
+            # Checked since an absurd ratio of the focal lengths would make the blur below arbitrarily wide.
+            stored = Camera(colour, width, height)
+            check_plausible(f"`{folder}`: the colour camera", stored)
+            warn_if_other_size(f"`{folder}`: the colour camera", stored)
             return Camera(depth, *_size(folder, [depth for _, _, depth in frames]))
 
         motion = _extrinsics(folder, "color") @ np.linalg.inv(_extrinsics(folder, "depth"))
         return cls.listed(folder, frames, camera, colour=colour, motion=motion)
 
     def load_image(self, path: Path, min_bits: int = 8) -> ImageFile:
-        """Return the image with the intrinsics of the depth camera, resampled with an average."""
+        """Return the image, blurred and resampled to the intrinsics of the depth camera."""
         read = self.stored_image(path, min_bits)
         image = read.image
         fx, fy, cx, cy = self.camera.intrinsics
@@ -92,25 +93,25 @@ class ScanNet(FolderSequence):
     def load_depth(self, path: Path) -> np.ndarray:
         """Return the depth at the colour camera, with the intrinsics of the depth camera."""
         depth = super().load_depth(path)
-        wrong = depth.shape != (self.camera.height, self.camera.width)  # reported by the base
+        wrong = depth.shape != (self.camera.height, self.camera.width)  # the base class reports it
         return depth if wrong or self._registration is None else self._registration(depth)
 
     @cached_property
     def _registration(self) -> DepthRegistration | None:
-        """Return None if the cameras are at one place."""
-        one_place = np.array_equal(self.motion, np.eye(4))
-        return None if one_place else DepthRegistration.of(self.camera, self.camera, self.motion)
+        """Return the registration of the depth to the colour camera; None if both cameras have the same pose."""
+        same_pose = np.array_equal(self.motion, np.eye(4))
+        return None if same_pose else DepthRegistration.of(self.camera, self.camera, self.motion)
 
     def ground_truth(self) -> Trajectory | None:
-        there = [(one.timestamp, _beside(self.folder, one.image, "pose", ".txt")) for one in self.files]
-        there = [(time, file) for time, file in there if file.is_file()]
-        if not there:
+        files = [(one.timestamp, _beside(self.folder, one.image, "pose", ".txt")) for one in self.files]
+        files = [(time, file) for time, file in files if file.is_file()]
+        if not files:
             return None
-        poses = np.array([read_matrix(file, (4, 4)) for _, file in there])
+        poses = np.array([read_matrix(file, (4, 4)) for _, file in files])
         if self._registration is not None:
             with np.errstate(invalid="ignore"):  # of lost frames, which have infinities
                 poses = poses @ np.linalg.inv(self.motion)
-        return trajectory_of([time for time, _ in there], poses, self.folder / "pose")
+        return trajectory_of([time for time, _ in files], poses, self.folder / "pose")
 
 
 def _number(image: Path, index: int) -> int:
@@ -130,7 +131,7 @@ def _depth(folder: Path, image: Path) -> Path | None:
 
 
 def _info(folder: Path) -> Path | None:
-    """Return the file of both cameras that SensReader in C++ writes; None for another program's `info.txt`."""
+    """Return the calibration file that the C++ SensReader writes; None for another program's `info.txt`."""
     files = (folder / name for name in ("_info.txt", "info.txt"))
     return next((file for file in files if file.is_file() and "m_calibration" in whole_text(file)), None)
 
@@ -145,12 +146,12 @@ def _extrinsics(folder: Path, camera: str) -> np.ndarray:
     """Return the transformation rig -> camera; the identity by default."""
     file, matrix = _calibration(folder, "extrinsic", camera, np.eye(4))
     if not have_rotations(matrix[None])[0] or not np.isfinite(matrix).all():
-        raise InputError(f"`{file}`: the extrinsics of the {camera} camera are {matrix.tolist()}; expected a motion")
+        raise InputError(f"`{file}`: the {camera} extrinsics must be a rigid motion, got {matrix.tolist()}")
     return matrix
 
 
 def _calibration(folder: Path, what: str, camera: str, unstated: np.ndarray | None = None) -> tuple[Path, np.ndarray]:
-    """Return a matrix [4, 4] of either layout, and its file. unstated: default if it is missing."""
+    """Return a matrix [4, 4] of either layout, and its file. unstated: default value if it is missing."""
     file, info = folder / "intrinsic" / f"{what}_{camera}.txt", _info(folder)
     if file.is_file() or info is None:
         return file, unstated if unstated is not None and not file.is_file() else read_matrix(file, (4, 4))

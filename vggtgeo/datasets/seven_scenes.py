@@ -1,12 +1,12 @@
 """7-Scenes folders: `frame-XXXXXX.color.png|jpg`, `.depth.png`, `.pose.txt`, numbered at 30 frames/s.
 
-Source: J. Shotton et al., "Scene coordinate regression forests", CVPR 2013. As published, a folder has no
-intrinsics, depth (65535 means none as well) is not registered to the colour image, and poses are those of the depth
-camera. A folder without intrinsics, or with those of the depth camera (f = 585, as in the copy of TSDF Fusion), is
-registered: depth and poses are transformed to the colour camera by the extrinsics of a Kinect that are usual for these
-scenes (calibration of LIRIS,
-https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html). They are those of another
-Kinect: near objects have errors of some pixels.
+As published, a folder has no intrinsics, depth (65535 means none, too) is not registered to the colour images, and
+poses are those of the depth camera. If a folder has no intrinsics, or those of the depth camera (f = 585, as in the
+copy of TSDF Fusion), depth and poses are transformed to the colour camera. The extrinsics are those that are usual for
+these scenes (LIRIS, https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html). They were
+calibrated with another Kinect, so near objects have errors of some pixels.
+
+Source: J. Shotton et al., "Scene coordinate regression forests", CVPR 2013.
 """
 
 import re
@@ -46,7 +46,7 @@ _TO_COLOUR = np.array(
 class SevenScenes(FolderSequence):
     """One sequence. Ground truth: `groundtruth-colour.txt` (TUM format) if present, else the pose files.
 
-    as_published: depth and pose files are those of the depth camera.
+    as_published: whether depth and pose files belong to the depth camera.
     """
 
     as_published: bool = False
@@ -57,7 +57,7 @@ class SevenScenes(FolderSequence):
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """List the frames; of a folder of sequences, those of the first, with a warning if it has more."""
+        """List the frames; in a folder of sequences those of the first, with a warning if there are more."""
         if not _colour_files(folder):
             folder = _first_sequence(folder)
         numbered = _colour_files(folder)
@@ -65,8 +65,8 @@ class SevenScenes(FolderSequence):
             (number / FRAMES_PER_SECOND, image, existing(_beside(image, "depth.png")))
             for number, image in sorted(numbered.items())
         ]
-        whole = cls.listed(folder, frames, lambda *size: _camera(folder, *size))
-        return replace(whole, as_published=whole.camera is _AS_PUBLISHED)
+        sequence = cls.listed(folder, frames, lambda *size: _camera(folder, *size))
+        return replace(sequence, as_published=sequence.camera is _AS_PUBLISHED)
 
     def load_depth(self, path: Path) -> np.ndarray:
         """Return the depth, registered to the colour camera."""
@@ -82,8 +82,8 @@ class SevenScenes(FolderSequence):
         """Return the true poses; warn of pose files with NaN or infinity (lost tracking), which are left out."""
         if (self.folder / COLOUR_TRUTH).exists():
             return Trajectory.load_tum(self.folder / COLOUR_TRUTH)
-        places = {file.timestamp: _beside(file.image, "pose.txt") for file in self.files}
-        poses = {time: read_matrix(place, (4, 4)) for time, place in places.items() if place.is_file()}
+        files = {file.timestamp: _beside(file.image, "pose.txt") for file in self.files}
+        poses = {time: read_matrix(file, (4, 4)) for time, file in files.items() if file.is_file()}
         if not poses:
             return None
         to_camera = np.linalg.inv(_TO_COLOUR) if self.as_published else np.eye(4)
@@ -113,14 +113,13 @@ def _beside(image: Path, suffix: str) -> Path:
 
 def _camera(folder: Path, width: int, height: int) -> Camera:
     own = camera_from_folder(folder, width, height)
-    if own is not None and own.intrinsics != _KINECT_DEPTH:  # to which the depth is not registered
+    if own is not None and own.intrinsics != _KINECT_DEPTH:  # not the colour camera, see above
         return own
     if (width, height) != (640, 480):
         return guess_with_warning(str(folder), width, height)
     warn(
-        f"`{folder}` has no intrinsics of its colour camera: taken as published, with that of a Kinect, {_KINECT}; "
-        "depth and poses belong to its depth camera (f = 585) and are moved to the colour camera by a generic "
-        "calibration",
+        f"`{folder}` has no intrinsics of its colour camera: those of a Kinect, {_KINECT}, are used; depth and poses "
+        "belong to the depth camera (f = 585) and are transformed to the colour camera with a generic calibration",
         NoteWarning,
     )
     return _AS_PUBLISHED

@@ -21,7 +21,7 @@ from vggtgeo.io.files import whole_text
 
 _LOG = "_COLMAP_SfM.log"
 _LINES = 5
-"""Lines of a pose in the log: numbers, and four rows of a matrix camera -> world."""
+"""Lines of each pose in the log: image numbers, then the four rows of a matrix camera -> world."""
 _AXES = ["X", "Y", "Z"]
 _MIN_CORNERS = 3
 """Minimum corners of a polygon."""
@@ -38,9 +38,9 @@ class TanksAndTemples(FolderSequence):
     @classmethod
     def open(cls, folder: Path) -> Self:
         """List the images, in the folder itself, in `images`, or in a folder of the scene's name."""
-        places = [folder, folder / "images", folder / folder.resolve().name]
-        images = next((found for place in places if place.is_dir() and (found := image_files(place))), [])
-        # The first image is `000001.jpg`, and 0 in the log.
+        candidates = [folder, folder / "images", folder / folder.resolve().name]
+        images = next((found for place in candidates if place.is_dir() and (found := image_files(place))), [])
+        # The first image is `000001.jpg`; the log calls it 0.
         rows = rows_of(images, None)
         first = min([1, *rows])
         frames = [((row - first) / FRAMES_PER_SECOND, image, None) for row, image in zip(rows, images, strict=True)]
@@ -54,30 +54,31 @@ class TanksAndTemples(FolderSequence):
         numbers, poses = _read_log(file)
         alignment = self.folder / file.name.replace(_LOG, "_trans.txt")
         if alignment.is_file():
-            poses = moved(poses, read_matrix(alignment, (4, 4)))
+            poses = transformed(poses, read_matrix(alignment, (4, 4)))
         return trajectory_of(np.array(numbers) / FRAMES_PER_SECOND, poses, file)
 
     @property
     def truth_in_metres(self) -> bool:
-        """Return whether the poses are metric; COLMAP's alone are not."""
+        """Return whether the poses are metric: they are not without the transformation to the scanner's frame."""
         return (self.folder / f"{self._scene()}_trans.txt").is_file()
 
     def scanned_points(self) -> Float[np.ndarray, "n 3"] | None:
-        """Return the laser scan within its volume (`SCENE.ply`, `SCENE.json`), metres, in the world of `ground_truth`;
-        None if a file is missing, or `SCENE_trans.txt`, the transformation to the scanner's frame.
+        """Return the laser scan (`SCENE.ply`) inside the evaluation volume, metres, in the world of `ground_truth`.
+
+        None if the scan is missing, or `SCENE_trans.txt`, the transformation to the scanner's frame.
         """
         scene = self._scene()
         if scene is None or not all((self.folder / f"{scene}{end}").is_file() for end in ("_trans.txt", ".ply")):
             return None
         file = self.folder / f"{scene}.ply"
         points = PointCloud.load_ply(file).points.astype(np.float64)
-        inside = points[self.judged(points)]
+        inside = points[self.in_evaluation_volume(points)]
         if not len(inside):
             raise InputError(f"`{file}` has {len(points)} points, none of them in the volume of `{scene}.json`")
         return inside
 
-    def judged(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Return which points are in the volume of comparison; all without `SCENE.json`."""
+    def in_evaluation_volume(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Return which points are in the volume of `SCENE.json`; all without that file."""
         file = self.folder / f"{self._scene()}.json"
         return inside_crop(file, points) if file.is_file() else np.ones(len(points), bool)
 
@@ -87,8 +88,8 @@ class TanksAndTemples(FolderSequence):
         return None if file is None else file.name.removesuffix(_LOG)
 
 
-def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 4 4"]:
-    """Return camera -> world after a similarity `[s R, t]` of the world; rotations stay rotations."""
+def transformed(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """Return camera -> world after a similarity `[s R, t]` of the world; the scale changes positions only."""
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
     result = poses.copy()
     result[:, :3, :3] = similarity[:3, :3] / scale @ poses[:, :3, :3]
@@ -97,7 +98,7 @@ def moved(poses: Float[np.ndarray, "n 4 4"], similarity: Float[np.ndarray, "4 4"
 
 
 def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return which points are in the volume of `SCENE.json`: a polygon across an axis, between two bounds on it."""
+    """Return which points are in the volume of `SCENE.json`: a polygon, extruded between two bounds along an axis."""
     from skimage.measure import points_in_poly  # slow to import
 
     with parsing(file, "orthogonal_axis, axis_min below axis_max, and a bounding_polygon of three corners or more"):
@@ -106,14 +107,14 @@ def inside_crop(file: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray
         low, high = float(crop["axis_min"]), float(crop["axis_max"])
         polygon = np.array(crop["bounding_polygon"], np.float64).reshape(-1, 3)
         if not low < high or len(polygon) < _MIN_CORNERS or not np.isfinite([low, high, *polygon.ravel()]).all():
-            raise ValueError(f"axis_min is {low:g}, axis_max {high:g}, and the polygon {polygon.tolist()}")
+            raise ValueError(f"got axis_min {low:g}, axis_max {high:g} and the polygon {polygon.tolist()}")
     across = [number for number in range(3) if number != axis]
     between = (points[:, axis] >= low) & (points[:, axis] <= high)
     return between & points_in_poly(points[:, across], polygon[:, across])
 
 
 def _read_log(file: Path) -> tuple[list[int], Float[np.ndarray, "n 4 4"]]:
-    """Return number of the image, and camera -> world, of each pose."""
+    """Return the image number and camera -> world of each pose."""
     rows = [line.split() for line in whole_text(file).splitlines() if line.strip()]
     with parsing(file, "for each pose the number of its image, as in `0 0 0`, and four rows of a matrix"):
         numbers = [int(row[0]) for row in rows[::_LINES]]

@@ -1,7 +1,7 @@
-"""A video file, decoded frame by frame by PyAV, and its tracks: which are the images, which their depth.
+"""Video files, decoded frame by frame by PyAV.
 
-Action cameras write a small preview beside the recording; k4arecorder writes COLOR, DEPTH and IR into one Matroska
-file.
+A file may have several tracks: action cameras add a small preview, and k4arecorder writes COLOR, DEPTH and IR into one
+Matroska file. `choose_tracks` selects the images and their depth.
 """
 
 from __future__ import annotations
@@ -28,29 +28,30 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError, LeftOutWarning, NoteWarning, warn
 
-FASTEST = 1000
-"""Frames a second that a header may state."""
+MAX_RATE = 1000
+"""Maximum frame rate of a header; a higher one is invalid."""
 _FALLBACK_RATE = 30.0
 _HEAD = 4096
-_NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
-"""Control characters other than those of text and terminals: every video has some."""
+_NOT_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
+"""Control characters that text and terminal output do not have; every video has some."""
 _NO_TIMESTAMPS = 0x80
 """Flag of FFmpeg's formats that are streams without a container (AVFMT_NOTIMESTAMPS)."""
 _PREDICTED = (2, 3)
-"""Types of frames that are made of others: P and B."""
+"""Types of frames that are predicted from others: P and B."""
 _DEPTH = re.compile(r"(^|[^a-z])depth([^a-z]|$)", re.IGNORECASE)
 _INFRARED = re.compile(r"(^|[^a-z])(ir|infrared)([^a-z]|$)", re.IGNORECASE)
 _ATTACHED_PICTURE = 0x400
+"""Disposition flag of FFmpeg for a cover picture (AV_DISPOSITION_ATTACHED_PIC)."""
 _UNNAMED = "VideoHandler"
-"""Title that FFmpeg gives a track without one."""
+"""Title that FFmpeg writes for a track without one."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """A stream of video.
+    """A video stream of a file.
 
-    Fields: index, among all streams of the file. number, among those of video. title, "" for none. codec and pixels,
-    FFmpeg's names. width, height, pixels. cover, whether it is a single picture for lists of files.
+    Fields: index, among all streams of the file. number, among the video streams. title, "" for none. codec and pixels,
+    FFmpeg's names. width, height, pixels. cover, whether it is a cover picture.
     """
 
     index: int
@@ -67,22 +68,22 @@ class Track:
         return f"track {self.number} ({self.codec}, {self.width} x {self.height}{title})"
 
     @property
-    def says_depth(self) -> bool:
+    def titled_depth(self) -> bool:
         return bool(_DEPTH.search(self.title))
 
     @property
-    def says_infrared(self) -> bool:
+    def titled_infrared(self) -> bool:
         return bool(_INFRARED.search(self.title))
 
     @property
     def may_be_depth(self) -> bool:
-        """Return whether its pixels may be millimetres."""
-        return self.pixels.startswith("gray16") and not self.says_infrared
+        """Return whether the pixels may be depth in millimetres."""
+        return self.pixels.startswith("gray16") and not self.titled_infrared
 
 
 @dataclass(frozen=True)
 class ChosenTracks:
-    """Fields: images and depth, the tracks that are read. others, those that are not."""
+    """Fields: images and depth, the tracks that are read. others, the tracks that are not."""
 
     images: Track
     depth: Track | None
@@ -90,24 +91,24 @@ class ChosenTracks:
 
 
 def choose_tracks(tracks: Sequence[Track]) -> ChosenTracks:
-    """Choose the largest track in colour, before grey and infrared, and the 16-bit grey one whose title says depth.
+    """Choose the largest colour track, before grey and infrared, and the 16-bit grey track whose title contains depth.
 
     tracks: at least one.
     """
     grey = lambda track: track.pixels.startswith("gray")
-    rank = lambda track: (track.says_depth, track.says_infrared, grey(track), -track.width * track.height)
+    rank = lambda track: (track.titled_depth, track.titled_infrared, grey(track), -track.width * track.height)
     images = min([track for track in tracks if not track.cover] or tracks, key=rank)
-    depths = (track for track in tracks if track is not images and track.says_depth and track.may_be_depth)
+    depths = (track for track in tracks if track is not images and track.titled_depth and track.may_be_depth)
     depth = next(depths, None)
     return ChosenTracks(images, depth, tuple(track for track in tracks if track not in (images, depth)))
 
 
 @dataclass(frozen=True)
 class VideoFile:
-    """A video without ground truth; with depth if a track of it says so. Intrinsics come from a file in its folder.
+    """A video without ground truth, with depth if a track's title says so. Intrinsics come from a file in its folder.
 
-    Fields: path; name; camera; rate, frames/s; count, the container's number of frames (an estimate); tracks, those
-    that are read; given_rate, frames/s in place of the container's times.
+    Fields: path; name; camera; rate, frames/s; count, the container's number of frames (an estimate); tracks;
+    given_rate, frames/s that replaces the container's times, None to use those.
     """
 
     path: Path
@@ -121,7 +122,7 @@ class VideoFile:
 
     @classmethod
     def open(cls, path: Path, depth: bool = True) -> Self:
-        """Read the header and the first frame. depth: False to leave a track of depth alone.
+        """Read the header and the first frame. depth: False to ignore a track of depth.
 
         Raises InputError if no frame can be decoded, or the depth has another size than the images.
         """
@@ -132,30 +133,30 @@ class VideoFile:
             if first is None:
                 raise InputError(
                     f"`{path}` has no frame that can be decoded (its codec: {tracks.images.codec}): it is damaged, or "
-                    "of a kind that FFmpeg does not decode"
+                    "FFmpeg does not support it"
                 )
             width, height = _shown_size(first)
             aspect = stream.pixel_aspect if 1 / MAX_ASPECT <= stream.pixel_aspect <= MAX_ASPECT else 1.0
-            aspect = aspect if (width, height) == (first.width, first.height) else 1 / aspect
+            aspect = aspect if (width, height) == (first.width, first.height) else 1 / aspect  # the image is rotated
         if tracks.depth is not None and (tracks.depth.width, tracks.depth.height) != (width, height):
             raise InputError(
-                f"`{path}`: the depth of {tracks.depth} has another size than the images of {tracks.images}: register "
-                "it first, or leave it out with --rgb-only"
+                f"`{path}`: the depth of {tracks.depth} must have the size of the images of {tracks.images}: register "
+                "it first, or ignore it with --rgb-only"
             )
         camera = camera_from_folder(path.parent, width, height) or guess_with_warning(str(path), width, height, aspect)
         if not stream.has_times:
-            warn(f"`{path}` has no times: {stream.rate:g} frames a second are assumed; give `--fps` if it has others")
-        rate = stream.rate if 0 < stream.rate < FASTEST else _FALLBACK_RATE
+            warn(f"`{path}` has no times: {stream.rate:g} frames a second are assumed; `--fps` sets another rate")
+        rate = stream.rate if 0 < stream.rate < MAX_RATE else _FALLBACK_RATE
         return cls(path, path.name, camera, rate, max(stream.count, 1), tracks, tracks.depth is not None)
 
     def __len__(self) -> int:
         return self.count
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """See `Sequence.frames`; frames that are skipped are not converted.
+        """See `Sequence.frames`; skipped frames are decoded, but not converted to RGB.
 
-        Damaged frames, and those of another size than the first, are left out, with a LeftOutWarning. A stream that
-        ends before its container says so ends with an InputWarning.
+        Damaged frames, and those of another size than the first, are left out, with a LeftOutWarning. A stream with
+        fewer frames than its header states ends with an InputWarning.
         """
         check_selection(self.name, self.count, start, end, stride)
         return self._decode(range(start, sys.maxsize if end is None else end, stride))
@@ -165,7 +166,7 @@ class VideoFile:
 
     def _decode(self, chosen: range) -> Iterator[Frame]:
         index, time = 0, -math.inf
-        damaged: int | None = None  # the first of the frames that cannot be decoded, while they last
+        damaged: int | None = None  # the first frame of the current damaged part, None outside of one
         size, others = (self.camera.width, self.camera.height), []
         with self._streams() as (stream, depths):
             for failed, frame in stream.frames():
@@ -191,8 +192,8 @@ class VideoFile:
         if others:
             text = f"{len(others)} frames are not {size[0]} x {size[1]} pixels as the first ({others[0]})"
             warn(LeftOutWarning(f"`{self.name}`: {text}; they are skipped", len(others)))
-        if index < min(chosen.stop, self.count):  # no LeftOutWarning: an MKV of varying rate has an estimated count
-            warn(f"`{self.name}` ends after {index} frames; its header says {self.count}: is the file cut off?")
+        if index < min(chosen.stop, self.count):  # no LeftOutWarning: the count of an MKV of varying rate is a guess
+            warn(f"`{self.name}` ends after {index} frames; its header states {self.count}: is the file truncated?")
 
     @contextmanager
     def _streams(self) -> Iterator[tuple[_Stream, NearestInTime | None]]:
@@ -201,8 +202,8 @@ class VideoFile:
                 yield images, None
                 return
             with _open_stream(self.path, self.tracks.depth) as depth:
-                later = depth.start - images.start
-                yield images, NearestInTime((depth.time(frame) + later, frame) for _, frame in depth.frames())
+                offset = depth.start - images.start
+                yield images, NearestInTime((depth.time(frame) + offset, frame) for _, frame in depth.frames())
 
     def _depth(self, depths: NearestInTime, time: float) -> np.ndarray:
         """Return depth at a time of the stream, metres, NaN for none."""
@@ -212,32 +213,30 @@ class VideoFile:
         return metres_of_codes(frame.to_ndarray(format="gray16le"), MILLIMETRES)
 
     def _missed(self, failed: int, seconds: float, index: int) -> int:
-        """Return frames that are missing before one: those that failed, or those that the time since the last one
-        holds.
-        """
+        """Return how many frames are missing before a frame: the failed packets, or more if the time gap is longer."""
         passed = round(seconds * self.rate) - 1 if math.isfinite(seconds) else 0
         return max(failed, min(passed, self.count - index - 1))
 
     def _time(self, index: int, previous: float, stated: float) -> float:
-        """Return the container's time where it increases (the rate of phones varies), else by the rate."""
+        """Return the container's time if it increases (phones have a varying rate), else the time by the rate."""
         if index == 0:
             return 0.0
         if self.given_rate is not None:
             return index / self.given_rate
         return stated if stated > previous else previous + 1.0 / self.rate
 
-    def _warn_of_damage(self, chosen: range, first: int, behind: int) -> None:
-        if count := sum(index in chosen for index in range(first, behind)):
-            text = f"frames {first} to {behind - 1} cannot be decoded, or are predicted from such"
+    def _warn_of_damage(self, chosen: range, first: int, end: int) -> None:
+        if count := sum(index in chosen for index in range(first, end)):
+            text = f"frames {first} to {end - 1} cannot be decoded, or are predicted from damaged frames"
             warn(LeftOutWarning(f"`{self.name}` is damaged: {text}; they are skipped", count))
 
 
 class _Stream:
-    """One stream of an open container of `av`.
+    """One stream of an open container of PyAV.
 
-    rate: frames a second as stated, 0 for none. count: frames as stated, or by the stated duration, 0 for none. start:
-    time of the first frame, seconds of the file. pixel_aspect: width of a stored pixel over its height (1440 x 1080 are
-    shown as 16:9), 0 for none. has_times: whether the file has a container, which states the time of each frame.
+    rate: frames a second by the header, 0 if unknown. count: number of frames by the header or its duration, 0 if
+    unknown. start: time of the first frame, seconds of the file. pixel_aspect: width of a stored pixel over its height
+    (1440 x 1080 are shown as 16:9), 0 if unknown. has_times: whether the file is a container, with times of frames.
     """
 
     def __init__(self, container: Any, index: int) -> None:
@@ -254,7 +253,7 @@ class _Stream:
     def frames(self) -> Iterator[tuple[int, Any]]:
         """Yield each decoded frame, and how many packets before it could not be decoded."""
         failed = 0
-        with suppress(av.error.FFmpegError):  # of the container: there is nothing to be read behind it
+        with suppress(av.error.FFmpegError):  # an error of the container ends the stream: nothing after it is readable
             for packet in self._container.demux(self._stream):
                 try:
                     decoded = packet.decode()
@@ -272,14 +271,14 @@ class _Stream:
     def rgb(self, frame: Any) -> UInt8[np.ndarray, "h w 3"]:
         """Return the pixels of a frame, rotated as its file states."""
         turns = round(frame.rotation / 90)
-        # Of 10 bits FFmpeg's RGB differs from its BGR by up to 5: BGR is that of OpenCV. A frame's own `to_ndarray`
-        # sets the conversion up anew each time, which takes as long as the conversion.
+        # For 10-bit videos FFmpeg's RGB differs from its BGR by up to 5; BGR equals what OpenCV reads. `to_ndarray` of
+        # a frame would set up a new conversion each time, which takes as long as the conversion.
         image: Any = self._conversion.reformat(frame, format="bgr24", interpolation="BICUBIC").to_ndarray()
         image = np.ascontiguousarray(np.rot90(image, turns))
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
     def _seconds(self) -> float:
-        """Return the duration of the stream as Matroska states it, else of the whole file."""
+        """Return the duration of the stream if Matroska states it, else that of the whole file."""
         stated = re.fullmatch(r"(\d+):(\d+):([\d.]+)", self._stream.metadata.get("DURATION", ""))
         if stated is None:
             return (self._container.duration or 0) * 1e-6
@@ -292,9 +291,9 @@ def _shown_size(frame: Any) -> tuple[int, int]:
 
 
 def _open_container(path: Path) -> Any:
-    """Open a video file, a context manager; raise InputError if FFmpeg cannot."""
+    """Open a video file as a context manager; raise InputError if FFmpeg cannot."""
     try:
-        return av.open(os.path.abspath(path))  # what is before a `:` would be a protocol otherwise
+        return av.open(os.path.abspath(path))  # FFmpeg takes text before a `:` of a relative path for a protocol
     except (av.error.FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(
@@ -310,12 +309,12 @@ def _open_stream(path: Path, track: Track) -> Iterator[_Stream]:
 
 
 def _tracks(path: Path, depth: bool) -> ChosenTracks:
-    """Return the tracks that are read, with a note if there are others; raise InputError if no track is a video."""
+    """Choose the tracks, with a note if there are several; raise InputError if no track is a video."""
     with _open_container(path) as container:
         streams = enumerate(container.streams.video)
         tracks = [_track(number, stream) for number, stream in streams if stream.codec_context is not None]
     if not tracks:
-        raise InputError(f"`{path}` has no stream of video that can be decoded")
+        raise InputError(f"`{path}` has no video stream that can be decoded")
     chosen = choose_tracks(tracks)
     chosen = chosen if depth else replace(chosen, depth=None)
     if len(tracks) < 2:
@@ -326,8 +325,8 @@ def _tracks(path: Path, depth: bool) -> ChosenTracks:
     maybe = next((track for track in chosen.others if track.may_be_depth), None)
     if depth and chosen.depth is None and maybe:
         warn(
-            f"`{path}`: {maybe} may be depth (16 bits of grey), and has no title that says so: not used; `ffmpeg -i "
-            f"FILE -map 0 -c copy -metadata:s:v:{maybe.number} title=DEPTH NEW.mkv` gives it the title, for millimetres"
+            f"`{path}`: {maybe} may be depth (16 bits of grey), but is not used without the title DEPTH. If it is "
+            f"depth in millimetres: `ffmpeg -i FILE -map 0 -c copy -metadata:s:v:{maybe.number} title=DEPTH NEW.mkv`"
         )
     return chosen
 
@@ -344,5 +343,5 @@ def _check_content(path: Path) -> None:
     """Raise InputError for an empty file or text: FFmpeg draws letters, and opens lists of addresses (`m3u8`)."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
-    if not _NO_TEXT.search(head):
+    if not _NOT_TEXT.search(head):
         raise InputError(f"`{path}` is a text file; give a folder of images or a video file")

@@ -1,9 +1,7 @@
-"""Views of a sequence: with other intrinsics, without depth or ground truth, or with smaller images; and frames of any
-iterable: a list, a generator, a live camera.
+"""Views of a sequence with other intrinsics, without depth or ground truth, or with smaller images; frame streams.
 
-Images are reduced because the pipeline judges corners in pixels: pixel noise and search radii are constants, measured
-on images of 540 x 360 to 752 x 480. In the images of phones, 1920 x 1080 and more, corners are blurred over several
-pixels.
+Large images are reduced because pixel noise and search radii of the pipeline are constants in pixels, measured on
+images of 540 x 360 to 752 x 480. In images of phones, 1920 x 1080 and more, a corner is blurred over several pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +19,15 @@ import numpy as np
 
 from vggtgeo.datasets.bags import RosBag
 from vggtgeo.datasets.folder import FolderSequence
-from vggtgeo.datasets.frame import Frame, Sequence, check_depth, check_frame, check_image, check_selection, described
+from vggtgeo.datasets.frame import (
+    Frame,
+    Sequence,
+    check_depth,
+    check_frame,
+    check_image,
+    check_selection,
+    type_and_shape,
+)
 from vggtgeo.datasets.image_files import MAX_DEPTH, MIN_DEPTH
 from vggtgeo.datasets.images import FRAMES_PER_SECOND, ImageFolder, RgbdFolders
 from vggtgeo.datasets.intrinsics import check_plausible
@@ -33,7 +39,7 @@ from vggtgeo.io.argument_checks import check_positive, check_within
 from vggtgeo.io.errors import InputError, warn
 
 MIN_UNITS, MAX_UNITS = 1e-3, 1e6
-"""Units a metre of depth files."""
+"""Valid range of the units per metre of depth files."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +60,8 @@ class SequenceView:
         return len(self.source)
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """Return frames as `Sequence.frames`; those of a user's class are copied, since it may reuse one array and the
-        map keeps frames.
+        """Return frames as `Sequence.frames`. Frames of a user's class are copied: it may reuse arrays that the map
+        keeps.
         """
         frames = self.source.frames(start, end, stride)
         frames = frames if self.has_depth else (replace(frame, depth=None) for frame in frames)
@@ -90,7 +96,7 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
 
 
 def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
-    """Return the sequence whose depth files have so many units a metre: 1000 for millimetres, TUM RGB-D has 5000.
+    """Return the sequence with another unit of its depth files: 1000 per metre for millimetres, 5000 for TUM RGB-D.
 
     Raises:
         InputError: the scale is implausible, or the sequence has no such depth files.
@@ -102,10 +108,10 @@ def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:
         or type(sequence).load_depth is not FolderSequence.load_depth
         or not any(file.depth for file in sequence.files)
     ):
-        raise InputError(f"`{sequence.name}` has no depth files with a selectable unit")
+        raise InputError(f"`{sequence.name}` has no depth files whose unit can be set")
     coding = replace(sequence.depth_format, units_per_metre=units_per_metre, floats_per_metre=units_per_metre)
     scaled = replace(sequence, depth_format=coding)
-    # Floats in millimetres, read as metres, are out of range.
+    # Floats in millimetres were invalid as metres, so the depth may be usable only now.
     return replace(scaled, has_depth=sequence.has_depth or scaled.depth_is_usable())
 
 
@@ -155,14 +161,14 @@ def _reduced_frames(frames: Iterator[Frame], camera: Camera, smaller: Camera) ->
         check_frame(frame, camera)
         image = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
         depth = frame.depth
-        if depth is not None:  # a mean over an edge would be on no surface
+        if depth is not None:  # no average: at an edge it would lie between the two surfaces
             depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
         yield replace(frame, image=image, depth=depth)
 
 
 @dataclass(frozen=True, eq=False)
 class FrameStream:
-    """Frames of one camera, read once."""
+    """Frames of one camera that can be read only once."""
 
     camera: Camera
     has_depth: bool
@@ -175,19 +181,19 @@ class FrameStream:
 
 
 def frame_stream(frames: Iterable[Any], camera: Camera | None = None) -> FrameStream:
-    """Return frames of any iterable, which is read one frame ahead.
+    """Return a stream of the frames of any iterable: a list, a generator, a live camera. One frame is read at once.
 
     Args:
-        frames: of `Frame`; or images, uint8 [H, W, 3] RGB, 30 a second; or pairs of an image and depth, float [H, W]
-            metres with NaN for none. They are copied: a camera may reuse one array.
-        camera: of all frames; None: a guess from the size of the first image, and intrinsics are estimated.
+        frames: an iterable of `Frame`; or images, uint8 [H, W, 3] RGB, 30 a second; or pairs of an image and depth,
+            float [H, W] metres with NaN for none. They are copied: a camera may reuse one array.
+        camera: of all frames; None for a guess from the size of the first image.
 
     Raises:
         InputError: there is no frame, or one has another type.
 
     """
     if not isinstance(frames, Iterable):
-        raise InputError(f"`frames` is {described(frames)}; give a folder, a video file, or images one after another")
+        raise InputError(f"`frames` must be a folder, a video file or an iterable, got {type_and_shape(frames)}")
     counted = (_frame(item, index) for index, item in enumerate(frames))
     first = next(counted, None)
     if first is None:
@@ -203,22 +209,22 @@ def _in_order(frames: Iterator[Frame]) -> Iterator[Frame]:
     for frame in frames:
         if frame.index <= last:
             raise InputError(
-                f"`{frame.name}` has the index {frame.index} after {last}; number the frames from 0 on, as `enumerate` "
-                "does"
+                f"the index of `{frame.name}` must be above {last}, got {frame.index}: number the frames from 0 on, as "
+                "`enumerate` does"
             )
         yield frame
         last = frame.index
 
 
 def _warn_of_unit(frame: Frame) -> None:
-    """Warn of depth without a value in range; all NaN is valid."""
+    """Warn if all depth is outside the valid range, as in millimetres; all NaN is valid."""
     depth = frame.depth
     if not isinstance(depth, np.ndarray) or depth.dtype.kind != "f" or np.isnan(depth).all():
         return
     if not ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
         warn(
-            f"the depth of `{frame.name}` goes from {np.nanmin(depth):g} to {np.nanmax(depth):g}; it is used from "
-            f"{MIN_DEPTH:g} to {MAX_DEPTH:g} m: are these metres (millimetres: divide by 1000.0)?"
+            f"the depth of `{frame.name}` must be from {MIN_DEPTH:g} to {MAX_DEPTH:g} m, got {np.nanmin(depth):g} to "
+            f"{np.nanmax(depth):g}: is it in metres (millimetres: divide by 1000.0)?"
         )
 
 

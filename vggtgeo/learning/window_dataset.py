@@ -24,7 +24,7 @@ from vggtgeo.bundle.padding import SlotIndex
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.problem_file import load_arrays, save_problem
 from vggtgeo.datasets.frame import Frame
-from vggtgeo.datasets.image_files import is_there
+from vggtgeo.datasets.image_files import path_exists
 from vggtgeo.io.argument_checks import path_of
 from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import whole_text, write_json
@@ -78,7 +78,7 @@ class WindowWriter:
         """Write a packed window and its labels (arrays of one shape for all windows)."""
         problem, initial, index = window
         arrays = {name: np.asarray(value) for name, value in labels.items()}
-        if not self.count and is_there(self.folder / _name(0)):
+        if not self.count and path_exists(self.folder / _name(0)):
             raise InputError(f"`{self.folder}` holds windows already; give a new folder")
         leaves, structure = jax.tree.flatten((problem, initial))
         kinds = [(np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves]
