@@ -17,8 +17,8 @@ from vggtgeo.io.files import locked
     [
         (("nosuch",), "`nosuch`"),
         (("quick", "--sequences", "attic"), "`sequences` must be of office"),
-        (("quick", "--data", "/no/such/place"), "`data` is `/no/such/place`, which is not a folder"),
-        (("quick", "--timeout-minutes", "0"), "`timeout_minutes` is 0.0; it must be positive"),
+        (("quick", "--data", "/no/such/place"), "`data` must be a folder, got `/no/such/place`"),
+        (("quick", "--timeout-minutes", "0"), "`timeout_minutes` must be positive, got 0.0"),
         (("quick", "-o", "/proc/nowhere"), "`/proc/nowhere` cannot be written"),
     ],
 )

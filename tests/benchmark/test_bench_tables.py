@@ -100,7 +100,7 @@ def test_the_tables_say_what_makes_a_row_doubtful() -> None:
     text = report.markdown(tiny.suite(), [good, gone, other])
     assert "## Warnings" in text
     assert "| walk | full | 0 | the scale is 7 |" in text
-    assert "1 run, 1 more without their recording, 1 of other systems." in text
+    assert "1 run, 1 more without a recording, 1 of other systems." in text
     assert "## Warnings" not in report.markdown(tiny.suite(), ROWS)
 
 

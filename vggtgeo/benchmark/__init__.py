@@ -9,9 +9,9 @@
 | `cluster` | the same on a Ray cluster |
 | `provenance` | versions, machine, digests of inputs |
 | `rows` | the rows of all runs: CSV and Parquet; means, intervals, paired differences |
-| `tables`, `figures` | what the report shows; figures published by others in tables of their own |
+| `tables`, `figures` | content of the report; published results of other systems in separate tables |
 | `report` | the report as Markdown and as HTML |
-| `runner` | all of it, with trajectories of other systems: `vggtgeo.bench` |
+| `runner` | `vggtgeo.bench`: runs, tables and trajectories of other systems |
 
 The package is not called `bench`, as `vggtgeo.bench` is the function.
 """

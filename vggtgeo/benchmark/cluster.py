@@ -1,8 +1,8 @@
 """Run a suite on a Ray cluster (extra `cluster`): each run is a task with processors and, optionally, a GPU.
 
-A task starts the same process with the same limits as `processes`, and returns its row and its small files, which the
-driver writes into the store. Ray restarts tasks whose worker or node is lost; each result is stored once. Recordings
-must have the same path on every node. If the driver dies, call it again.
+A task starts the same process with the same limits as `processes`, and returns its row and its small files. The driver
+writes them into the store. Ray restarts tasks whose worker or node is lost; each result is stored once. Recordings must
+have the same path on every node. If the driver ends early, call it again: finished runs are kept.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path
 
 RETRIES = 3
-"""Of a task whose worker or node is lost."""
+"""Maximum number of restarts of a task whose worker or node is lost."""
 MAX_FILE_SIZE = 2**24
-"""Bytes: larger files (maps, recordings) are not returned, and are deleted on the node."""
+"""Bytes. Larger files (maps, recordings) are not returned and are deleted on the node."""
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """address: of the cluster's head; "auto" for the one of this machine, "local" to start one. cpus, gpus: per run."""
+    """A Ray cluster. address: of its head; "auto" for this machine's, "local" to start one. cpus, gpus: per run."""
 
     address: str = "auto"
     cpus: float = 1.0
@@ -48,7 +48,7 @@ def run_jobs_on_cluster(
 ) -> None:
     """Run `jobs` on the cluster, and store their rows as they finish.
 
-    InputError if Ray is not installed, or no cluster answers at the address.
+    Raises InputError if Ray is not installed, or no cluster answers at the address.
     """
     if not jobs:
         return
@@ -71,7 +71,7 @@ def run_jobs_on_cluster(
 
 
 def run_remotely(job: str, limits: Limits, command: Command, cpus: float) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Run a job on this node; return how it ended, and its files by name."""
+    """Run a job on this node; return the columns on how it ended, and its files by name."""
     with tempfile.TemporaryDirectory(prefix="vggtgeo-bench-") as made:
         place, scratch = Path(made) / json.loads(job)["name"], Path(made) / "scratch"
         place.mkdir()
@@ -106,7 +106,7 @@ def _connect(cluster: Cluster) -> Any:
         raise InputError(f"a cluster needs Ray; {install_hint('cluster')}") from None
     host, colon, port = cluster.address.rpartition(":")
     try:
-        if colon and port.isdigit() and "://" not in host:  # Ray itself would try for minutes
+        if colon and port.isdigit() and "://" not in host:  # fails at once, where Ray would retry for minutes
             socket.create_connection((host, int(port)), timeout=5.0).close()
         ray.init(address=cluster.address, log_to_driver=False)
     except (OSError, ValueError) as error:

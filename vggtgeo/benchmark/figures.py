@@ -1,4 +1,4 @@
-"""The drawings of a suite: ablations, paths, errors along the path, time and memory."""
+"""Figures of a suite: ablations, paths, errors over time, run time and memory."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
 _ROW, _LINE, _MARGIN = 0.3, 0.15, 0.9
-"""Inches."""
+"""Height of a row, of a further line of its label, and of the margins of a panel, inches."""
 _LABEL, _TITLE, _ENTRY = 30, 60, 44
-"""Letters of a line of a label beside an axis, of a title, of an entry of a legend: with longer ones axes collapse."""
+"""Maximum letters in a line of an axis label, a title, a legend entry: longer ones leave no room for the axes."""
 _MIN_SPAN = 2.5
-"""Factor between the ends of an axis of errors: a difference of a thousandth is not drawn as others are, and one of the
-ticks at 1, 2 and 5 lies within."""
+"""Minimum ratio of the ends of an axis of errors, so that tiny differences look tiny, and a tick at 1, 2 or 5 is
+visible."""
 _MAX_LINES = 8
 MIN_POSES = 3
-"""Of a path that is drawn: fewer cannot be aligned."""
+"""Minimum number of poses of a path: fewer cannot be aligned."""
 
 
 def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
-    """Draw the error of each setting (logarithmic), a panel a sequence.
+    """Draw the error of each setting on a logarithmic axis, one panel for each sequence.
 
-    A dot is a run, a bar the mean with its interval.
+    A dot is a run, a bar the mean with its 95 % interval.
     """
     good = [row for row in rows if row["status"] == "ok"]
     column = headline(good)
@@ -45,7 +45,7 @@ def ablation_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> No
         for name in tables.sequences_of(suite, good)
     }
     panels = {name: keys for name, keys in panels.items() if keys}
-    coverage = lambda own: "" if tables.is_covered(own) else tables.at_coverage(own)  # if too small for a comparison
+    coverage = lambda own: "" if tables.is_covered(own) else tables.at_coverage(own)  # shown only if it is too small
     label = lambda name, key: f"{suite.title_of(key)}{coverage(select(good, name, key))}"
     rows_of = {name: [_wrapped(label(name, key), _LABEL) for key in keys] for name, keys in panels.items()}
     heights = [_height(labels) + _MARGIN for labels in rows_of.values()]
@@ -67,7 +67,7 @@ def _wrapped(text: str, width: int) -> str:
 
 
 def _height(labels: Sequence[str]) -> float:
-    """Return the height of as many rows, inches; all are as high as the one whose label has most lines."""
+    """Return the height of a panel, inches; all rows have the height of the longest label."""
     return (_ROW + _LINE * max((label.count("\n") for label in labels), default=0)) * len(labels)
 
 
@@ -105,8 +105,8 @@ def _draw_panel(axes: Any, suite: Suite, errors: Sequence[np.ndarray], keys: Seq
 
 
 @dataclass(frozen=True, eq=False)
-class Path3:
-    """An estimate after alignment, the truth it is compared with, and the error of each pose, metres."""
+class AlignedPath:
+    """An aligned estimate, the ground truth, and the error of each pose, metres."""
 
     title: str
     estimate: Trajectory
@@ -114,17 +114,17 @@ class Path3:
     errors: np.ndarray
 
 
-def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[Path3]:
-    """Return the first run of each setting on a sequence with a trajectory that can be aligned with the truth."""
-    found: list[Path3] = []
+def paths(suite: Suite, rows: Sequence[Row], sequence: str, folder: Path) -> list[AlignedPath]:
+    """Return for each setting the first run on a sequence whose trajectory can be aligned with the ground truth."""
+    found: list[AlignedPath] = []
     for setting in tables.settings_of(suite, rows):
         drawn = (_path(suite, row, folder) for row in select(rows, sequence, setting))
         found += islice((one for one in drawn if one is not None), 1)
     return found[:_MAX_LINES]
 
 
-def _path(suite: Suite, row: Row, folder: Path) -> Path3 | None:
-    """Return the trajectory of a run; None if it has none, or too few of its poses have a truth to be aligned."""
+def _path(suite: Suite, row: Row, folder: Path) -> AlignedPath | None:
+    """Return the aligned trajectory of a run; None if it has none, or too few poses with ground truth."""
     runs, name = folder / "runs", run_name(row)
     own, others = runs / name / "truth.txt", sorted(runs.glob(f"{row['sequence']}.*.{row['seed']}/truth.txt"))
     try:
@@ -137,11 +137,11 @@ def _path(suite: Suite, row: Row, folder: Path) -> Path3 | None:
     if len(matched) < MIN_POSES:
         return None
     title = suite.title_of(str(row["setting"])).replace("`", "")
-    return Path3(title, error.alignment.trajectory(matched), truth, error.errors)
+    return AlignedPath(title, error.alignment.trajectory(matched), truth, error.errors)
 
 
-def paths_figure(given: Sequence[Path3]) -> NotebookFigure:
-    """Draw the paths from above, with the truth, and the error along the time."""
+def paths_figure(given: Sequence[AlignedPath]) -> NotebookFigure:
+    """Draw the paths and the ground truth from above, and the errors over time."""
     figure = NotebookFigure(figsize=(5.0, 6.25), layout="constrained")
     above, along = figure.subplots(2, 1, height_ratios=(2.0, 1.0))
     view, origin = view_axes(given[0].truth, level_world=True), given[0].truth.positions[0]
@@ -162,18 +162,18 @@ def paths_figure(given: Sequence[Path3]) -> NotebookFigure:
     return figure
 
 
-_STAGES_LEFT_OUT = frozenset({"seconds_all", "seconds_wall", "seconds_process"})
+_TOTALS = frozenset({"seconds_all", "seconds_wall", "seconds_process"})
 
 
 def cost_figure(suite: Suite, rows: Sequence[Row], width: float = 8.5) -> NotebookFigure:
-    """Draw the seconds of each stage, and the peak memory, means over runs; a row a sequence and setting."""
+    """Draw mean seconds of each stage and mean peak memory, one row for each sequence and setting."""
     groups = [
         (_wrapped(f"{sequence}, {suite.title_of(setting)}", _LABEL), own)
         for sequence in tables.sequences_of(suite, rows)
         for setting in tables.settings_of(suite, rows)
         if (own := [row for row in select(rows, sequence, setting) if not row.get("external")])
     ]
-    names = {name for row in rows for name in row if name.startswith("seconds_")} - _STAGES_LEFT_OUT
+    names = {name for row in rows for name in row if name.startswith("seconds_")} - _TOTALS
     totals = {name: float(np.nansum([_mean(own, name) for _, own in groups])) for name in names}
     stages = [
         name for name in sorted(names, key=lambda name: -totals[name]) if totals[name] > 0.01 * sum(totals.values())

@@ -1,4 +1,4 @@
-"""The input of a benchmark run: a recording or a rendered walk, its exact depth, and the perception roles."""
+"""Open the input of a benchmark run: a recording or a rendered walk, its exact depth, and the perception roles."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from filelock import FileLock
 from vggtgeo.benchmark.suite import WalkTable
 from vggtgeo.datasets import Sequence, SequenceView, open_sequence, without_depth
 from vggtgeo.datasets.frame import Frame, check_selection
-from vggtgeo.datasets.image_files import is_there
+from vggtgeo.datasets.image_files import path_exists
 from vggtgeo.datasets.tanks import TanksAndTemples
 from vggtgeo.evaluation import nearest_in_time
 from vggtgeo.geometry import rigid
@@ -28,7 +28,7 @@ from vggtgeo.io.files import atomic_open
 from vggtgeo.models.classical import ConstantVelocity, PnpGeometry
 from vggtgeo.models.roles import InitialGeometry
 from vggtgeo.models.window_locator import WindowLocator
-from vggtgeo.report.map_scene import spread
+from vggtgeo.report.map_scene import evenly_spaced
 from vggtgeo.simulation import SimulatedOracle, simulate
 from vggtgeo.simulation.degradations import DEGRADATIONS, Recording
 from vggtgeo.simulation.stubs import SimulatedDino, SimulatedLetr, SimulatedMast3r, SimulatedMoge, SimulatedVggt
@@ -40,11 +40,11 @@ DATA_VARIABLE = "VGGTGEO_DATA"
 
 
 def data_folders(given: Iterable[str | os.PathLike[str]] | None) -> tuple[Path, ...]:
-    """Return the folders of recordings: those given, else those of `$VGGTGEO_DATA` (separated by `:`), else `data`."""
+    """Return the folders of recordings: `given`, else those in `$VGGTGEO_DATA` (separated by `:`), else `data`."""
     if given is not None:
         folders = tuple(Path(path).expanduser() for path in given)
         if files := [folder for folder in folders if not folder.is_dir()]:
-            raise InputError(f"`data` is `{files[0]}`, which is not a folder")
+            raise InputError(f"`data` must be a folder, got `{files[0]}`")
         return folders
     named = os.environ.get(DATA_VARIABLE, "data").split(os.pathsep)
     return tuple(Path(name).expanduser() for name in named if name and Path(name).expanduser().is_dir())
@@ -53,22 +53,22 @@ def data_folders(given: Iterable[str | os.PathLike[str]] | None) -> tuple[Path, 
 def find_sequences(path: str, folders: Iterable[Path]) -> list[Path]:
     """Return all existing `folder / path`, the preferred one first.
 
-    Up to two folders may be in between: that of the benchmark, and that of the scene.
+    Up to two levels of folders may be in between: one of the benchmark, one of the scene.
     """
     wanted = Path(path).expanduser()
     if wanted.is_absolute():
-        return [wanted.resolve()] if is_there(wanted) else []
+        return [wanted.resolve()] if path_exists(wanted) else []
     parents = [one for folder in folders for one in (folder, *sorted(folder.glob("*")), *sorted(folder.glob("*/*")))]
-    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if is_there(parent / wanted)))
+    return list(dict.fromkeys((parent / wanted).resolve() for parent in parents if path_exists(parent / wanted)))
 
 
 @dataclass(frozen=True, eq=False)
 class Input:
     """The input of a run.
 
-    Fields: sequence; perception; exact, depth and poses of the true surfaces, of an undegraded rendered walk or a
-    recording with exact depth; scan, of a scanned scene; simulated, whether the sequence is rendered; references, other
-    ground truths by name.
+    Fields: sequence; perception; exact, true depth and poses of an undegraded rendered walk or a recording with exact
+    depth; scan, of a scanned scene; simulated, whether the sequence is rendered; references, other ground truths by
+    name.
     """
 
     sequence: Sequence
@@ -92,24 +92,24 @@ def open_input(spec: Mapping[str, Any], seed: int, scratch: Path | None = None) 
     if not spec["simulate"]:
         with_depth = spec["exact_depth"] or not spec["rgb_only"]
         recorded = open_sequence(spec["path"], spec["kind"], depth=with_depth)
-        sequence = _without(recorded, spec)
+        sequence = _with_hidden_inputs(recorded, spec)
         exact = RecordedFrames.of(recorded) if spec["exact_depth"] else None
         scan = recorded if isinstance(recorded, TanksAndTemples) else None
-        # Read scan and references now: an error after the run would cost hours.
+        # Read scan and references before the run, which may take hours, so that errors are found early.
         if scan is not None:
             scan.scanned_points()
         references = {name: Trajectory.load_tum(Path(spec["path"]) / file) for name, file in spec["references"].items()}
-        return Input(sequence, _perceived(spec, sequence.has_depth), exact, scan, references=references)
+        return Input(sequence, _perception_of(spec, sequence.has_depth), exact, scan, references=references)
     (rendered, oracle), is_plain = _rendered(spec["simulate"], seed, scratch), spec["degrade"] == "base"
     if spec["perception"] == "simulated":
         if not is_plain:
             raise InputError(
-                f"`degrade` is {spec['degrade']!r}, but simulated roles use the undegraded images; leave it out, or "
-                "use other roles"
+                f"`degrade` must be 'base' for simulated roles, which use the undegraded images, got "
+                f"{spec['degrade']!r}: leave it out, or use other roles"
             )
         return Input(rendered, Perception(simulated_roles(oracle, spec, seed), {}), oracle, simulated=True)
-    sequence = _without(rendered if is_plain else degraded(rendered, spec["degrade"], seed), spec)
-    return Input(sequence, _perceived(spec, sequence.has_depth), oracle if is_plain else None, simulated=True)
+    sequence = _with_hidden_inputs(rendered if is_plain else degraded(rendered, spec["degrade"], seed), spec)
+    return Input(sequence, _perception_of(spec, sequence.has_depth), oracle if is_plain else None, simulated=True)
 
 
 def walk_name(simulate: Mapping[str, Any], seed: int) -> str:
@@ -122,7 +122,7 @@ def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> tupl
     if scratch is None:
         return _render(table, seed)
     kept = scratch / walk_name(table, seed)
-    with FileLock(kept.with_suffix(".lock")):  # of the runs on one walk, one renders it
+    with FileLock(kept.with_suffix(".lock")):  # several runs may need the same walk: one renders it
         if not kept.is_file():
             with atomic_open(kept, "wb") as stream:
                 pickle.dump(_render(table, seed), stream, pickle.HIGHEST_PROTOCOL)
@@ -132,10 +132,10 @@ def _rendered(table: Mapping[str, Any], seed: int, scratch: Path | None) -> tupl
 
 
 def _render(table: Mapping[str, Any], seed: int) -> tuple[RenderedWalk, SimulatedOracle]:
-    asked = WalkTable(**table)
-    size = asked.size[0], asked.size[1]
-    rendered = simulate(asked.scene, asked.frames, seed, size, rate=asked.rate, speed=asked.speed)
-    oracle = SimulatedOracle(rendered, kept=asked.frames)
+    walk = WalkTable(**table)
+    size = walk.size[0], walk.size[1]
+    rendered = simulate(walk.scene, walk.frames, seed, size, rate=walk.rate, speed=walk.speed)
+    oracle = SimulatedOracle(rendered, kept=walk.frames)
     recording = Recording(list(oracle.frames()), oracle.camera, oracle.ground_truth())
     return RenderedWalk(oracle.name, recording), oracle
 
@@ -144,7 +144,7 @@ def _render(table: Mapping[str, Any], seed: int) -> tuple[RenderedWalk, Simulate
 class RenderedWalk:
     """A rendered walk in memory, so that a run's time excludes rendering: 3 MB per frame of 320 x 240.
 
-    If it is degraded, its camera is the one that a user would assume.
+    Of a degraded walk the camera is what a user would believe: it does not know of the degradation.
     """
 
     name: str
@@ -171,13 +171,13 @@ class RenderedWalk:
 
 
 def degraded(walk: RenderedWalk, name: str, seed: int) -> RenderedWalk:
-    """Return the walk after the degradation `name`, with noise from the seed."""
+    """Apply the degradation `name` to a walk, with noise of the given seed."""
     changed = DEGRADATIONS[name](walk.recording, np.random.default_rng([seed, 23]))
     return RenderedWalk(f"{walk.name}, {name}", changed)
 
 
 def simulated_roles(oracle: SimulatedOracle, spec: Mapping[str, Any], seed: int) -> Roles:
-    """Return the five stubs with their standard error models; depth errors are scaled by the setting's factor."""
+    """Return stubs of the five roles with their standard error models; the setting scales the depth errors."""
     moge, factor = SimulatedMoge(oracle, seed), spec["depth_errors"]
     starts: dict[str, InitialGeometry] = {
         "constant-velocity": ConstantVelocity(),
@@ -194,7 +194,7 @@ def simulated_roles(oracle: SimulatedOracle, spec: Mapping[str, Any], seed: int)
     )
 
 
-def _without(sequence: Sequence, spec: Mapping[str, Any]) -> Sequence:
+def _with_hidden_inputs(sequence: Sequence, spec: Mapping[str, Any]) -> Sequence:
     """Return the sequence without the depth or the calibration that the spec hides."""
     if spec["rgb_only"]:
         sequence = without_depth(sequence)
@@ -204,16 +204,16 @@ def _without(sequence: Sequence, spec: Mapping[str, Any]) -> Sequence:
     return sequence
 
 
-def _perceived(spec: Mapping[str, Any], has_depth: bool) -> Perception:
+def _perception_of(spec: Mapping[str, Any], has_depth: bool) -> Perception:
     if spec["perception"] == "simulated":
-        raise InputError("`perception` is 'simulated', which needs a rendered walk: a sequence with `simulate`")
+        raise InputError("`perception` must not be 'simulated' for a recording: it needs a sequence with `simulate`")
     names = {"points": spec["features"], "geometry": spec["start_of_pose"]}
     mixed = {role: name for role, name in names.items() if name not in ("sift", "pnp")}
     return perception(spec["perception"], default_roles(has_depth), mixed=mixed)
 
 
 _DELAY = 0.005
-"""Largest time between a frame and its true pose, seconds: rendered ones are simultaneous."""
+"""Maximum time between a frame and its true pose, seconds; those of rendered sequences are simultaneous."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,14 +225,15 @@ class RecordedFrames:
 
     @classmethod
     def of(cls, sequence: Sequence) -> RecordedFrames | None:
-        """Return the frames; None without depth or ground truth. InputError for a distorted camera: maps are of
-        undistorted images.
+        """Return the frames; None without depth or ground truth.
+
+        Raises InputError for a distorted camera, since depth is compared in undistorted images.
         """
         truth = sequence.ground_truth()
         if truth is None or not sequence.has_depth:
             return None
         if sequence.camera.distorts:
-            raise InputError(f"`exact_depth` is for undistorted images, `{sequence.name}` is distorted; leave it out")
+            raise InputError(f"`exact_depth` must be false for `{sequence.name}`, whose camera has a distortion")
         return cls(sequence, truth)
 
     @property
@@ -266,7 +267,7 @@ def exact_cloud(frames: ExactFrames) -> np.ndarray:
     step = 4
     fx, fy, cx, cy = frames.camera.intrinsics
     clouds = []
-    for index in spread(len(frames), 30):
+    for index in evenly_spaced(len(frames), 30):
         depth, pose = frames.depth(int(index))[::step, ::step], frames.pose(int(index))
         v, u = np.nonzero(np.isfinite(depth) & np.isfinite(pose).all())
         z = depth[v, u]

@@ -1,4 +1,4 @@
-"""Expand a suite into runs, each with everything its result depends on, and keep finished ones as folders."""
+"""Expand a suite into runs, and store finished runs as folders."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from vggtgeo.slam.settings.table import changed, updated
 
 @dataclass(frozen=True)
 class Job:
-    """One run. spec: everything it depends on, plain values; its `path` is None if the recording is missing. absent:
-    message for that case.
+    """One run. spec: everything that its result depends on, as plain values; `path` is None for a missing recording.
+    absent: message for a missing recording.
     """
 
     sequence: str
@@ -48,7 +48,7 @@ class Job:
 
     def fingerprint(self, source: str) -> str:
         """Return a digest of everything that the result depends on; source: digest of the code."""
-        spec = {key: value for key, value in self.spec.items() if key != "path"}  # recordings may be moved
+        spec = {key: value for key, value in self.spec.items() if key != "path"}  # a moved recording is the same
         parts = [self.sequence, self.setting, self.seed, spec, self.input_hash, source]
         text = json.dumps(parts, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -102,7 +102,7 @@ _OF_SEQUENCE = ("kind", "degrade", "start", "end", "key_points", "threshold", "v
 
 @dataclass(frozen=True)
 class Store:
-    """Runs of a suite in `folder`/runs. source: digest of the code that computes; see `Job.fingerprint`."""
+    """Stored runs of a suite, in `folder`/runs. source: digest of the code, see `Job.fingerprint`."""
 
     folder: Path
     suite: str
@@ -113,9 +113,9 @@ class Store:
         return self.folder / "runs" / job.name
 
     def load(self, job: Job, retry: bool = False) -> Row | None:
-        """Return the row of a finished run; None if it is missing, or of other settings, inputs or code.
+        """Return the row of a finished run; None if it is missing, or has other settings, inputs or code.
 
-        retry: also None for a run that ended without a result. InputError for a damaged file.
+        retry: also return None for a run that ended without a result. Raises InputError for a damaged file.
         """
         path = self.place(job) / ROW
         if not path.is_file():
@@ -135,7 +135,7 @@ class Store:
         return place
 
     def complete(self, job: Job, **columns: Any) -> Row:
-        """Write and return the run's row with `columns`; if the run wrote none, a row with its status."""
+        """Add `columns` to the run's row, write and return it. The run's own status and message have priority."""
         path = self.place(job) / ROW
         row = json.loads(whole_text(path, errors="strict")) if path.is_file() else identity(self.describe(job))
         if "status" in row:
@@ -146,7 +146,7 @@ class Store:
         return row
 
     def absent(self, job: Job) -> Row:
-        """Return the row of a run whose recording is missing; not stored, so that the next call looks again."""
+        """Return the row of a run whose recording is missing; it is not stored, so that the next call tries again."""
         return {**identity(self.describe(job)), "status": "absent", "message": job.absent}
 
     def describe(self, job: Job) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Errors and costs of a finished run as one row: SI units, degrees; None if undefined."""
+"""Compute errors and costs of a finished run as one row: SI units, degrees; None if undefined."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from vggtgeo.evaluation.alignment import AXES, Axis
 from vggtgeo.evaluation.pose_errors import Unit
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.report.map_scene import spread
+from vggtgeo.report.map_scene import evenly_spaced
 from vggtgeo.results.result import Result
 
 DELTAS: tuple[tuple[str, float, Unit], ...] = (("1s", 1.0, "seconds"), ("1m", 1.0, "metres"))
-"""Of RTE and RRE: column suffix, delta and its unit."""
+"""Column suffix, delta and its unit of the relative errors, RTE and RRE."""
 NOT_COMPARABLE = "not comparable"
 """Status of a row whose errors are meaningless, for the reasons in its message."""
 _MARGIN = 0.02
@@ -39,7 +39,7 @@ _MARGIN = 0.02
 
 
 def measure(result: Result, given: Input, spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a run; numbers that it cannot have (errors without ground truth) are left out."""
+    """Return the row of a run, without columns that cannot be computed (errors without ground truth)."""
     summary = result.summary
     row: dict[str, Any] = {
         "verdict": result.verdict.level,
@@ -78,8 +78,8 @@ def focal_error(estimated: Sequence[float], true: Sequence[float]) -> float:
 def mean_nees(result: Result, truth: Trajectory, scale: float) -> dict[str, Any]:
     """Return the mean NEES of positions and of rotations, divided by its three degrees of freedom.
 
-    1 if the run's standard deviations match its errors, more if they are too small. scale: of the Sim(3) alignment,
-    applied to a run of free scale.
+    It is 1 if the run's standard deviations match its errors, and larger if they are too small. scale: of the Sim(3)
+    alignment, applied to a run of unknown scale.
     """
     stated = result.uncertainty
     if stated is None:
@@ -93,7 +93,7 @@ def mean_nees(result: Result, truth: Trajectory, scale: float) -> dict[str, Any]
 
 
 def truth_of_run(result: Result, truth: Trajectory | None) -> Trajectory | None:
-    """Return the ground truth between the first and the last frame of the run (all if there is none); None without."""
+    """Return the ground truth between the first and last frame of the run (all if no pose is); None if unknown."""
     if truth is None or result.record is None:
         return truth
     frames, times = result.record.slam.frames, truth.timestamps
@@ -106,8 +106,8 @@ def trajectory_errors(
 ) -> tuple[dict[str, Any], Similarity | None]:
     """Return ATE after each alignment, RTE and RRE at `DELTAS`, and the alignment for maps.
 
-    That is SE(3) for a metric estimate, else Sim(3), also for the relative errors. Meaningless errors get a status and
-    a message.
+    The alignment for maps and relative errors is SE(3) for a metric estimate, else Sim(3). If errors are meaningless,
+    the row has a status and a message.
     """
     try:
         report = evaluate_trajectory(estimate, truth, vertical=AXES[vertical])
@@ -151,7 +151,7 @@ def _plain(value: Any) -> Any:
 
 _DEPTH_MAPS = 40  # keyframes whose depth is compared, evenly spaced: more change the mean little
 _MAX_POINTS = 200_000
-"""Of each cloud: a tenth of the points changes the distances in the third digit."""
+"""Points of each compared cloud: with a tenth of them the distances change in the third digit."""
 
 
 def depth_errors(result: Result, given: Input, alignment: Similarity) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def depth_errors(result: Result, given: Input, alignment: Similarity) -> dict[st
     if given.exact is None or result.record is None:
         return {}
     pairs = list(zip(result.record.slam.keyframes, result.record.dense.depth_maps, strict=True))
-    chosen = [pairs[row] for row in spread(len(pairs), _DEPTH_MAPS)]
+    chosen = [pairs[row] for row in evenly_spaced(len(pairs), _DEPTH_MAPS)]
     fused = [(keyframe.frame, None if depth_map is None else depth_map.depth) for keyframe, depth_map in chosen]
     before = [(keyframe.frame, keyframe.depth) for keyframe, _ in chosen]
     return pooled_depth_errors(fused, before, given.exact, alignment.scale)
@@ -171,8 +171,8 @@ _Depths = Sequence[tuple[int, np.ndarray | None]]
 def pooled_depth_errors(fused: _Depths, before: _Depths, exact: ExactFrames, scale: float) -> dict[str, Any]:
     """Return errors over all pixels of (frame index, depth) pairs, with depth multiplied by `scale`.
 
-    `depth_prior_rmse_m` is that of `before`. Exact depth is reduced to the size of the depth by nearest neighbour
-    (`camera.max_pixels`).
+    `depth_prior_rmse_m` is the error of `before`. Exact depth is reduced by nearest neighbour to the size of the depth,
+    which depends on `camera.max_pixels`.
     """
     resized = lambda truth, like: cv2.resize(truth, like.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     found, prior = (
@@ -226,7 +226,7 @@ def scan_errors(points: Float[np.ndarray, "n 3"], scan: TanksAndTemples, thresho
     truth = scan.scanned_points()
     if truth is None:
         return {}
-    inside = points[scan.judged(points)]
+    inside = points[scan.in_evaluation_volume(points)]
     if not len(inside):
         return {"f_score": 0.0, "precision": 0.0, "recall": 0.0, "threshold_m": threshold}
     return _columns(cloud_error(thinned(inside, threshold / 2), thinned(truth, threshold / 2), threshold))

@@ -36,15 +36,14 @@ Command = Callable[[Path, Path], Sequence[str]]
 """Returns the command line of a run for its folder and the scratch folder."""
 Finished = Callable[[Job, Row], None]
 _TAIL = 2000  # characters at the end of a log that are searched for its last line
-_POLL = 0.02
-_MEMORY_POLL = 0.25
-"""Seconds between two polls; measuring the memory of a process and its children takes half a millisecond."""
+_POLL, _MEMORY_POLL = 0.02, 0.25
+"""Seconds between two polls of a process, and of its memory, which takes half a millisecond."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """seconds: of one try. memory_gb: resident memory of the process and its children. retries: after a signal from
-    outside (SIGKILL, SIGTERM, SIGHUP), for example a preempted cluster node, or the kernel's out-of-memory killer.
+    """Limits of a run. seconds: of one try. memory_gb: resident memory of the process and its children. retries: after
+    a signal from outside (SIGKILL, SIGTERM, SIGHUP), as of a preempted node or the kernel's out-of-memory killer.
     """
 
     seconds: float
@@ -56,8 +55,8 @@ class Limits:
 class Ending:
     """How a process ended.
 
-    Fields: status, "ended" (by itself, see code), "timeout", "memory", or "killed" by a signal from outside; code, the
-    exit status, or minus the signal's number; seconds, of the last try; peak_gb, largest resident memory; tries.
+    Fields: status, "ended" (by itself, see code), "timeout", "memory", or "killed" by a signal from outside; code, exit
+    status, or the negative number of a signal; seconds, of the last try; peak_gb, maximum resident memory; tries.
     """
 
     status: str
@@ -103,7 +102,7 @@ def run_limited(
 def _once(
     command: Sequence[str], log: Path, limits: Limits, cores: Sequence[int], stop: threading.Event | None
 ) -> Ending:
-    began = looked = time.monotonic()
+    began = measured = time.monotonic()
     peak = 0.0
     with _started(command, log, cores) as process:
         while True:
@@ -114,8 +113,8 @@ def _once(
                 return Ending("ended", process.returncode, now - began, max(peak, rusage_gb(usage.ru_maxrss)))
             if now - began > limits.seconds:
                 return Ending("timeout", 0, now - began, peak)
-            if now - looked > _MEMORY_POLL:
-                looked, peak = now, max(peak, _resident_gb(process.pid))
+            if now - measured > _MEMORY_POLL:
+                measured, peak = now, max(peak, _resident_gb(process.pid))
                 if peak > limits.memory_gb:
                     return Ending("memory", 0, now - began, peak)
             if stop is not None and stop.is_set():
@@ -173,8 +172,8 @@ def claim_cores(count: int) -> Iterator[tuple[int, ...]]:
         yield tuple(found)
 
 
-def shares(workers: int) -> list[tuple[int, ...]]:
-    """Return the processors of each of `workers` processes, in equal shares; empty shares if there are too few."""
+def core_shares(workers: int) -> list[tuple[int, ...]]:
+    """Divide the processors equally among `workers` processes; all shares are empty if there are too few."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     each = len(cores) // workers
     return [tuple(cores[number * each : (number + 1) * each]) for number in range(workers)]
@@ -195,14 +194,14 @@ def run_jobs(
 ) -> None:
     """Run `jobs`, `workers` at a time, and store their rows; crashes, timeouts and memory limits give rows as well.
 
-    Rendered walks are kept in a scratch folder while other runs need them. After Ctrl-C or an exception
-    of `finished`, all processes are ended; finished runs are stored.
+    Rendered walks are kept in a scratch folder while other runs need them. After Ctrl-C or an exception of `finished`
+    all processes are ended; finished runs stay stored.
     """
     with _scratch(store.folder) as scratch:
         walks = [walk_name(job.spec["simulate"], job.seed) for job in jobs if job.spec["simulate"]]
         needed, lock, stop = Counter(walks), threading.Lock(), threading.Event()
         free: queue.SimpleQueue[tuple[int, ...]] = queue.SimpleQueue()
-        for cores in shares(workers):
+        for cores in core_shares(workers):
             free.put(cores)
 
         def work(job: Job) -> None:
@@ -241,7 +240,7 @@ def run_in(
 ) -> dict[str, Any]:
     """Run the job in the folder `place`; return the columns on how and where it ended.
 
-    Their status is used if the run wrote no row.
+    The status among them is used if the run wrote no row.
     """
     began, log = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), place / LOG
     ending = run_limited(command(place, scratch), log, limits, cores, stop)
@@ -262,7 +261,7 @@ def run_in(
 
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
-    """Make a temporary folder in that of the batch; the one of a killed batch is removed first."""
+    """Make a temporary folder inside the folder of the batch, after removing that of a killed batch."""
     place = folder / ".scratch"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(mode=0o700, parents=True)  # rendered walks are pickles: no other user may write them

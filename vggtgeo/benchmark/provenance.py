@@ -1,4 +1,4 @@
-"""Provenance of results: code, machine, inputs."""
+"""Record the provenance of results: code, machine, inputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vggtgeo.results.summary import versions
 
 _PACKAGE = Path(__file__).parent.parent
 _PACKAGES = ("bundle", "datasets", "evaluation", "geometry", "simulation", "slam", "solvers", "models")
-"""Packages that results depend on; reports and commands do not change them."""
+"""Packages that results depend on; reports and commands do not change results."""
 _TEXT = frozenset({".txt", ".toml", ".yaml", ".yml", ".json", ".csv"})
 
 
@@ -76,7 +76,7 @@ def provenance() -> dict[str, Any]:
 def input_hash(path: Path) -> str:
     """Return a digest of a recording: names and sizes of its files, content of its text files; 16 hexadecimal digits.
 
-    Image contents are not hashed: reading a gigabyte takes longer than some runs.
+    Contents of images are not hashed: reading a gigabyte takes longer than some runs.
     """
     digest = hashlib.sha256()
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())

@@ -1,4 +1,4 @@
-"""The report of a suite, as Markdown and as HTML. This file selects the content, `page.html.j2` has the layout."""
+"""Write the report of a suite, as Markdown and as HTML, whose layout is in `page.html.j2`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MARKS = {"": "{}", "second": "<u>{}</u>"}
 
 
 def markdown(suite: Suite, rows: Sequence[Row]) -> str:
-    """Return all tables as Markdown: best in bold, second best underlined."""
+    """Return all tables as Markdown: the best in bold, the second best underlined."""
     good = tables.finished(rows)
     there = [row for row in rows if row["status"] != "absent"]
     parts = [f"# {' '.join(suite.title.split())}", suite.about.strip(), tables.notice(suite, rows)]
@@ -57,7 +57,7 @@ def _text(cell: str | Cell) -> str:
 
 
 def write_page(path: Path, suite: Suite, rows: Sequence[Row], folder: Path) -> None:
-    """Write the page, atomically. folder: of the suite, whose runs are linked."""
+    """Write the HTML page, atomically. folder: of the suite; the page links to its runs."""
     good = tables.finished(rows)
     there = [row for row in rows if row["status"] != "absent"]
     has_error = tables.summary_of(good, figures.headline(good)).count > 0
@@ -89,7 +89,11 @@ def _facts(suite: Suite, rows: Sequence[Row]) -> list[tuple[str, str]]:
         (f"{len(good)} / {len(rows)}", "runs with a result"),
         (str(len(tables.sequences_of(suite, good))), "sequences"),
         (str(len(tables.settings_of(suite, good))), "settings"),
-        *((str(levels.count(level)), f"called {level}") for level in ("good", "degraded", "failed") if level in levels),
+        *(
+            (str(levels.count(level)), f"with the verdict {level}")
+            for level in ("good", "degraded", "failed")
+            if level in levels
+        ),
         (f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s", "of runs"),
     ]
 

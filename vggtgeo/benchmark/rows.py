@@ -1,4 +1,4 @@
-"""The table of runs, one row each: CSV, Parquet, means and paired differences with Student intervals."""
+"""Write the rows of runs as CSV and Parquet; compute means and paired differences with Student intervals."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FIRST = (
     *("mesh_f_score", "mesh_accuracy_m", "mesh_completeness_m", "nees_place", "nees_rotation", "focal_error"),
     *("frames_per_second", "seconds_wall", "peak_memory_gb"),
 )
-"""Columns that come first, in this order; the others follow by name."""
+"""Order of the first columns; the others follow, sorted by name."""
 
 
 def run_name(row: Row) -> str:
@@ -80,10 +80,11 @@ def _same_type(column: list[Any]) -> list[Any]:
 
 
 LEVEL = 0.95
+"""Confidence level of the intervals."""
 LESS_BASELINE = "_less_baseline"
 """Suffix of a column: the difference to the baseline over the common time."""
 SAME = 1e-6
-"""Relative spread below which numbers are equal: the runs had no random part."""
+"""Relative spread below which numbers count as equal: the seed has no effect on such runs."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ class Summary:
 
     @property
     def differs(self) -> bool:
-        """Whether the interval excludes zero. Never for equal numbers: seeds without effect do not sample the noise."""
+        """Whether the interval excludes zero. False for equal numbers: seeds without effect give no variance."""
         return bool(abs(self.mean) > self.half > SAME * abs(self.mean))
 
 
@@ -139,10 +140,10 @@ def paired(
     sequence: str | None = None,
     recorded: Collection[str] = (),
 ) -> Float[np.ndarray, " n"]:
-    """Return setting minus baseline on the same sequence and seed; over the common time where a row has that.
+    """Return setting minus baseline on the same sequence and seed; over the common time if the row has that difference.
 
-    recorded: sequences that are the same for every seed. In a mean over sequences, such a sequence is one sample (the
-    mean over its seeds): ten seeds of two recordings are not twenty independent recordings.
+    recorded: sequences that do not depend on the seed. In a mean over sequences each of them is one sample, the mean
+    over its seeds: ten seeds of two recordings are not twenty independent recordings.
     """
     other = {(row["sequence"], row["seed"]): number(row, column) for row in select(rows, sequence, baseline)}
     samples: dict[tuple[str, int | None], list[float]] = {}

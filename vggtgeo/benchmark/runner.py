@@ -23,7 +23,7 @@ from vggtgeo.benchmark.rows import LESS_BASELINE, Row, as_csv, run_name, write_p
 from vggtgeo.benchmark.suite import ExternalTable, Suite, load_suite, restrict
 from vggtgeo.benchmark.tables import COMPARED, finished, is_covered
 from vggtgeo.datasets import open_sequence
-from vggtgeo.datasets.image_files import is_there
+from vggtgeo.datasets.image_files import path_exists
 from vggtgeo.datasets.pose_files import load_trajectory
 from vggtgeo.evaluation import evaluate_trajectory, followed
 from vggtgeo.figures.plot import plot
@@ -46,7 +46,7 @@ class BenchReport:
 
     Fields:
         suite: the suite.
-        rows: one per run, in the order of the suite, then those of other systems; `status` is how the run ended.
+        rows: one per run, in the order of the suite, then of other systems; `status` says how the run ended.
         folder: of the runs.
 
     """
@@ -102,7 +102,7 @@ def bench(
     """Run a suite (sequences x settings x seeds) and write its tables and its report into the folder `output`.
 
     Each run is a process with limits of time and memory: a crash or a timeout is a row in the tables. Finished runs are
-    kept in `output`/runs; a second call runs only what is missing, or was made with other settings, inputs or code.
+    kept in `output`/runs. A second call runs only what is missing, or whose settings, inputs or code have changed.
 
     Args:
         suite: a TOML file, or the name of a shipped suite: quick, simulated, paper, clips, tum, 7scenes, ...
@@ -159,7 +159,7 @@ def _check_output(folder: Path) -> None:
     there = [name for name in OUTPUTS if (folder / name).exists()]
     if there and not (folder / "runs").is_dir() and not {"tables.md", "runs.csv"} <= set(there):
         raise InputError(
-            f"`{folder}` contains `{there[0]}`, which the batch would replace, but no batch; give another folder with "
+            f"`{folder}` has no batch, but a file `{there[0]}` that the batch would replace; give another folder with "
             "`-o`"
         )
 
@@ -197,17 +197,17 @@ def all_rows(
 
 
 def external_rows(suite: Suite, jobs: Sequence[Job], runs: Path, base: Path) -> list[Row]:
-    """Return a row for each existing file of `[[external]]`; `files` is relative to the folder `base`.
+    """Return a row for each existing file of `[[external]]`; its `files` are relative to the folder `base`.
 
-    The ground truth is that of a run on the same sequence and seed (in `runs`), or of the recording. Warn of a system
-    without any file.
+    The ground truth is that of a run on the same sequence and seed (in `runs`), or of the recording. Warns of a system
+    without files.
     """
     rows = []
     for table in suite.external:
         files: dict[Path, Job] = {}
         for job in jobs:
             files.setdefault(base / table.file(job.sequence, job.seed), job)
-        there = {file: job for file, job in files.items() if is_there(file)}
+        there = {file: job for file, job in files.items() if path_exists(file)}
         if files and not there:
             warn(f"external `{table.name}` has no trajectory: `{next(iter(files))}` does not exist")
         rows += [_external_row(suite, table, job, file, runs) for file, job in there.items()]

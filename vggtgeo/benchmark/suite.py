@@ -49,7 +49,7 @@ class CheckedTable:
         """Return the table of plain values; raise InputError with `where` for an unknown key or an invalid value."""
         types = {entry.name: str(entry.type).removesuffix(" | None") for entry in dataclasses.fields(cls)}
         if not isinstance(values, Mapping):
-            raise InputError(f"{where} is {values!r}; it must be a table")
+            raise InputError(f"{where} must be a table, got {values!r}")
         try:
             inspect.signature(cls).bind(**values)
         except TypeError as error:
@@ -57,9 +57,9 @@ class CheckedTable:
         for key, value in values.items():
             kinds, inner, words = _KINDS.get(types[key], ((), (), ""))
             entries = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-            # The exact type: in Python, `isinstance(True, int)`.
+            # Compare exact types: booleans are integers for `isinstance`.
             if kinds and not (type(value) in kinds and all(type(one) in inner for one in entries if inner)):
-                raise InputError(f"{where}: `{key}` is {value!r}; it must be {words}")
+                raise InputError(f"{where}: `{key}` must be {words}, got {value!r}")
         try:
             return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
         except InputError as error:
@@ -68,7 +68,7 @@ class CheckedTable:
 
 @dataclass(frozen=True)
 class Protocol:
-    """stride: take every n-th frame. poses: evaluate "all" frames or "keyframes". about: source and description."""
+    """Evaluation protocol. stride: take every n-th frame. poses: evaluate "all" or "keyframes". about: description."""
 
     stride: int
     poses: str
@@ -77,20 +77,20 @@ class Protocol:
 
 PROTOCOLS: dict[str, Protocol] = {
     "every-frame": Protocol(1, "all", "a pose for every frame, metric"),
-    "every-frame-sim3": Protocol(1, "all", "a pose for every frame, scale free"),
+    "every-frame-sim3": Protocol(1, "all", "a pose for every frame, scale unknown"),
     "mast3r-slam": Protocol(
         2, "keyframes", "MASt3R-SLAM: every second frame, keyframes only, `evo_ape tum GT EST -as`"
     ),
     "droid-slam": Protocol(2, "all", "DROID-SLAM: every second frame, a pose for each of them"),
-    "dpvo": Protocol(1, "all", "DPVO: every frame; its own tables print the median of the trials, these the mean"),
-    "vggt-slam": Protocol(1, "keyframes", "VGGT-SLAM: keyframes by the flow of the image"),
+    "dpvo": Protocol(1, "all", "DPVO: every frame; its tables have the median of the trials, ours the mean"),
+    "vggt-slam": Protocol(1, "keyframes", "VGGT-SLAM: keyframes chosen by optical flow"),
 }
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RowTable(CheckedTable):
-    """A table that gives rows of the report. name: short identifier; title: for the report."""
+    """A table with its own rows in the report. name: short identifier; title: for the report."""
 
     name: str
     title: str = ""
@@ -153,7 +153,7 @@ class SequenceTable(CheckedTable):
     def __post_init__(self) -> None:
         _check_name(self.name)
         if bool(self.path) == bool(self.simulate):
-            raise InputError("a sequence has either a `path` or a table `simulate`")
+            raise InputError("a sequence must have either a `path` or a table `simulate`")
         _one_of("degrade", self.degrade, tuple(DEGRADATIONS))
         if self.simulate:
             WalkTable.read("`simulate`", self.simulate)
@@ -161,7 +161,7 @@ class SequenceTable(CheckedTable):
             _one_of("kind", self.kind, KINDS)
         _one_of("vertical", self.vertical, tuple(AXES))
         if self.key_points < 1:
-            raise InputError(f"`key_points` is {self.key_points}; it must be at least 1")
+            raise InputError(f"`key_points` must be at least 1, got {self.key_points}")
         _one_of("protocol", self.protocol, ("", *PROTOCOLS))
         updated(SlamSettings(), self.set)
 
@@ -175,7 +175,7 @@ class SettingTable(RowTable):
         sequences: names of the sequences; by default all.
         seeds: number of seeds; overrides the suite's.
         rgb_only: ignore depth.
-        calibrated: false hides the intrinsics, which then start from a guess.
+        calibrated: false to hide the intrinsics, so that they start from a guess.
         perception: "classical", "light", "paper" (networks), or "simulated" (stubs of the five roles).
         features: "sift" or "orb".
         start_of_pose: initial pose of a frame: "pnp", "constant-velocity", or, for simulated roles, "window".
@@ -199,7 +199,7 @@ class SettingTable(RowTable):
         _one_of("features", self.features, ("sift", "orb"))
         _one_of("start_of_pose", self.start_of_pose, ("pnp", "constant-velocity", "window"))
         if self.seeds is not None and self.seeds < 1:
-            raise InputError(f"`seeds` is {self.seeds}; it must be at least 1")
+            raise InputError(f"`seeds` must be at least 1, got {self.seeds}")
         updated(SlamSettings(), self.set)
 
 
@@ -219,7 +219,7 @@ class ExternalTable(RowTable):
 
 @dataclass(frozen=True, kw_only=True)
 class Suite(CheckedTable):
-    """The whole file.
+    """A suite, the whole TOML file.
 
     Keys:
         title, about: for the head of the report.
@@ -255,7 +255,7 @@ class Suite(CheckedTable):
         _one_of("protocol", self.protocol, tuple(PROTOCOLS))
         for name in ("seeds", "timeout_minutes", "memory_gb"):
             if not getattr(self, name) > 0:
-                raise InputError(f"`{name}` is {getattr(self, name)}; it must be positive")
+                raise InputError(f"`{name}` must be positive, got {getattr(self, name)}")
         for name in self.published:
             _one_of("published", name, tuple(packaged("published")))
         for key in ("sequence", "setting"):
@@ -266,7 +266,7 @@ class Suite(CheckedTable):
         names = {table.name for table in self.sequence}
         for table in self.setting:
             if unknown := set(table.sequences) - names:
-                raise InputError(f"setting `{table.name}`: `sequences` has {sorted(unknown)}, which do not exist")
+                raise InputError(f"setting `{table.name}`: `sequences` must be of the suite, got {sorted(unknown)}")
         updated(SlamSettings(), self.set)
 
     @property
@@ -351,7 +351,7 @@ def restrict(
 
 def _cut(table: SequenceTable, frames: int) -> SequenceTable:
     if frames < 1:
-        raise InputError(f"`frames` is {frames}; it must be at least 1")
+        raise InputError(f"`frames` must be at least 1, got {frames}")
     if table.simulate:
         return dataclasses.replace(
             table, simulate={**table.simulate, "frames": min(frames, table.simulate.get("frames", frames))}
@@ -377,9 +377,9 @@ def _check_different(what: str, names: list[str]) -> None:
     folders = [name.lower() for name in names]  # names of folders, which are case-insensitive on some systems
     twice = sorted({name for name in names if folders.count(name.lower()) > 1})
     if twice:
-        raise InputError(f"`{what}` has the name {', '.join(twice)} twice; names must be unique, ignoring case")
+        raise InputError(f"`{what}` must have unique names (ignoring case), got {', '.join(twice)} twice")
 
 
 def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        raise InputError(f"`{key}` is {value!r}; it must be one of {', '.join(allowed)}")
+        raise InputError(f"`{key}` must be one of {', '.join(allowed)}, got {value!r}")

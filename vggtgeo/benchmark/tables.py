@@ -1,4 +1,4 @@
-"""The tables of a suite: what each of them shows, for Markdown and for the HTML report."""
+"""Compute the tables of a suite, for Markdown and for the HTML report."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from vggtgeo.benchmark.suite import PROTOCOLS, Suite, packaged
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table. name: of the row's value; factor: to the unit of the head; better: -1 if less is better, 1
-    if more is better, 0 if not ranked.
+    """A column of a table. head: its title. name: key of the row's value. factor: converts to the unit in the title.
+    better: -1 if less is better, 1 if more is better, 0 if not ranked.
     """
 
     head: str
@@ -71,16 +71,16 @@ GROUPS: dict[str, tuple[Column, ...]] = {
 COMPARED = (SE3, SIM3, RRE, DEPTH_RMSE, F_SCORE)
 """Columns of the differences to the baseline."""
 MIN_FOR_MEDIAN = 3
-"""Numbers: the median of two is their mean."""
+"""Minimum number of runs for a median: that of two is their mean."""
 MIN_COVERAGE = 0.9
-"""Share of the ground truth's duration; with less, the error is of another, mostly easier, part of the sequence."""
+"""Minimum share of the ground truth's duration: errors over less time are of a different, mostly easier, part."""
 FREE = "free"
-"""Shown instead of an SE(3) error for runs of free scale."""
+"""Shown instead of an SE(3) error for runs of unknown scale."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A number as text; its mark, "best", "second", "better", "worse" or none; the median beside the mean, if any."""
+    """A number as text; its mark, "best", "second", "better", "worse" or ""; the median next to the mean, if any."""
 
     text: str
     mark: str = ""
@@ -89,7 +89,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A table. labels: heads of the first columns, which are texts; heads: of the others; lines: a value a column."""
+    """A table. labels: titles of the first columns, which are texts; heads: of the others; lines: values by column."""
 
     title: str
     labels: tuple[str, ...]
@@ -99,9 +99,10 @@ class Table:
 
 
 def accuracy(suite: Suite, rows: Sequence[Row], column: Column) -> Table:
-    """Return a table with a row per setting: a cell per sequence, then mean (with the mean of the medians over seeds)
-    and median over the sequences on which all settings that are ranked at all are ranked. rows: include those without a
-    result.
+    """Return a table with a row per setting and a cell per sequence, then mean and median over sequences.
+
+    The mean has beside it the mean of the medians over seeds. Both are over the sequences on which every setting is
+    ranked, apart from settings that are ranked nowhere. rows: include those without a result.
     """
     settings, sequences = settings_of(suite, rows), sequences_of(suite, rows)
     groups = {name: [select(rows, name, setting) for setting in settings] for name in sequences}
@@ -114,23 +115,23 @@ def accuracy(suite: Suite, rows: Sequence[Row], column: Column) -> Table:
         lists = [[summary_of(groups[name][row], column) for name in common if has] for row, has in enumerate(used)]
         pooled = [Summary.of(np.array([one.mean for one in own])) for own in lists]
         text = lambda number: f"{number:.{column.digits}f}" if np.isfinite(number) else ""
-        # Means of medians, as in publications, if each sequence has enough seeds.
+        # Publications have means of medians; these need enough seeds on each sequence.
         enough = [min((one.count for one in own), default=0) >= MIN_FOR_MEDIAN for own in lists]
         medians = [
             np.mean([one.median for one in own]) if many else np.nan for own, many in zip(lists, enough, strict=True)
         ]
         means = [one.mean for one in pooled]
-        by_column.append(_placed(means, column, list(map(text, means)), list(map(text, medians))))
+        by_column.append(_marked_cells(means, column, list(map(text, means)), list(map(text, medians))))
         heads.append(f"mean{of}")
         if len(common) >= MIN_FOR_MEDIAN:
             heads.append(f"median{of}")
             numbers = [one.median for one in pooled]
-            by_column.append(_placed(numbers, column, list(map(text, numbers)), [""] * len(pooled)))
+            by_column.append(_marked_cells(numbers, column, list(map(text, numbers)), [""] * len(pooled)))
     lines: list[list[str | Cell]]
     lines = [[suite.title_of(setting), *(cells[row] for cells in by_column)] for row, setting in enumerate(settings)]
     note = (
-        f"ATE RMSE after {'SE(3)' if column is SE3 else 'Sim(3)'} alignment, cm, at the share of the truth's duration "
-        f"that is covered: below {100 * MIN_COVERAGE:.0f} % an error is not ranked."
+        f"ATE RMSE after {'SE(3)' if column is SE3 else 'Sim(3)'} alignment, cm, with the covered share of the ground "
+        f"truth's duration: errors below {100 * MIN_COVERAGE:.0f} % coverage are not ranked."
     )
     return Table(column.head, ("setting",), tuple(heads), lines, note)
 
@@ -138,7 +139,7 @@ def accuracy(suite: Suite, rows: Sequence[Row], column: Column) -> Table:
 def differences(suite: Suite, rows: Sequence[Row]) -> Table:
     """Return setting minus baseline on the same sequence and seed; marked if the 95 % interval excludes zero.
 
-    Over all sequences, a recording is one sample, a rendered world one per seed (each is a new walk).
+    In the row of all sequences a recording is one sample, a rendered world one sample per seed (each is a new walk).
     """
     rows = finished(rows)
     lines: list[list[str | Cell]] = []
@@ -155,8 +156,8 @@ def differences(suite: Suite, rows: Sequence[Row]) -> Table:
                 cells = [_difference(Summary.of(one), column) for one, column in zip(lists, COMPARED, strict=True)]
                 lines.append([suite.title_of(setting), sequence or "all", str(pairs), *cells])
     note = (
-        "On the same sequence and seed, over the time that both cover: mean difference and its 95 % interval "
-        "(Student), negative is less. Marked where the interval leaves zero out."
+        "Mean difference on the same sequence and seed, over the time that both cover, with its 95 % interval "
+        "(Student). Differences are marked if the interval excludes zero."
     )
     labels, heads = ("setting", "sequence", "pairs"), tuple(column.head for column in COMPARED)
     return Table(f"Against {suite.title_of(suite.base)}", labels, heads, lines, note if lines else "")
@@ -193,26 +194,26 @@ def details(suite: Suite, rows: Sequence[Row]) -> list[Table]:
 
 def doubts(rows: Sequence[Row]) -> Table:
     """Return the table of warnings about errors: few matched poses, an implausible scale."""
-    return _of_texts(
+    return _text_table(
         "Warnings", ("sequence", "setting", "seed", "warnings"), [row for row in rows if row.get("warnings")]
     )
 
 
 def failures(rows: Sequence[Row]) -> Table:
-    """Return the table of runs without a result and their reasons; those without data are in its note."""
+    """Return the table of runs without a result and their reasons; its note lists missing recordings."""
     absent = sorted({str(row["sequence"]) for row in rows if row["status"] == "absent"})
     note = f"Missing recordings: {', '.join(absent)} (`vggtgeo data list` shows where to get them)." if absent else ""
     failed = [row for row in rows if row["status"] not in ("ok", "absent")]
-    return _of_texts("Without a result", ("sequence", "setting", "seed", "status", "message"), failed, note)
+    return _text_table("Without a result", ("sequence", "setting", "seed", "status", "message"), failed, note)
 
 
 def published(name: str) -> Table:
-    """Return a table of figures published by others, with their digits; a file of `vggtgeo/benchmark/published`."""
+    """Return a table of results published by others, digits as printed; `name` is a file in `published/`."""
     values = tomllib.loads(packaged("published")[name].read_text("utf-8"), parse_float=str)
     papers = tomllib.loads((files("vggtgeo.benchmark") / "systems.toml").read_text("utf-8"))
     known, starred = values["rows"], values.get("uncalibrated", ())
     note = f"Not measured here; {values['unit']}. Source: {values['source']}. Protocol: {values['protocol']}."
-    note += " `*`: not given the intrinsics." if starred else ""
+    note += " `*`: intrinsics unknown to the system." if starred else ""
     note += " `-`: not published." if any("" in numbers for numbers in known.values()) else ""
     lines = [
         [f"{system}{'*' * (system in starred)}", *(Cell(str(one) or "-") for one in numbers), papers[system]]
@@ -223,7 +224,7 @@ def published(name: str) -> Table:
 
 
 def provenance(rows: Sequence[Row]) -> Table:
-    """Return the different values of each column on code and machine that has any."""
+    """Return all different values of each column on code and machine."""
     versions = sorted({name for row in rows for name in row if name.startswith("version_")})
     lines = [
         [name.removeprefix("version_"), ", ".join(found)]
@@ -234,13 +235,13 @@ def provenance(rows: Sequence[Row]) -> Table:
 
 
 def notice(suite: Suite, rows: Sequence[Row]) -> str:
-    """Return a paragraph on the kind of numbers: simulated or recorded, seeds, protocol."""
+    """Return a paragraph that describes the runs: simulated or recorded, seeds, protocol."""
     kinds = {bool(row.get("simulated")) for row in rows if row["status"] == "ok"}
     kind = {
-        frozenset({True}): "Simulated: rendered worlds with exact truth. ",
-        frozenset({True, False}): "Sequences that are simulated are called so in `runs.csv`. ",
+        frozenset({True}): "Simulated: rendered worlds with exact ground truth. ",
+        frozenset({True, False}): "`runs.csv` marks simulated sequences. ",
     }.get(frozenset(kinds), "")
-    roles = "Perception is simulated, too: stubs of the five roles with stated error models. "
+    roles = "Perception is simulated, too: stubs of the five roles with known error models. "
     stubs = roles if any(row.get("perception") == "simulated" for row in rows) else ""
     seeds = f"Seeds from {suite.first_seed}; mean ± standard deviation over seeds"
     most = max((len(select(rows, row["sequence"], row["setting"])) for row in rows), default=0)
@@ -250,7 +251,7 @@ def notice(suite: Suite, rows: Sequence[Row]) -> str:
     others, absent = sum("external" in row for row in rows), sum(row["status"] == "absent" for row in rows)
     runs = len(rows) - others - absent
     count = f"{runs} runs" if runs != 1 else "1 run"
-    count += f", {absent} more without their recording" if absent else ""
+    count += f", {absent} more without a recording" if absent else ""
     count += f", {others} of other systems" if others else ""
     return f"{kind}{stubs}Suite `{suite.name}`, {count}. {seeds} Protocol {protocols}."
 
@@ -261,7 +262,7 @@ def finished(rows: Iterable[Row]) -> list[Row]:
 
 
 def comparable(rows: Sequence[Row], column: Column) -> list[Row]:
-    """Return the rows whose value is meaningful: an SE(3) error of a free scale is not."""
+    """Return the rows whose value is meaningful: an SE(3) error of an unknown scale is not."""
     return [row for row in rows if column is not SE3 or row.get("metric") is not False]
 
 
@@ -271,14 +272,14 @@ def summary_of(rows: Sequence[Row], column: Column) -> Summary:
 
 
 def is_covered(rows: Sequence[Row]) -> bool:
-    """Return whether no run is known to cover less than `MIN_COVERAGE`."""
+    """Return whether all runs cover at least `MIN_COVERAGE`, or have no known coverage."""
     return not (values(rows, "coverage") < MIN_COVERAGE).any()
 
 
 def is_ranked(rows: Sequence[Row], column: Column) -> bool:
-    """Return whether the mean may be ranked: every run has a number, and none covers too little.
+    """Return whether the mean may be ranked: every run has a number and sufficient coverage.
 
-    Without failed runs, a mean favours settings that fail on hard ones.
+    A mean without the failed runs would favour settings that fail on hard sequences.
     """
     is_whole = bool(rows) and summary_of(rows, column).count == len(rows)
     return is_whole and (column.name == "coverage" or is_covered(rows))
@@ -291,8 +292,9 @@ def at_coverage(rows: Sequence[Row]) -> str:
 
 
 def text_of(rows: Sequence[Row], column: Column) -> str:
-    """Return mean and standard deviation (if there are several numbers) as text, with the number of runs if some have
-    no value; empty if none has.
+    """Return mean and standard deviation as text, with the number of runs if some have no value.
+
+    A single number has no deviation; without numbers the text is empty.
     """
     good = finished(rows)
     if good and not comparable(good, column):
@@ -327,24 +329,26 @@ def verdicts(rows: Sequence[Row]) -> str:
 def _ranked(groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]:
     """Return a cell for each group of rows; groups with missing numbers or too little coverage are not ranked."""
     means = [summary_of(own, column).mean if is_ranked(own, column) else np.nan for own in groups]
-    return _placed(means, column, [_text(own, column) for own in groups], [_median(own, column) for own in groups])
+    return _marked_cells(
+        means, column, [_text(own, column) for own in groups], [_median(own, column) for own in groups]
+    )
 
 
 def _text(rows: Sequence[Row], column: Column) -> str:
-    """Return the text of a cell with the coverage; without any number, how the runs failed."""
+    """Return the text of a cell with its coverage; without a number, how the runs failed."""
     text = text_of(rows, column)
     lost = [row for row in rows if row["status"] != "ok" or row.get("verdict") == "failed"]
     return f"{text}{at_coverage(rows)}" if text and text != FREE else text or verdicts(lost)
 
 
 def _median(rows: Sequence[Row], column: Column) -> str:
-    """Return the median, which published tables often have instead of the mean."""
+    """Return the median as text: published tables often have it instead of the mean."""
     summary = summary_of(rows, column)
     return f"{summary.median:.{column.digits}f}" if column.better and summary.count >= MIN_FOR_MEDIAN else ""
 
 
-def _placed(numbers: Sequence[float], column: Column, texts: Sequence[str], medians: Sequence[str]) -> list[Cell]:
-    """Return cells with the best and the second best marked, if there are two or more different numbers."""
+def _marked_cells(numbers: Sequence[float], column: Column, texts: Sequence[str], medians: Sequence[str]) -> list[Cell]:
+    """Return cells with the best and the second best marked; no mark if all numbers are equal."""
     rounded = [round(one, column.digits) for one in numbers]
     known = sorted({one for one in rounded if np.isfinite(one)}, reverse=column.better > 0)
     marks = dict(zip(known, ("best", "second"), strict=False)) if column.better and len(known) > 1 else {}
@@ -380,10 +384,10 @@ def _runs(rows: Sequence[Row]) -> str:
 
 
 def _tracked(rows: Sequence[Row]) -> str:
-    """Return tracked and read frames of all runs together."""
+    """Return the numbers of tracked and of read frames over all runs."""
     known = [row for row in rows if row.get("frames")]
     return f"{sum(row['tracked'] for row in known)}/{sum(row['frames'] for row in known)}" if known else ""
 
 
-def _of_texts(title: str, names: tuple[str, ...], rows: Sequence[Row], note: str = "") -> Table:
+def _text_table(title: str, names: tuple[str, ...], rows: Sequence[Row], note: str = "") -> Table:
     return Table(title, names, (), [[str(row.get(name, "")) for name in names] for row in rows], note)

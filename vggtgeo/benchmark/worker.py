@@ -1,4 +1,4 @@
-"""One run in its own process: reads `job.json`, writes `row.json`."""
+"""Run one job in its own process: read `job.json`, write `row.json`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def run_job(folder: Path, scratch: Path | None = None) -> None:
 
 
 def identity(job: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the columns of a row that are known from its job."""
+    """Return the columns of a row that follow from its job."""
     spec = job["spec"]
     return {
         **{key: job[key] for key in ("suite", "sequence", "setting", "seed", "fingerprint", "input_hash")},
@@ -81,7 +81,8 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
                 warned=warned,
             ),
         )
-        if result.summary["interrupted"]:  # by a signal from outside: a part of the frames is not a result
+        # `reconstruct` ends gracefully after a signal. A part of the frames is no valid result, so end by the signal.
+        if result.summary["interrupted"]:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGTERM)
         if spec["pages"]:
@@ -97,7 +98,7 @@ def _run(folder: Path, spec: Mapping[str, Any], seed: int, scratch: Path | None)
 def recording(folder: Path, wanted: bool, scratch: Path | None = None) -> Iterator[tuple[Callback, ...]]:
     """Yield the callback that logs the run to `folder`/run.rrd for the Rerun viewer, if wanted.
 
-    The file is written in `scratch` and moved at the end: saving the result would delete it as an earlier run's.
+    The file is written in `scratch` and moved at the end, since saving the result deletes an earlier run's recording.
     """
     if not wanted:
         yield ()
@@ -111,7 +112,7 @@ def recording(folder: Path, wanted: bool, scratch: Path | None = None) -> Iterat
 
 
 def end_with_parent(parent: int) -> None:
-    """End this process when its `parent` has ended, even if that was during the imports."""
+    """End this process when its `parent` ends, even if it ended during the imports of this process."""
 
     def watch() -> None:
         while os.getppid() == parent:

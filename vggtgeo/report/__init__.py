@@ -1,10 +1,10 @@
 """The report of a run, a self-contained HTML file, and its 3D view."""
 
 from vggtgeo.report.map_scene import MAX_POINTS as MAX_POINTS
+from vggtgeo.report.map_scene import KeyframeView as KeyframeView
 from vggtgeo.report.map_scene import MapScene as MapScene
-from vggtgeo.report.map_scene import Pictured as Pictured
+from vggtgeo.report.map_scene import keyframe_views as keyframe_views
 from vggtgeo.report.map_scene import map_scene as map_scene
-from vggtgeo.report.map_scene import pictured as pictured
 from vggtgeo.report.page import RunRecord as RunRecord
 from vggtgeo.report.page import write_page as write_page
 from vggtgeo.report.viewer import MapView as MapView

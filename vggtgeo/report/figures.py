@@ -45,10 +45,10 @@ _LABELS = {
     "rotations": "rotation between keyframes",
     "surfaces": "alignment of depth images",
 }
-"""Names of terms for a reader of the report; other terms keep theirs."""
+"""Names of terms in the report; terms of users keep their own."""
 _UNITS = {"px": "pixels", "sigma": "standard deviations"}
 _WIDTH = 4.6
-"""Inches: legible at its own size on a desktop and on a phone."""
+"""Inches: legible without scaling on a desktop and on a phone."""
 
 
 def residuals_svg(records: Sequence[WindowRecord]) -> str:
@@ -116,7 +116,7 @@ def svg(figure: Figure) -> str:
 
 
 def _unique_ids(svg: str) -> str:
-    """Prefix the identifiers: two figures in one page must not share them."""
+    """Prefix the identifiers, so that two figures in one page do not share any."""
     prefix = f"f{zlib.crc32(svg.encode())}-"
     svg = re.sub(r'\bid="', f'id="{prefix}', svg)
     return re.sub(r'(url\(#|href="#)', rf"\1{prefix}", svg)

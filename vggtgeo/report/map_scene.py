@@ -1,7 +1,7 @@
-"""What the 3D view of a page shows, as one compressed block of arrays and a header in JSON.
+"""Pack the content of a page's 3D view into one compressed block of arrays and a header in JSON.
 
-Coordinates are those of the view: the origin is the mean of the camera path, z is up, lengths are the map's. Points and
-vertices are rounded to 1/65535 of the map's extent (0.3 mm in 20 m).
+Coordinates are those of the view: the origin is the mean of the camera path, z is up, the scale is the map's. Points
+and vertices are rounded to 1/65535 of the map's extent (0.3 mm in 20 m).
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ MAX_POINTS = 500_000
 MAX_FACES = 150_000
 MAX_KEYFRAMES = 200
 MAX_POSES = 5_000
-"""Of the path and of the truth."""
+"""Maximum poses of the path, and of the ground truth."""
 _IMAGE_WIDTH, _IMAGE_QUALITY = 288, 72
 _SPACING_SAMPLES = 2_000
 _COVERAGE = 2.0
-"""Size of a drawn point in units of the distance to its nearest neighbour: surfaces close, and edges stay sharp."""
+"""Size of a drawn point in units of the distance to its nearest neighbour: surfaces have no holes, edges stay sharp."""
 _FRUSTUM = 0.02
 """Length of a drawn camera in units of the map's extent."""
 _HEADROOM = 0.03
-"""Above the highest camera, in units of the map's extent: what is higher is cut at first, so that a room is open."""
+"""Height above the highest camera, in units of the map's extent, at which the first view is cut, below a ceiling."""
 
 
 @dataclass(frozen=True)
-class Pictured:
-    """A keyframe of the view. pose: float [4, 4], camera -> world. image: JPEG; None if it is not known."""
+class KeyframeView:
+    """A keyframe of the view. pose: float [4, 4], camera -> world. image: JPEG; None if unknown."""
 
     name: str
     pose: np.ndarray
@@ -53,39 +53,39 @@ class Pictured:
 
 @dataclass(frozen=True, eq=False)
 class MapScene:
-    """Content of the view. header: plain values. block: the arrays that the header names, compressed (zlib)."""
+    """Content of the view. header: plain values, and the names of the arrays. block: the arrays, compressed by zlib."""
 
     header: dict[str, object]
     block: bytes
 
     @property
     def json(self) -> str:
-        """The header as JSON that may stand inside a `<script>` element."""
+        """The header as JSON that is safe inside a `<script>` element."""
         return json.dumps(self.header, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def spread(count: int, most: int) -> Int[np.ndarray, " n"]:
-    """Return at most `most` of the rows 0 to `count` - 1, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+def evenly_spaced(count: int, maximum: int) -> Int[np.ndarray, " n"]:
+    """Return at most `maximum` of the rows 0 to `count` - 1, evenly spaced."""
+    return np.unique(np.linspace(0, count - 1, min(maximum, count)).round().astype(int))
 
 
-def pictured(keyframes: Sequence[Keyframe]) -> list[Pictured]:
-    """Return at most `MAX_KEYFRAMES` keyframes, evenly spread, with small images."""
+def keyframe_views(keyframes: Sequence[Keyframe]) -> list[KeyframeView]:
+    """Return at most `MAX_KEYFRAMES` keyframes, evenly spaced, with small images."""
     return [
-        Pictured(
+        KeyframeView(
             f"frame {one.frame}",
             np.linalg.inv(one.pose),
             one.timestamp,
             jpeg(one.image, _IMAGE_WIDTH, _IMAGE_QUALITY),
         )
-        for one in (keyframes[row] for row in spread(len(keyframes), MAX_KEYFRAMES))
+        for one in (keyframes[row] for row in evenly_spaced(len(keyframes), MAX_KEYFRAMES))
     ]
 
 
 def map_scene(
     cloud: PointCloud,
     trajectory: Trajectory,
-    keyframes: Sequence[Pictured],
+    keyframes: Sequence[KeyframeView],
     intrinsics: Sequence[float],
     *,
     mesh: Mesh | None = None,
@@ -95,7 +95,7 @@ def map_scene(
     truth_in_metres: bool = True,
     max_points: int = MAX_POINTS,
 ) -> MapScene:
-    """Return the scene of a map.
+    """Return the content of the 3D view of a map.
 
     Args:
         cloud: the map, world frame.
@@ -106,7 +106,7 @@ def map_scene(
         truth: camera -> world, aligned to the trajectory here.
         uncertainty: of the poses of `trajectory`.
         metric: whether lengths are metres.
-        truth_in_metres: whether those of the truth are; else it is aligned with a scale.
+        truth_in_metres: whether lengths of `truth` are metres; else it is aligned with a scale.
         max_points: of the view; a larger map is decimated.
 
     """
@@ -171,7 +171,7 @@ def _named(keyframes: Sequence[Pictured], uncertainty: PoseUncertainty | None) -
 
 
 def _packed(header: dict[str, object], arrays: dict[str, np.ndarray]) -> MapScene:
-    """Concatenate the arrays, each from a multiple of four bytes, and note where they are."""
+    """Concatenate the arrays, aligned to four bytes, and add their types and positions to the header."""
     parts, end, places = [], 0, {}
     for name, array in arrays.items():
         data = np.ascontiguousarray(array).tobytes()
@@ -182,7 +182,7 @@ def _packed(header: dict[str, object], arrays: dict[str, np.ndarray]) -> MapScen
 
 
 def _add_quantised(arrays: dict[str, np.ndarray], name: str, points: Float[np.ndarray, "n 3"]) -> list[list[float]]:
-    """Add the points as uint16; return the low corner and the step of the rounding."""
+    """Add the points as uint16; return the lowest corner and the step of the quantisation."""
     low = points.min(axis=0, initial=0.0)
     step = np.maximum((points.max(axis=0, initial=0.0) - low) / 65535, 1e-12)
     arrays[name] = np.rint((points - low) / step).astype(np.uint16)
@@ -201,16 +201,16 @@ def _spacing(points: np.ndarray) -> float:
     """Return the median distance to the nearest neighbour; 0 for fewer than two points."""
     if len(points) < 2:
         return 0.0
-    asked = points[:: max(1, len(points) // _SPACING_SAMPLES)]
-    return float(np.median(cKDTree(points).query(asked, k=2)[0][:, 1]))
+    samples = points[:: max(1, len(points) // _SPACING_SAMPLES)]
+    return float(np.median(cKDTree(points).query(samples, k=2)[0][:, 1]))
 
 
 def _thinned(positions: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    return positions[spread(len(positions), MAX_POSES)].astype(np.float32)
+    return positions[evenly_spaced(len(positions), MAX_POSES)].astype(np.float32)
 
 
 def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> Trajectory | None:
-    """Return the truth during the run in the frame of the estimate; None if their times do not match."""
+    """Return the ground truth during the run in the frame of the estimate; None if their times do not match."""
     if truth is None:
         return None
     try:
@@ -222,7 +222,7 @@ def _aligned(truth: Trajectory | None, trajectory: Trajectory, rigid: bool) -> T
     return alignment.trajectory(truth.select(inside)) if inside.any() else None
 
 
-def _sigma_at(uncertainty: PoseUncertainty | None, keyframes: Sequence[Pictured]) -> np.ndarray:
+def _sigma_at(uncertainty: PoseUncertainty | None, keyframes: Sequence[KeyframeView]) -> np.ndarray:
     """Return the standard deviation of each keyframe's position; NaN = unknown."""
     sigma = np.full(len(keyframes), np.nan)
     if uncertainty is not None:
@@ -241,7 +241,7 @@ def _frustums(poses: np.ndarray, intrinsics: Sequence[float], length: float) -> 
 
 
 def decimated_cloud(cloud: PointCloud, max_points: int) -> PointCloud:
-    """Return a random subset of at most `max_points` points in their old order; equal clouds give equal subsets."""
+    """Return a random subset of at most `max_points` points in their order; equal clouds give equal subsets."""
     if len(cloud) <= max_points:
         return cloud
     kept = np.sort(np.random.default_rng(0).choice(len(cloud), max_points, replace=False))
@@ -250,8 +250,10 @@ def decimated_cloud(cloud: PointCloud, max_points: int) -> PointCloud:
 
 
 def decimated_mesh(mesh: Mesh, max_faces: int) -> Mesh:
-    """Return a mesh of at most `max_faces` faces: vertices in one cell of a grid become their mean, and faces that lose
-    a corner disappear (J. Rossignac and P. Borrel, Multi-resolution 3D approximations, 1993).
+    """Return a mesh of at most `max_faces` faces, by vertex clustering.
+
+    Vertices in one cell of a grid are replaced by their mean, and faces with two corners in one cell are removed
+    (J. Rossignac and P. Borrel, Multi-resolution 3D approximations, 1993).
     """
     if len(mesh.faces) <= max_faces:
         return mesh

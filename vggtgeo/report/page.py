@@ -1,4 +1,4 @@
-"""Write `report.html`: this file selects the content, `page.html.j2` has the layout."""
+"""Write `report.html`, whose layout is in `page.html.j2`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vggtgeo.io.files import write_text
 from vggtgeo.mapping.dense import DenseMap
 from vggtgeo.mapping.depth_map import DepthMap
 from vggtgeo.report import figures
-from vggtgeo.report.map_scene import spread
+from vggtgeo.report.map_scene import evenly_spaced
 from vggtgeo.report.viewer import INSTALL, style, template
 from vggtgeo.slam.callback import WindowRecord
 from vggtgeo.slam.run import frame_trajectory, keyframe_trajectory
@@ -26,10 +26,10 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.verdict.findings import Verdict
 
 SAMPLES = 4
-"""Keyframes whose image, depth and confidence are shown."""
+"""Number of keyframes whose image, depth and confidence are shown."""
 VERDICT_LINES = {
     "good": "Good: no check contradicts this result.",
-    "degraded": "Degraded: parts of this result are wrong or missing, as listed here; use the rest.",
+    "degraded": "Degraded: parts of this result are wrong or missing, as listed here. The rest can be used.",
     "failed": "Failed: do not use this result.",
 }
 _SAMPLE_WIDTH = 300
@@ -38,11 +38,11 @@ _SAMPLE_WIDTH = 300
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """The data of a result in memory, from which report and depth images are made.
+    """The data of a run in memory, from which report and depth images are made.
 
     slam: the last state. dense: the dense map after the last adjustment. windows: one per adjustment of the window.
     truth: ground truth, camera -> world. warnings: about the input and the weights of networks. title: of the report.
-    valid: bool [H, W], pixels of the undistorted images inside the original one; None if all are.
+    valid: bool [H, W], pixels of the undistorted images that the original images cover; None if all are.
     """
 
     slam: Slam
@@ -67,13 +67,15 @@ def write_page(
         path: of the file.
         record: of the run, with at least one frame.
         summary: content of `summary.json`.
-        verdict: how far the result can be trusted; the first part of the page.
-        view: returns the 3D view, which is made last, since it waits for the mesh; None: not available.
+        verdict: of the run; shown at the top of the page.
+        view: returns the 3D view, None if it is not available; called last, since it waits for the mesh.
 
     """
     slam, cloud, truth = record.slam, record.dense.cloud, record.truth
     trajectory = frame_trajectory(slam)
-    chosen = [(slam.keyframes[row], record.dense.depth_maps[row]) for row in spread(len(slam.keyframes), SAMPLES)]
+    chosen = [
+        (slam.keyframes[row], record.dense.depth_maps[row]) for row in evenly_spaced(len(slam.keyframes), SAMPLES)
+    ]
     low, high = _depth_range([depth_map for _, depth_map in chosen if depth_map is not None])
     drawn = ""
     if len(trajectory):
@@ -87,7 +89,7 @@ def write_page(
         facts=_facts(slam, trajectory, cloud, summary),
         simulated=bool(summary.get("simulated")),
         interrupted=bool(summary.get("interrupted")),
-        scale_is_free=not slam.metric,
+        scale_is_unknown=not slam.metric,
         unit=" m" if slam.metric else "",
         no_uncertainty="pose_sigma" not in summary,
         verdict=verdict,
@@ -129,7 +131,7 @@ def _facts(slam: Slam, trajectory: Trajectory, cloud: PointCloud, summary: Mappi
         aligned, name = ("ate_se3_m", "SE(3)") if slam.metric and truth["in_metres"] else ("ate_sim3_m", "Sim(3)")
         error = truth[aligned]["rmse"]
         shown = f"{100 * error:.2f} cm" if truth["in_metres"] else f"{error:.4g}"
-        facts.append((shown, f"ATE after {name}" + ("" if truth["in_metres"] else ", in the truth's unit")))
+        facts.append((shown, f"ATE after {name}" + ("" if truth["in_metres"] else ", in the unit of the ground truth")))
     facts.append((f"{len(cloud):,}".replace(",", "\u202f"), "points in the map"))
     facts.append((f"{summary['peak_memory_gb']:.2f} GB", "peak memory"))
     return facts
@@ -152,11 +154,11 @@ def _timeline(verdict: Verdict) -> list[tuple[str, float, str]]:
 
 
 def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[str, list[str]]]:
-    """Return rows of RMSE, mean, median, maximum; with a free scale, after Sim(3) alignment only."""
+    """Return rows of RMSE, mean, median, maximum; with an unknown scale only after Sim(3) alignment."""
     if truth is None:
         return []
     metric = metric and truth["in_metres"]
-    unit, factor = ("cm", 100.0) if truth["in_metres"] else ("unit of the truth", 1.0)
+    unit, factor = ("cm", 100.0) if truth["in_metres"] else ("unit of the ground truth", 1.0)
     translation = "rpe_translation_m" if metric else "rpe_translation_sim3_m"
     rows = (
         *([(f"ATE, SE(3) [{unit}]", truth["ate_se3_m"], factor)] if metric else []),
@@ -171,7 +173,7 @@ def _truth_table(truth: Mapping[str, Any] | None, metric: bool) -> list[tuple[st
 
 
 def _stages(seconds: Mapping[str, float]) -> list[tuple[str, float, float]]:
-    """Return name, duration in seconds, and its share of the longest, of each stage."""
+    """Return the name, the duration in seconds, and its ratio to the longest duration, of each stage."""
     shown = {name: value for name, value in seconds.items() if name != "all" and value >= 0.005}
     longest = max(shown.values(), default=1.0)
     return [(name, value, value / longest) for name, value in sorted(shown.items(), key=lambda item: -item[1])]

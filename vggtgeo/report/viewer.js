@@ -34,7 +34,7 @@
   const source = new TextDecoder().decode(await unzip("map3d-library"));
   new Function("define", source)((name, needs, make) => { library = make(); });
 
-  // Any first part of the shuffled points is spread over the whole map: that is what is drawn while the map turns.
+  // The points are shuffled, so that the first part of them, drawn while the map turns, covers the whole map.
   const count = header.points, order = new Uint32Array(count).map((_, i) => i);
   for (let i = count - 1, seed = 1; i > 0; i--) {
     seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0;
@@ -114,8 +114,8 @@
   await k3d.load({ objects });
   const object = (id) => world.ObjectsById[id];
 
-  // While the view moves only as many points are drawn as this machine can in a 30th of a second. It rests when the
-  // camera has not changed for a quarter of a second and ten frames: a slow machine draws few frames a second.
+  // While the view moves, the number of drawn points is limited to keep about 30 frames a second. All points are drawn
+  // when the camera has not changed for a quarter of a second and, on slow machines, for ten frames.
   let moving = false, budget = Math.min(count, 100000), last = 0, changed = 0, idle = 0;
   const draw = (number) => { // fewer points are larger, so that surfaces stay closed
     if (!object(POINTS)) return;

@@ -1,7 +1,7 @@
-"""Templates of all pages, and the 3D view as HTML that needs nothing else: the scene, K3D-jupyter's JavaScript, and a
-script of ours between them.
+"""Load the templates of all pages, and make the 3D view as self-contained HTML.
 
-K3D-jupyter (MIT) is optional: it draws with WebGL, and its JavaScript comes in its wheel. Without it there is no view.
+The view consists of the scene, the JavaScript of K3D-jupyter, which draws with WebGL, and `viewer.js`, which connects
+both. K3D-jupyter (MIT) is an optional package whose wheel contains the JavaScript. Without it there is no 3D view.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vggtgeo.report.map_scene import MapScene
 
 INSTALL = install_hint("viewer")
 _HEIGHT = 640
-"""Of the view in a notebook, pixels."""
+"""Height of the view in a notebook, pixels."""
 
 
 def template(package: str, name: str) -> jinja2.Template:
@@ -51,7 +51,7 @@ def check_viewer() -> None:
 
 
 def view_html(scene: MapScene) -> str:
-    """Return the view as elements for a page with the style sheet of all pages; raise InputError without K3D."""
+    """Return the HTML elements of the view, for a page with the style of `style`; raise InputError without K3D."""
     check_viewer()
     library, licences = _library()
     return template("vggtgeo.report", "viewer.html.j2").render(
@@ -66,7 +66,7 @@ def view_html(scene: MapScene) -> str:
 
 @dataclass(frozen=True)
 class MapView:
-    """A 3D view of a map: a notebook displays it, `save` writes it. html: the whole page."""
+    """A 3D view of a map, displayed by a notebook and saved by `save`. html: the whole page."""
 
     html: str
 
@@ -76,7 +76,7 @@ class MapView:
         return cls(template("vggtgeo.report", "view.html.j2").render(style=style(), title=title, view=view_html(scene)))
 
     def save(self, path: str | Path) -> None:
-        """Write the page, atomically: one file that needs no network."""
+        """Write the page, one file that works without a network, atomically."""
         write_text(Path(path), self.html)
 
     def _repr_html_(self) -> str:
@@ -88,9 +88,9 @@ class MapView:
 
 @cache
 def _library() -> tuple[str, str]:
-    """Return K3D's JavaScript, compressed, and its licences (three.js and others), as they require.
+    """Return K3D's JavaScript, compressed, and the licences that must be distributed with it (three.js and others).
 
-    `k3d` is not imported, which takes a second.
+    `k3d` is only located, not imported, since an import takes a second.
     """
     spec = find_spec("k3d")
     assert spec is not None
