@@ -15,7 +15,7 @@ from vggtgeo.geometry.mesh import Mesh
 from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
-from vggtgeo.report import MapView, Pictured, map_scene, viewer
+from vggtgeo.report import KeyframeView, MapView, map_scene, viewer
 from vggtgeo.report.map_scene import MapScene, decimated_cloud, decimated_mesh
 from vggtgeo.slam.global_map.pose_uncertainty import PoseUncertainty
 
@@ -65,7 +65,7 @@ def _scene(cloud: PointCloud, mesh: Mesh | None = None, **options: object) -> Ma
     path = _circle()
     image = cv2.imencode(".jpg", np.full((60, 80, 3), 120, np.uint8))[1].tobytes()
     frames = [
-        Pictured(f"frame {3 * i}", pose, time, image)
+        KeyframeView(f"frame {3 * i}", pose, time, image)
         for i, (time, pose) in enumerate(zip(path.timestamps, path.poses, strict=True))
     ]
     sigma = PoseUncertainty(path.timestamps, np.full(len(path), 0.05), np.full(len(path), 0.01))

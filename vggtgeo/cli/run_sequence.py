@@ -33,7 +33,7 @@ from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 from vggtgeo.slam.settings.table import changed
 from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
-from vggtgeo.viewing.target import STAND_IN, check_target, open_target
+from vggtgeo.viewing.target import FALLBACK_FILE, check_target, open_target
 
 EARLY_SECONDS = 60.0
 """Between two writings of the poses so far, which take less than a second for 20,000 frames."""
@@ -96,7 +96,7 @@ def run_and_write(
     print_result(console, result, summary, output)
     if wanted.as_json:
         typer.echo(json.dumps(summary))
-    if any(callback.cut_short for callback in viewed):
+    if any(callback.incomplete for callback in viewed):
         unsaved = unsaved or f"the recording `{wanted.rerun}` is incomplete (see the warning above)"
     if unsaved:
         raise InputError(f"{unsaved}; all other results are in `{output}`")
@@ -162,7 +162,7 @@ def _rerun_callbacks(
     is_file = check_target(target) not in ("spawn", "serve")
     if is_file and Path(target).parent.resolve() == folder.folder.resolve():
         target = str(folder.stage / Path(target).name)
-    opened = open_target(target, name, folder.stage / STAND_IN)
+    opened = open_target(target, name, folder.stage / FALLBACK_FILE)
     if opened.url is not None:
         typer.echo(f"follow the run in a browser: {opened.url}", err=True)
     return (RerunCallback(opened.stream, window, opened.file),), opened.url

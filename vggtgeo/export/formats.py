@@ -1,4 +1,4 @@
-"""The export formats, and the function behind `vggtgeo export`."""
+"""Export a run in one of several formats, for `vggtgeo export`."""
 
 from __future__ import annotations
 
@@ -25,12 +25,13 @@ from vggtgeo.results.output_checks import EXPORTS, check_is_run
 from vggtgeo.results.scene import Scene
 from vggtgeo.results.summary import read_summary
 
-MILLI = 1000.0
+MILLIMETRES_PER_METRE = 1000.0
 
 
 def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
-    """Write `transforms.json`, `images/`, `depth/` (if the run saved it) and `points.ply` below `target`; also
-    `mask.png` if the undistorted images have invalid borders: black pixels are not used for training.
+    """Write `transforms.json`, `images/`, `depth/` (if the run saved it) and `points.ply` into `target`.
+
+    Also writes `mask.png` if the undistorted images have invalid borders: its black pixels are not used for training.
     """
     scene, cloud = Scene.load(source), cloud_of(source)
     poses = rigid.invert(scene.poses) @ FROM_OPENGL
@@ -45,7 +46,7 @@ def write_nerfstudio(source: Path, target: Path) -> dict[str, float]:
         depth = source / "depth" / f"{scene.frames[view]:06d}.depth.png"
         if depth.is_file():
             frame["depth_file_path"] = f"depth/{scene.frames[view]:06d}.png"
-            millimetres = np.rint(read_codes(depth) * (MILLI / DEPTH_UNIT)).astype(np.uint16)
+            millimetres = np.rint(read_codes(depth) * (MILLIMETRES_PER_METRE / DEPTH_UNIT)).astype(np.uint16)
             write_picture(target / frame["depth_file_path"], millimetres)
             deep += 1
         frames.append(frame)
@@ -68,9 +69,9 @@ def write_tum(source: Path, target: Path) -> dict[str, float]:
 
 
 def write_kitti(source: Path, target: Path) -> dict[str, float]:
-    """Write `poses.txt`, the first three rows of each camera -> world matrix per line, and `times.txt`, seconds.
+    """Write `poses.txt`, the upper three rows of a matrix camera -> world on each line, and `times.txt`, seconds.
 
-    The format cannot represent frames without a pose: they are left out of both files.
+    The format cannot represent frames without a pose: both files leave them out.
     """
     trajectory = Trajectory.load_tum(source / "trajectory.txt")
     rows = [" ".join(f"{value:.9e}" for value in pose[:3].reshape(-1)) for pose in trajectory.poses]
@@ -88,9 +89,9 @@ FORMATS: dict[str, Callable[[Path, Path], dict[str, float]]] = {
     "tum": write_tum,
     "kitti": write_kitti,
 }
-"""Each function writes the files of a format from a run's folder to another, and returns counts."""
+"""Function of each format: writes the files from a run's folder into another, and returns counts."""
 _RECORD = ".vggtgeo-export"
-"""Lists the files that exports wrote into a folder: the only ones that an export may replace."""
+"""File with the names of all files that exports wrote into a folder: only those may be replaced."""
 
 
 def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[str] | None = None) -> dict[str, float]:
@@ -115,7 +116,7 @@ def export(source: str | os.PathLike[str], to: str, target: str | os.PathLike[st
     check_is_run(place)
     output = path_of("target", target) if target is not None else place / EXPORTS / to
     if output.resolve() == place.resolve():
-        raise InputError(f"`{output}` is the folder of the run itself; give another for the export")
+        raise InputError(f"`target` must not be the folder of the run, got `{output}`; give another for the export")
     verdict = read_summary(place)[1]
     if verdict.level == "failed":
         warn(f"`{place}`: the verdict of the run is failed: {'; '.join(verdict.reasons)}")
@@ -138,7 +139,7 @@ def _staged(output: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=output, ignore_cleanup_errors=True) as stage:
             yield Path(stage)
     except OSError as error:
-        # Name the output in the error: the stage does not exist afterwards, and the error of a full disk has no name.
+        # The error names the output: the temporary folder is gone by then, and a full disk's error has no name.
         if error.filename is None or Path(error.filename).is_relative_to(output):
             raise not_written(output, error) from None
         raise

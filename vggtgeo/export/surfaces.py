@@ -1,10 +1,10 @@
-"""Clouds and meshes: PLY, GLB (glTF), LAS.
+"""Export clouds and meshes as PLY, GLB (glTF) and LAS.
 
 Colours of a run are those of its images: sRGB (IEC 61966-2-1), 8 bits. Each format has its own colour space:
 
-| format | colour space by its specification | written |
+| format | colour space in its specification | written |
 |---|---|---|
-| glTF, `COLOR_0` | linear factors (glTF 2.0, 3.9.2); 8 bits of that lose dark tones | linear, 16 bits |
+| glTF, `COLOR_0` | linear factors (glTF 2.0, 3.9.2); 8 bits would lose dark tones | linear, 16 bits |
 | PLY; points of nerfstudio | none; readers show the bytes as sRGB | sRGB, 8 bits |
 | LAS | image channels of 16 bits (LAS 1.4, 2.6.8), shown as sRGB | sRGB, 16 bits |
 | COLMAP | the bytes of the images | sRGB, 8 bits |
@@ -25,15 +25,15 @@ from vggtgeo.geometry.point_cloud import PointCloud
 from vggtgeo.io.errors import InputError, install_hint
 
 UPRIGHT = np.array([1.0, -1.0, -1.0])
-"""From y down, z forward (the first camera's axes) to glTF's y up, z backward."""
+"""Changes the first camera's axes (y down, z forward) to glTF's (y up, z backward)."""
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""From the same axes to z up, y forward, as in surveying."""
+"""Changes the first camera's axes to z up, y forward, as in surveying."""
 LAS_UNIT = 1e-3
 _CUSTOM_ATTRIBUTE = "_color"
 """Names of custom attributes of glTF begin with an underscore."""
 FULL_SCALE = 65535
 _LINEAR_BELOW, _SLOPE, _OFFSET, _GAMMA = 0.04045, 12.92, 0.055, 2.4
-"""Of the transfer function of sRGB."""
+"""Constants of the transfer function of sRGB."""
 
 
 def cloud_of(source: Path) -> PointCloud:
@@ -67,7 +67,7 @@ def write_ply(source: Path, target: Path) -> dict[str, float]:
 
 
 def write_glb(source: Path, target: Path) -> dict[str, float]:
-    """Write the mesh as `map.glb`; down is that of the first camera."""
+    """Write the mesh as `map.glb`; the vertical is that of the first camera."""
     trimesh = _package("trimesh")
     mesh = mesh_of(source)
     # The default material of glTF is metallic, which is dark without an environment to reflect.
@@ -82,7 +82,7 @@ def write_glb(source: Path, target: Path) -> dict[str, float]:
 
 
 def _as_colours(tree: dict[str, Any]) -> None:
-    """Rename the attribute of 16 bits to glTF's: trimesh itself writes colours of 8 bits only."""
+    """Rename the 16-bit attribute to glTF's `COLOR_0`, for which trimesh itself writes 8 bits only."""
     attributes = tree["meshes"][0]["primitives"][0]["attributes"]
     attributes["COLOR_0"] = attributes.pop(_CUSTOM_ATTRIBUTE)
     tree["accessors"][attributes["COLOR_0"]]["normalized"] = True

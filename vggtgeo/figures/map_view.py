@@ -1,4 +1,4 @@
-"""Images of a point cloud, rendered by splatting, for reports and notebooks."""
+"""Render images of a point cloud by splatting, for reports and notebooks."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from vggtgeo.geometry.trajectory import Trajectory
 BACKGROUND = (246, 246, 244)
 _PATH, _START = (31, 95, 191), (224, 123, 26)
 _HEADROOM = 0.15
-"""Metres above the highest camera in the view from above: higher points are ceiling."""
+"""Metres above the highest camera; higher points count as ceiling and are not drawn in the view from above."""
 _POINT = 0.024
-"""Size of a point, metres: a little more than a voxel of the map, so that surfaces have no holes."""
+"""Size of a point, metres: slightly larger than a voxel of the map, so that surfaces have no holes."""
 _MAX_SIZE = 12
-"""Of a point, pixels."""
+"""Maximum size of a point, pixels."""
 _STEP_BACK = 1.2
 """Distance of the viewpoint behind the camera, metres."""
 _LENS = 0.9
 """Focal length of the walk-in view, in image widths."""
 _MAP_HEIGHT = 3.6
-"""Of the two views of the map below the trajectory, inches."""
+"""Height of the two views of the map below the trajectory, inches."""
 
 
 def from_above(cloud: PointCloud, trajectory: Trajectory, width: int = 900) -> UInt8[np.ndarray, "h w 3"]:
-    """Render the map without ceiling, orthographic from above, with the path; the longest extent is along x.
+    """Render the map from above without ceiling, in orthographic projection, with the path; x is the longest extent.
 
     Args:
         cloud: world frame, metres.
@@ -40,7 +40,7 @@ def from_above(cloud: PointCloud, trajectory: Trajectory, width: int = 900) -> U
     points, path = cloud.points @ axes.T, trajectory.positions @ axes.T
     kept = points[:, 2] < path[:, 2].max() + _HEADROOM
     if not kept.any():
-        kept[:] = True  # wrong depth may put the whole map above the cameras: show it anyway
+        kept[:] = True  # with wrong depth the whole map may be above the cameras: show it anyway
     points, colours = points[kept], cloud.colours[kept]
     low, high = _extent(points[:, :2], path[:, :2])
     height = width * 3 // 4

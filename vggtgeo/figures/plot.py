@@ -1,4 +1,4 @@
-"""`plot`: draw any value of the library."""
+"""Draw any value of the library with `plot`."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from vggtgeo.io.argument_checks import check_kind, check_positive, real_array
 from vggtgeo.io.errors import InputError
 
 _FACTORS = (1, 3, 10, 30, 100, 300, 1000)
-"""Standard deviations to choose from for the ellipses."""
+"""Possible sizes of the ellipses, standard deviations."""
 _MAX_SHARE = 0.2
-"""Largest half axis of an ellipse, as share of the figure's extent."""
+"""Maximum half axis of an ellipse, as a share of the figure's extent."""
 
 
 @singledispatch
@@ -42,15 +42,15 @@ def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
     Args:
         value: one of
 
-            - `Trajectory`: from above and from the side. Options: `truth` (a trajectory), drawn beside it after SE(3)
-              alignment, or Sim(3) `with_scale=True`.
-            - `Result`: the same, and the map from inside and from above. Options: `truth`.
+            - `Trajectory`: from above and from the side. Options: `truth` (a trajectory), drawn after SE(3) alignment,
+              or Sim(3) `with_scale=True`.
+            - `Result`: its trajectory, and the map from inside and from above. Options: `truth`.
             - `TrajectoryReport` of `evaluate`: histograms of the errors after each alignment.
             - `Solution`: the energy by iteration.
-            - `Covariances`: the camera centres from above with ellipses. Takes the `state` that they belong to.
+            - `Covariances`: the camera centres from above with ellipses. Needs the `state` that they belong to.
               Options: `truth`, camera centres [n, 3] in the world; `sigmas`, by default chosen to be visible.
             - `Observability`: the eigenvalues, and the information lost without each kind of observation.
-            - `BenchReport`: the error of every run, by scene and variant.
+            - `BenchReport`: the error of every run, by sequence and setting.
         args: as above.
         options: as above.
 
@@ -69,7 +69,9 @@ def plot(value: Any, *args: Any, **options: Any) -> NotebookFigure:
 def check_single(values: Any, axes: int) -> None:
     """Raise InputError for a batch."""
     if np.ndim(values) != axes:
-        raise InputError("`value` is a batch; plot one of it: `jax.tree.map(lambda leaf: leaf[0], value)` is the first")
+        raise InputError(
+            "`value` must not be a batch; plot one element: `jax.tree.map(lambda leaf: leaf[0], value)` is the first"
+        )
 
 
 @plot.register(Trajectory)
@@ -126,8 +128,8 @@ def _covariances(
     keyframes = len(value.poses)
     if np.shape(state.poses.wxyz_xyz) != (keyframes, 7):
         raise InputError(
-            f"`state` has poses of shape {np.shape(state.poses.wxyz_xyz)}, expected {keyframes} keyframes as the "
-            "covariances; pass the state and the covariances of one solution"
+            f"`state` must have {keyframes} keyframes as the covariances, got poses of shape "
+            f"{np.shape(state.poses.wxyz_xyz)}: pass the state and the covariances of one solution"
         )
     check_finite(state)
     if truth is not None:
@@ -169,8 +171,9 @@ def _covariances(
 
 @plot.register(Observability)
 def _observability(found: Observability) -> NotebookFigure:
-    """Draw, on the left, the balanced eigenvalues with all factors and without each kind; on the right, the share of
-    information about each common motion and the free intrinsics that is lost without each kind.
+    """Draw the balanced eigenvalues (left) and the lost information (right), without each kind of observation.
+
+    The information is that about each common motion and about the free intrinsics.
     """
     figure = NotebookFigure(figsize=(10.0, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[2, 3])

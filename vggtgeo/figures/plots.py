@@ -1,9 +1,9 @@
-"""Style of all figures, and the figure of a trajectory from above and from the side, with the ground truth.
+"""Style all figures, and draw a trajectory from above and from the side, with the ground truth.
 
-The frame of a reconstruction is arbitrary, so up is estimated from the cameras: hand-held cameras have little roll, so
-up is the direction most nearly orthogonal to all image rows. If the camera hardly rotates, its pitch is unknown. Then
-up is the axis of the ground truth's world nearest to the mean up of the images; without ground truth it is that mean
-itself, and the figure's title says so. The longest horizontal extent is along the x axis.
+The world frame of a reconstruction is arbitrary, so the vertical is estimated from the cameras. Hand-held cameras have
+little roll, so up is the direction most nearly orthogonal to all image rows. If the camera hardly rotates, its pitch is
+unknown. Then up is the axis of the ground truth's world nearest to the mean up of the images; without ground truth it
+is that mean, and the figure's title says so. The longest horizontal extent is along the x axis.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ LINES = (BLUE, ORANGE, GREEN, "#8e5fb0", "#b0413e", "#7a7a2a", "#3b9aa5", "#a05a
 _WIDTH = 11.0
 """Inches."""
 _WEIGHT_OF_MEAN_UP = 0.02
+"""Weight of the mean up of the images against the scatter of the image rows, whose eigenvalues are at most 1."""
 _MIN_YAW = 0.05
 """Second eigenvalue of the image rows' scatter above which rotations define up: 13 degrees RMS of yaw. Below, the mean
 up of the images has more than a third of the weight."""
 _MIN_EXTENT = 0.1
-"""Metres: extent of the figure of a still camera."""
+"""Minimum extent of a figure, metres, for a camera that does not move."""
 
 
 class NotebookFigure(Figure):
@@ -86,14 +87,14 @@ def trajectory_figure(
     """Return the top and side view of `estimate`, with equal axes, `width` inches wide; `keyframes` are marked.
 
     With `truth`, the estimate is aligned to it by SE(3), or by Sim(3) if `with_scale` or the ground truth is not in
-    `metres`, and the title has the ATE of the poses that match in time; if too few match, `truth` is left out. No title
-    if `title` is None. InputError for an empty estimate.
+    `metres`. The title then has the ATE of the poses that match in time; if too few match, `truth` is left out. Without
+    a title if `title` is None. Raises InputError for an empty estimate.
     """
     if len(estimate) == 0:
-        raise InputError("`estimate` has no pose; there is nothing to draw")
+        raise InputError("`estimate` must have at least one pose, got none")
     drawn = _align(estimate, truth, keyframes, with_scale or not metres)
     in_metres = metres if drawn.error else not with_scale
-    figure = _draw(drawn, "m" if in_metres else "unit of the truth" if drawn.error else "no unit", width)
+    figure = _draw(drawn, "m" if in_metres else "unit of the ground truth" if drawn.error else "no unit", width)
     if title is not None:
         figure.suptitle(_title(drawn, title, with_scale, metres), x=0.01, ha="left", fontsize=12, color=INK)
     return figure
@@ -113,13 +114,13 @@ def _align(estimate: Trajectory, truth: Trajectory | None, keyframes: Trajectory
 
 
 def view_axes(trajectory: Trajectory, level_world: bool = False) -> Float[np.ndarray, "3 3"]:
-    """Return a level frame, estimated from the cameras: rows are the longest horizontal direction, the other horizontal
-    one, and up; right-handed.
+    """Estimate a level frame from the cameras: rows are the longest horizontal direction, the other one, and up.
 
-    level_world: whether an axis of the world is vertical, as in benchmarks; used if the cameras rotate too little.
+    The frame is right-handed. level_world: whether an axis of the world is vertical, as in benchmarks; used if the
+    cameras rotate too little.
     """
     up = _up(trajectory)
-    if level_world and not _yaws(trajectory):
+    if level_world and not _has_yaw(trajectory):
         axis = np.argmax(np.abs(up))
         up = np.sign(up[axis]) * np.eye(3)[axis]
     centred = trajectory.positions - trajectory.positions.mean(axis=0)
@@ -134,7 +135,7 @@ def view_axes(trajectory: Trajectory, level_world: bool = False) -> Float[np.nda
     return np.stack([along, np.cross(up, along), up])
 
 
-def _yaws(trajectory: Trajectory) -> bool:
+def _has_yaw(trajectory: Trajectory) -> bool:
     """Return whether the cameras rotate enough for their image rows to span the horizontal plane."""
     rows = trajectory.rotations[:, :, 0]
     return bool(np.linalg.eigvalsh(rows.T @ rows / len(rows))[1] > _MIN_YAW)
@@ -150,7 +151,7 @@ def _up(trajectory: Trajectory) -> Float[np.ndarray, "3"]:
 def _draw(drawn: _Aligned, unit: str, width: float) -> NotebookFigure:
     seen = drawn.truth or drawn.estimate
     axes_of_view, origin = view_axes(seen, level_world=drawn.truth is not None), seen.positions[0]
-    side_title = "seen from the side" + ("" if drawn.truth or _yaws(seen) else "; up is that of the images")
+    side_title = "seen from the side" + ("" if drawn.truth or _has_yaw(seen) else "; up is the mean up of the images")
     everything = [drawn.estimate.positions] + ([drawn.truth.positions] if drawn.truth else [])
     points = (np.concatenate(everything) - origin) @ axes_of_view.T
     low, high = points.min(axis=0), points.max(axis=0)
@@ -177,7 +178,7 @@ def _draw_view(axes: Any, drawn: _Aligned, origin: np.ndarray, rows: np.ndarray)
     flat = lambda points: rows @ (points - origin).T
     path = flat(drawn.estimate.positions)
     if drawn.truth is not None:
-        axes.plot(*flat(drawn.truth.positions), color=ORANGE, lw=2.2, alpha=0.9, label="truth", zorder=2)
+        axes.plot(*flat(drawn.truth.positions), color=ORANGE, lw=2.2, alpha=0.9, label="ground truth", zorder=2)
     axes.plot(*path, color=BLUE, lw=1.3, label="estimate", zorder=3)
     if len(drawn.keyframes):
         axes.plot(*flat(drawn.keyframes), ".", color=BLUE, ms=5, label="keyframes", zorder=4)
@@ -189,7 +190,7 @@ def _draw_view(axes: Any, drawn: _Aligned, origin: np.ndarray, rows: np.ndarray)
 
 def _title(drawn: _Aligned, title: str, with_scale: bool, metres: bool) -> str:
     if drawn.error is None:
-        facts = f"{len(drawn.estimate)} pose{'s' if len(drawn.estimate) > 1 else ''}, no truth"
+        facts = f"{len(drawn.estimate)} pose{'s' if len(drawn.estimate) > 1 else ''}, no ground truth"
         if not with_scale:
             facts += f", path {drawn.estimate.length:.2f} m"
     else:

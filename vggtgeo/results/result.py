@@ -25,14 +25,14 @@ from vggtgeo.io.files import atomic_path, write_json
 from vggtgeo.mapping.dense import dense_map
 from vggtgeo.report import (
     MAX_POINTS,
+    KeyframeView,
     MapScene,
     MapView,
-    Pictured,
     RunRecord,
     check_viewer,
     has_viewer,
+    keyframe_views,
     map_scene,
-    pictured,
     view_html,
     write_page,
 )
@@ -274,10 +274,10 @@ class Result:
     def _scene(self, mesh: Mesh | None, truth: Trajectory | None, max_points: int = MAX_POINTS) -> MapScene:
         record = self.record
         if record is not None:
-            keyframes = pictured([record.slam.keyframes[number] for number in submaps_by_size(record.slam)[0]])
+            keyframes = keyframe_views([record.slam.keyframes[number] for number in submaps_by_size(record.slam)[0]])
         else:
             poses = zip(self.keyframes.timestamps, self.keyframes.poses, strict=True)
-            keyframes = [Pictured(f"keyframe {row}", pose, time) for row, (time, pose) in enumerate(poses)]
+            keyframes = [KeyframeView(f"keyframe {row}", pose, time) for row, (time, pose) in enumerate(poses)]
         return map_scene(
             self.cloud,
             self.trajectory,

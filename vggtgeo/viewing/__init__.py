@@ -1,1 +1,1 @@
-"""Views of a run in the Rerun viewer. Rerun is optional: only this package imports it, inside functions."""
+"""Show a run in the Rerun viewer. Only this package imports Rerun, inside functions, since the import is slow."""

@@ -1,8 +1,8 @@
-"""Log a run to Rerun: the camera of each frame, the window of each keyframe, the iterations of its solver, and the map:
-the cloud of each keyframe, logged once in its own frame, and the keyframe's pose.
+"""Log a run to Rerun: the camera of each frame, the window of each keyframe, its solver's iterations, and the map.
 
-When an adjustment moves a keyframe, logging its pose moves its points as well. So the cost per frame is bounded: at
-most `MAX_CLOUDS` clouds of `MAX_POINTS` points, and a transform per moved keyframe: those of the window, or all of them
+The map consists of the cloud of each keyframe, logged once in the keyframe's own frame, and of the keyframe's pose.
+When an adjustment changes the pose, only the pose is logged again. So the cost per frame is bounded: at most
+`MAX_CLOUDS` clouds of `MAX_POINTS` points, and one transform for each changed keyframe: those of the window, or all
 when submaps are merged.
 """
 
@@ -30,11 +30,11 @@ from vggtgeo.viewing.entities import Entities
 from vggtgeo.viewing.target import flush
 
 MAX_POINTS = 4000
-"""Of a keyframe's cloud: 60 kB, as much as three of the frames' images."""
+"""Maximum points of a keyframe's cloud: 60 kB, as much as the images of three frames."""
 MAX_CLOUDS = 4
-"""Clouds logged per frame: a run in a known map, or a resumed one, starts with many keyframes."""
+"""Maximum clouds logged per frame: a run in a known map, or a resumed run, starts with many keyframes."""
 MIN_CONFIDENCE = 128
-"""Of depth that is shown, of 255: as in the map."""
+"""Minimum confidence of depth that is shown, of 255; the map has the same limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +55,13 @@ class LiveMap:
 
     def update(self, slam: Slam) -> None:
         """Log new clouds, and the poses of moved keyframes."""
-        room = MAX_CLOUDS
+        remaining = MAX_CLOUDS
         for keyframe in slam.adjusted_keyframes:
             before = self._logged.get(keyframe.number)
-            if room and _is_stale(keyframe, before, slam):
-                points, colours = own_cloud(keyframe, slam.intrinsics, dense=slam.metric)
+            if remaining and _is_stale(keyframe, before, slam):
+                points, colours = keyframe_cloud(keyframe, slam.intrinsics, dense=slam.metric)
                 self._entities.cloud(f"world/live/{keyframe.number}", points, colours)
-                room -= 1
+                remaining -= 1
                 self._entities.pose(f"world/live/{keyframe.number}", keyframe.pose)
                 self._logged[keyframe.number] = _Logged(keyframe.frame, keyframe.pose, keyframe.points)
             elif before is not None and keyframe.pose is not before.pose:
@@ -75,20 +75,20 @@ class LiveMap:
 
 
 def _is_stale(keyframe: Keyframe, before: _Logged | None, slam: Slam) -> bool:
-    """Return whether to log the cloud of a keyframe (again).
+    """Return whether the cloud of a keyframe is new or has changed since it was logged.
 
-    Without dense depth the cloud is that of the adjusted points, which may have changed. Those of the window change
-    with each keyframe and are shown by `world/points`.
+    Without dense depth the cloud consists of the adjusted points, which may have changed. Those of the window change
+    with each keyframe and are shown by `world/points` instead.
     """
     if before is None or before.frame != keyframe.frame:  # a new map reuses keyframe numbers
         return True
     return not slam.metric and keyframe.points is not before.points and keyframe.number not in slam.window.members
 
 
-def own_cloud(keyframe: Keyframe, intrinsics: np.ndarray, *, dense: bool) -> tuple[np.ndarray, np.ndarray]:
+def keyframe_cloud(keyframe: Keyframe, intrinsics: np.ndarray, *, dense: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return points float32 [n, 3] in the keyframe's camera frame, and colours uint8 [n, 3]; at most `MAX_POINTS`.
 
-    dense: use its depth on a regular grid, if it has any; else its adjusted points.
+    dense: use its depth on a regular grid, if it has depth; else its adjusted points.
     """
     if dense:
         height, width = keyframe.size
@@ -108,14 +108,14 @@ def own_cloud(keyframe: Keyframe, intrinsics: np.ndarray, *, dense: bool) -> tup
 
 
 class RerunCallback(Callback):
-    """Logs to `stream`, with the timelines `frame`, `time` (s) and `iteration` (tried steps of all windows' solvers).
+    """Logs to `stream`, with the timelines `frame`, `time` (s) and `iteration` (steps tried by the solver, in total).
 
-    window: keyframes of a window; pairs farther apart are loop closures. file: file of the stream, if any. cut_short:
-    whether the recording is incomplete, which is a warning and does not stop the run.
+    window: number of keyframes of a window; pairs farther apart are loop closures. file: file of the stream, if any.
+    incomplete: whether a part of the recording could not be written, which is a warning and does not stop the run.
     """
 
     def __init__(self, stream: Any, window: int = WindowSettings().size, file: Path | None = None):
-        self.stream, self._file, self.cut_short = stream, file, False
+        self.stream, self._file, self.incomplete = stream, file, False
         self._entities, self._recorder = Entities(stream), WindowRecorder()
         self._window, self._live = window, LiveMap(self._entities)
         self._keyframes = self._notes = self._iterations = 0
@@ -153,7 +153,7 @@ class RerunCallback(Callback):
         counts = f"{len(slam.frames)} frames, {len(slam.keyframes)} keyframes, {len(cloud)} points in the map"
         self._entities.note(f"finished: {counts}", level="INFO")
         if problem := flush(self.stream, self._file):
-            self.cut_short = self._file is not None
+            self.incomplete = self._file is not None
             warn(problem)
 
     @in_double_precision

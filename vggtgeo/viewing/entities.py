@@ -1,4 +1,4 @@
-"""The entities of a recording, and those of a finished run by its folder."""
+"""Log the entities of a run to Rerun, and those of a finished run from its folder."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from vggtgeo.slam.state import Slam, lost_stretches
 from vggtgeo.solvers.levenberg_marquardt import IterationRecord
 
 RADIUS = 0.011
-"""Of the points of clouds, metres."""
+"""Radius of the points of clouds, metres."""
 SIGMAS = 20.0
-"""Size of the ellipsoids, standard deviations: one is only millimetres in a good window."""
+"""Size of the ellipsoids, standard deviations: one deviation is only millimetres in a good window."""
 _BLUE, _ORANGE, _GREEN, _GREY = (31, 95, 191), (224, 123, 26), (58, 143, 92), (150, 150, 150)
 _RED, _PURPLE = (200, 40, 40), (142, 95, 176)
 _GRAPH_RADIUS = 160.0
@@ -35,7 +35,7 @@ _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
 
 class Entities:
-    """Logs the entities of a run to a Rerun stream whose time is set, one method each, from plain values."""
+    """Logs the entities of a run to a Rerun stream, at the stream's current time; one method for each entity."""
 
     def __init__(self, stream: Any) -> None:
         import rerun
@@ -63,7 +63,7 @@ class Entities:
         self._stream.log("world/camera/image", lens, self._jpeg(cv2.resize(image, half, interpolation=cv2.INTER_AREA)))
 
     def pose(self, path: str, pose: np.ndarray) -> None:
-        """Log where a camera stands, `pose` world -> camera, float [4, 4]: entities below `path` are in its frame."""
+        """Log a camera pose, world -> camera, float [4, 4]; entities below `path` are in the camera's frame."""
         to_world = rigid.invert(pose)
         self._stream.log(path, self._rr.Transform3D(translation=to_world[:3, 3], mat3x3=to_world[:3, :3]))
 
@@ -73,14 +73,14 @@ class Entities:
         self._stream.log("world/keyframes", self._rr.Points3D(keyframes.positions, colors=[_BLUE], radii=-4.0))
 
     def loops(self, slam: Slam, apart: int) -> None:
-        """Log lines between the keyframes of loop closures, see `loop_edges`."""
+        """Log lines between the keyframes of loop closures. apart: see `loop_edges`."""
         ends = [[rigid.centre(slam.keyframes[number].pose) for number in edge] for edge in loop_edges(slam.map, apart)]
         self._lines("world/loops", ends, _PURPLE)
 
     def lost(self, slam: Slam) -> None:
-        """Log where tracking was lost: a point there and, within one submap, a line to where it was relocalised.
+        """Log where tracking was lost: a point and, within one submap, a line to the place of relocalisation.
 
-        Also the paths of submaps that are not connected with the largest; their pose relative to it is a guess.
+        Also log the paths of submaps that are not connected to the largest one, whose relative pose is a guess.
         """
         label = submap_of(slam.map) if slam.keyframes else np.zeros(0, int)
         losses, gaps = [], []
@@ -161,7 +161,7 @@ class Entities:
         self._stream.log("world/points", cloud)
 
     def mesh(self, mesh: Mesh) -> None:
-        """Log the mesh of the map, at all times."""
+        """Log the mesh of the map, for all times."""
         shape = self._rr.Mesh3D(
             vertex_positions=mesh.vertices,
             triangle_indices=mesh.faces,
@@ -183,8 +183,8 @@ class Entities:
     def iteration(self, row: int, energy: float, record: IterationRecord | None, members: int) -> None:
         """Log the energy after step `row` of the window's solver.
 
-        From a `record` also the cameras, and base-10 logarithms of damping, gradient norm, and largest motion of a
-        camera centre, metres.
+        With a `record` also log the cameras, and the base-10 logarithms of damping, gradient norm, and the largest
+        motion of a camera centre, metres.
         """
         self._stream.log("plots/solver/energy", self._rr.Scalars(energy))
         if record is None:
@@ -238,7 +238,7 @@ def _centres(poses: Any) -> np.ndarray:
 
 
 def log_folder(stream: Any, folder: Path) -> None:
-    """Log path, keyframes, map and mesh, and each keyframe's saved depth and confidence.
+    """Log the path, keyframes, map and mesh of a finished run, and each keyframe's saved depth and confidence.
 
     Raises:
         InputError: `trajectory.txt`, `keyframes.txt` or `map.ply` is missing in `folder`.

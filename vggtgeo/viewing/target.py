@@ -1,4 +1,4 @@
-"""The target of a recording (a file, a local viewer, a web server), its blueprint, and the recording of a past run."""
+"""Open the target of a recording (a file, a local viewer, a web server), and find the recording of a past run."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import whole_text
 
 APPLICATION = "vggtgeo"
-STAND_IN = "run.rrd"
-"""In the run's folder: the recording in place of a viewer that could not be opened."""
+FALLBACK_FILE = "run.rrd"
+"""File in the run's folder that is recorded if no viewer can be opened."""
 VIEWER_PORT = 9876
-"""Usual port of the viewer, and of a served recording."""
+"""Default port of the viewer, and of a served recording."""
 WEB_PORT = 9090
-"""Usual port of the page that shows a served recording."""
+"""Default port of the page that shows a served recording."""
 _TIMEOUT = 10.0
-"""Seconds for a viewer to open, and to receive the last data."""
+"""Maximum seconds to wait until a viewer is open, and until it has received all data."""
 _PROBE_SIZE = 2**20
-"""Bytes written to test the disk; Rerun's first write is 30 kB."""
+"""Bytes written to test whether the disk has space; Rerun's first write is 30 kB."""
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
-    """An open target: `stream` to log to; `url` of a served recording; `file` that is written, if any."""
+class OpenTarget:
+    """An open target. stream: to log to. url: of a served recording. file: that is written, if any."""
 
     stream: Any
     url: str | None = None
@@ -48,7 +48,7 @@ def check_target(target: str) -> str:
     return target
 
 
-def open_target(target: str, name: str, instead: Path) -> Opened:
+def open_target(target: str, name: str, fallback: Path) -> OpenTarget:
     """Open a stream to `target`, with the blueprint of this package.
 
     A file is written continuously, so that the recording of an interrupted run can be opened.
@@ -56,7 +56,7 @@ def open_target(target: str, name: str, instead: Path) -> Opened:
     Args:
         target: `spawn`, `serve` or a file, see `check_target`.
         name: of the recording.
-        instead: file to write, with a warning, if no viewer can be opened.
+        fallback: file to write, with a warning, if no viewer can be opened.
 
     """
     import rerun as rr
@@ -64,19 +64,19 @@ def open_target(target: str, name: str, instead: Path) -> Opened:
     stream = rr.RecordingStream(APPLICATION)
     url = file = None
     if check_target(target) == "spawn":
-        file = _spawn(stream, instead)
+        file = _spawn(stream, fallback)
     elif target == "serve":
         url = _serve(stream)
     else:
         file = _save(stream, Path(target))
     stream.send_recording_name(name)
-    return Opened(stream, url, file)
+    return OpenTarget(stream, url, file)
 
 
 def recording_of(folder: Path) -> Path | None:
-    """Return the recording that the run in `folder` made there, or None.
+    """Return the recording that the run in `folder` made there; None without one.
 
-    It is named in the run's settings, which excludes recordings of earlier runs. A killed run has no settings: then the
+    The run's settings name it, which excludes recordings of earlier runs. A killed run has no settings: then it is the
     newest recording in the folder.
     """
     try:
@@ -85,7 +85,7 @@ def recording_of(folder: Path) -> Path | None:
         return max(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, default=None)
     if target is None:
         return None
-    file = folder / (STAND_IN if target == "spawn" else Path(str(target)).name)
+    file = folder / (FALLBACK_FILE if target == "spawn" else Path(str(target)).name)
     return file if file.suffix == ".rrd" and file.is_file() else None
 
 
@@ -115,7 +115,7 @@ def has_screen() -> bool:
 
 
 def _save(stream: Any, path: Path) -> Path:
-    """Record to a file, after a test that the disk is writable: else Rerun may never return, on a full disk."""
+    """Record to a file, after a test that the disk has space: on a full disk Rerun may never return."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with tempfile.TemporaryFile(dir=path.parent) as probe:
@@ -123,28 +123,28 @@ def _save(stream: Any, path: Path) -> Path:
         stream.save(path, default_blueprint=blueprint())
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise InputError(f"`--rerun` is `{path}`, which cannot be written: {reason}") from None
+        raise InputError(f"`--rerun` must be a writable file, got `{path}`: {reason}") from None
     return path
 
 
-def _spawn(stream: Any, instead: Path) -> Path | None:
-    """Open a viewer, or record to the file `instead` if that fails."""
+def _spawn(stream: Any, fallback: Path) -> Path | None:
+    """Open a viewer, or record to the file `fallback` if that fails."""
     reason = "there is no screen" if not has_screen() else _start_viewer(stream)
     if reason is None:
         stream.connect_grpc(default_blueprint=blueprint())
         return None
-    _save(stream, instead)
+    _save(stream, fallback)
     warn(
-        f"{reason}, so the recording goes to `{instead}`; view it with `rerun {instead}` on a machine with a screen, "
-        "or with `--rerun serve` in a browser"
+        f"{reason}, so the recording is written to `{fallback}`; view it with `rerun {fallback}` on a machine with a "
+        "screen, or use `--rerun serve` for a browser"
     )
-    return instead
+    return fallback
 
 
 def _start_viewer(stream: Any) -> str | None:
     """Start the viewer, or find a running one; return an error message if that fails."""
     path = os.environ.get("PATH", "")
-    # The viewer is installed beside Python, whose folder need not be in PATH.
+    # The viewer is installed in Python's folder of scripts, which need not be in PATH.
     os.environ["PATH"] = os.pathsep.join([sysconfig.get_path("scripts"), path])
     try:
         stream.spawn(connect=False)
@@ -157,11 +157,11 @@ def _start_viewer(stream: Any) -> str | None:
         if _listens(VIEWER_PORT):
             return None
         time.sleep(0.1)
-    return "the viewer closed at once"
+    return "the viewer did not answer"
 
 
 def _serve(stream: Any) -> str:
-    """Serve the recording and a web viewer, at the usual ports or at free ones; return the URL."""
+    """Serve the recording and a web viewer, at the default ports or at free ones; return the URL."""
     import rerun as rr
 
     source = stream.serve_grpc(grpc_port=_port(VIEWER_PORT), default_blueprint=blueprint())
@@ -177,20 +177,20 @@ def _listens(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-def _port(usual: int) -> int:
-    """Return `usual` if it is free, else a free port."""
+def _port(default: int) -> int:
+    """Return the port `default` if it is free, else another free port."""
     with socket.socket() as probe:
-        if os.name == "posix":  # as the server itself: a recently closed port counts as free
+        if os.name == "posix":  # Rerun's server sets this option, too: a recently closed port counts as free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind(("", usual))
+            probe.bind(("", default))
         except OSError:
             probe.bind(("", 0))
         return int(probe.getsockname()[1])
 
 
 def blueprint() -> Any:
-    """Return the arrangement of the views: world on the left, current keyframe on the right, curves below."""
+    """Return the layout of the views: world and curves on the left, current frame and keyframe on the right."""
     import rerun.blueprint as rrb
 
     world = rrb.Spatial3DView(
